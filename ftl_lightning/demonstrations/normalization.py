@@ -1,0 +1,42 @@
+"""Normalisation of states to [-1, 1], kept with the model."""
+
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+
+class Normalization(nn.Module):
+    """Column-wise min-max to [-1, 1]. A constant column maps to 0 and back to its value.
+
+    Args:
+        low, high: ``(state,)``, the extremes seen in pretraining. Columns with ``high <= low`` are constant.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("low", low.float())
+        self.register_buffer("high", high.float())
+
+    @classmethod
+    def fit(cls, states: Tensor) -> Self:
+        """From states ``(..., state)``."""
+        flat = states.flatten(0, -2)
+        return cls(flat.amin(dim=0), flat.amax(dim=0))
+
+    @property
+    def _half_width(self) -> Tensor:
+        return ((self.high - self.low) / 2).clamp(min=0)
+
+    def encode(self, states: Tensor) -> Tensor:
+        """``(..., state)`` in the domain's units to normalised; values outside the extremes go beyond [-1, 1]."""
+        half = self._half_width
+        varies = half > 0
+        return torch.where(varies, (states - self.low) / torch.where(varies, half, 1) - 1, 0)
+
+    def decode(self, normalised: Tensor) -> Tensor:
+        """The inverse of :meth:`encode`."""
+        return self.low + (normalised + 1) * self._half_width

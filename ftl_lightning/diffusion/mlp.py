@@ -1,0 +1,73 @@
+"""The MLP denoiser of the paper's object rearrangement domain."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) -> Tensor:
+    """``(batch, dimension)`` features of the timestep ``t (batch,)`` (Vaswani et al., 2017); ``dimension`` is even."""
+    half = dimension // 2
+    frequency = torch.exp(torch.arange(half, device=t.device) * (-math.log(period) / (half - 1)))
+    angle = t[:, None] * frequency
+    return torch.cat((angle.sin(), angle.cos()), dim=-1)
+
+
+class MLPDenoiser(nn.Module):
+    """Estimates noise from the noisy plan, the timestep, the concept and, where there is one, the initial state.
+
+    Timestep and concept scale and shift every hidden layer (FiLM, Perez et al., 2018), which gives inversion more to hold on
+    to than a concept that is only concatenated to the input. Hidden layers are residual.
+
+    Args:
+        horizon: states in a plan.
+        state_dim: columns of a state.
+        concept_dim: columns of a concept embedding.
+        initial_state_dim: columns of the initial state; 0 where the domain has none.
+        hidden_dim: width.
+        depth: hidden layers.
+        condition_dim: features of the timestep and of the concept, each.
+        dropout: of the hidden layers, in training.
+    """
+
+    def __init__(
+        self,
+        horizon: int,
+        state_dim: int,
+        concept_dim: int,
+        initial_state_dim: int = 0,
+        hidden_dim: int = 512,
+        depth: int = 4,
+        condition_dim: int = 128,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.condition_dim = condition_dim
+        self.time = nn.Sequential(nn.Linear(condition_dim, condition_dim), nn.SiLU(), nn.Linear(condition_dim, condition_dim))
+        self.concept = nn.Linear(concept_dim, condition_dim)
+        inputs = [horizon * state_dim + initial_state_dim] + [hidden_dim] * (depth - 1)
+        self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
+        self.film = nn.ModuleList(nn.Linear(2 * condition_dim, 2 * hidden_dim) for _ in inputs)
+        self.dropout = nn.Dropout(dropout)
+        self.head = nn.Linear(hidden_dim, horizon * state_dim)
+
+    def forward(self, x: Tensor, t: Tensor, concept: Tensor, initial_state: Tensor | None = None) -> Tensor:
+        """Estimated noise ``(batch, horizon, state)``.
+
+        Args:
+            x: noisy plan ``(batch, horizon, state)``, normalised.
+            t: ``(batch,)`` int64.
+            concept: ``(batch, concept)`` in the model's concept space.
+            initial_state: ``(batch, initial state)``, normalised, or ``None``.
+        """
+        condition = torch.cat((self.time(sinusoidal_embedding(t, self.condition_dim)), self.concept(concept)), dim=-1)
+        condition = functional.silu(condition)
+        hidden = x.flatten(1) if initial_state is None else torch.cat((x.flatten(1), initial_state), dim=-1)
+        for index, (layer, film) in enumerate(zip(self.layers, self.film, strict=True)):
+            scale, shift = film(condition).chunk(2, dim=-1)
+            update = self.dropout(functional.silu(layer(hidden) * (1 + scale) + shift))
+            hidden = hidden + update if index else update
+        out: Tensor = self.head(hidden)
+        return out.unflatten(-1, x.shape[1:])

@@ -1,0 +1,68 @@
+"""The forward process: how noise is added and how clean data is read off a noise estimate."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999) -> Tensor:
+    """Cosine schedule (Nichol & Dhariwal, 2021).
+
+    Args:
+        steps: T.
+        offset: their s.
+        beta_max: largest variance of a single step.
+
+    Returns:
+        ``(T,)`` float32, the product of ``1 - beta`` up to and including each step; index 0 is the least noisy.
+    """
+    edges = torch.cos((torch.arange(steps + 1, dtype=torch.float64) / steps + offset) / (1 + offset) * math.pi / 2) ** 2
+    beta = (1 - edges[1:] / edges[:-1]).clamp(max=beta_max)
+    return torch.cumprod(1 - beta, dim=0).float()
+
+
+def _per_sample(values: Tensor, like: Tensor) -> Tensor:
+    return values.reshape(-1, *(1,) * (like.dim() - 1))
+
+
+def add_noise(clean: Tensor, noise: Tensor, alpha_bar: Tensor) -> Tensor:
+    """``x_t = sqrt(abar_t) x_0 + sqrt(1 - abar_t) eps`` (section 3.1).
+
+    Args:
+        clean, noise: ``(batch, horizon, state)``.
+        alpha_bar: ``(batch,)`` or scalar.
+    """
+    alpha_bar = _per_sample(alpha_bar, clean)
+    return alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * noise
+
+
+def clean_from_epsilon(noisy: Tensor, epsilon: Tensor, alpha_bar: Tensor, clip: float | None = 1.0) -> Tensor:
+    """The clean data that a noise estimate implies; the inverse of :func:`add_noise` in its first argument.
+
+    Args:
+        noisy, epsilon: ``(batch, horizon, state)``.
+        alpha_bar: ``(batch,)`` or scalar.
+        clip: bound on the result's absolute value (data are normalised to [-1, 1]); ``None`` for no bound.
+    """
+    alpha_bar = _per_sample(alpha_bar, noisy)
+    clean = (noisy - (1 - alpha_bar).sqrt() * epsilon) / alpha_bar.sqrt()
+    return clean if clip is None else clean.clamp(-clip, clip)
+
+
+def denoising_loss(
+    epsilon: Callable[[Tensor, Tensor], Tensor], clean: Tensor, noise: Tensor, t: Tensor, alpha_bar: Tensor
+) -> Tensor:
+    """Squared error of the noise estimate, the integrand of Eq. 1 and Eq. 2; which of the two, ``epsilon`` decides.
+
+    Args:
+        epsilon: ``(x, t) -> noise``.
+        clean, noise: ``(batch, horizon, state)``.
+        t: ``(batch,)`` int64.
+        alpha_bar: the schedule ``(T,)``.
+
+    Returns:
+        ``(batch,)``, the mean over horizon and state.
+    """
+    return (epsilon(add_noise(clean, noise, alpha_bar[t]), t) - noise).square().mean(dim=(1, 2))

@@ -1,0 +1,132 @@
+"""What a domain is: one object with a handful of members. Adding a domain adds a folder with such an object."""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.errors import UserError
+
+
+@dataclass(frozen=True)
+class EvaluationTask:
+    """One bar of a chart: behaviour to generate and the goal it is judged by.
+
+    Attributes:
+        setting: the paper's name of the group it is averaged in, e.g. ``'training composition'``.
+        goal: the task in words, as :attr:`Domain.succeeded` reads it.
+        learned: name of the learned concept that is used, or ``None``.
+        texts: training concepts that are composed in.
+        component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
+    """
+
+    setting: str
+    goal: str
+    learned: str | None = None
+    texts: tuple[str, ...] = ()
+    component: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name within its setting."""
+        return self.goal if self.component is None else f"{self.goal} (learned from: {self.learned})"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Evaluation tasks that are reported together."""
+
+    tasks: tuple[EvaluationTask, ...]
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Names of the concepts to learn, each once, in order."""
+        return tuple(dict.fromkeys(task.learned for task in self.tasks if task.learned))
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Names of the settings, each once, in order."""
+        return tuple(dict.fromkeys(task.setting for task in self.tasks))
+
+
+@dataclass(frozen=True)
+class Published:
+    """A number of the paper, to be shown beside ours.
+
+    Attributes:
+        setting: as in :class:`EvaluationTask`.
+        value: accuracy in [0, 1].
+        error: standard error over tasks; ``None`` for a single task or where it is not reported.
+        components: K.
+        omega: the fixed weight as text, or ``'learned'``.
+        task: name of the evaluation task; ``''`` for the mean of the setting.
+    """
+
+    setting: str
+    value: float
+    error: float | None = None
+    components: int = 2
+    omega: str = "learned"
+    task: str = ""
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A domain.
+
+    Attributes:
+        name: folder name under ``ftl_lightning/domains``.
+        horizon: number of states in a generated plan.
+        state_names, state_units: one entry a column of a state.
+        training_concepts: descriptions of the behaviours of pretraining.
+        suites: by name: ``'training'`` (training concepts), ``'paper'`` (final evaluation only), ``'validation'`` (for tuning)
+            and any other, such as ``'components'`` (what each learned component generates alone).
+        descriptions: every text that the shipped table of embeddings holds, the empty one included.
+        training_set: ``(samples per concept, seed) -> demonstrations`` of every training concept.
+        generate: ``(task, count, seed) -> demonstrations`` of any task of the domain's grammar.
+        succeeded: ``(goal, states (sample, horizon, state)) -> (sample,)`` of bool, the paper's metric.
+        render: ``(states (sample, horizon, state), right (sample,) of bool, title) -> figure``.
+        references: trivial policies to print beside every rate: name to ``(goal, count, seed) -> states``.
+        published: the paper's numbers for this domain.
+    """
+
+    name: str
+    horizon: int
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    training_concepts: tuple[str, ...]
+    suites: Mapping[str, Suite]
+    descriptions: tuple[str, ...]
+    training_set: Callable[[int, int], Demonstrations]
+    generate: Callable[[str, int, int], Demonstrations]
+    succeeded: Callable[[str, Tensor], Tensor]
+    render: Callable[[Tensor, Sequence[bool], str], Figure]
+    references: Mapping[str, Callable[[str, int, int], Tensor]] = field(default_factory=dict)
+    published: tuple[Published, ...] = ()
+
+    @property
+    def table(self) -> Path:
+        """The shipped table of concept embeddings, in the domain's folder."""
+        return Path(__file__).parent / self.name / "embeddings.safetensors"
+
+
+def domain_names() -> tuple[str, ...]:
+    """The domains that are installed: the folders beside this file."""
+    return tuple(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if module.ispkg)
+
+
+def load_domain(name: str) -> Domain:
+    """Import a domain by the name of its folder.
+
+    Raises:
+        UserError: if there is none of that name.
+    """
+    if name not in domain_names():
+        raise UserError(f"domain: expected one of {', '.join(domain_names())}, found {name!r}")
+    domain: Domain = importlib.import_module(f"ftl_lightning.domains.{name}").DOMAIN
+    return domain

@@ -1,0 +1,69 @@
+"""The domain object: what the rest of the package knows of object rearrangement."""
+
+import functools
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
+from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
+from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse
+from ftl_lightning.domains.object_rearrangement.rendering import render
+from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
+
+NAME = "object_rearrangement"
+STATE_NAMES = tuple(
+    f"{shape}.{column}" for shape in SHAPES for column in ("x", "y", "radius", "angle", *(f"is_{other}" for other in SHAPES))
+)
+STATE_UNITS = ("length", "length", "length", "rad", "1", "1", "1") * len(SHAPES)
+
+
+def _demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrations:
+    """``count`` scenes of each task, as demonstrations of one state."""
+    states = torch.cat([generate(task, count, seed) for task in tasks])
+    return Demonstrations(
+        states=states[:, None],
+        lengths=torch.ones(len(states), dtype=torch.int64),
+        domain=NAME,
+        state_names=STATE_NAMES,
+        state_units=STATE_UNITS,
+        concepts=tuple(task for task in tasks for _ in range(count)),
+        provenance={"generator": NAME, "seed": seed, "count_per_task": count},
+    )
+
+
+def succeeded(goal: str, states: Tensor) -> Tensor:
+    """Whether every relation of a goal holds in its relaxed form (paper, 'Evaluation data and metrics').
+
+    Args:
+        goal: relations in words.
+        states: ``(sample, 1, 21)`` in the domain's units.
+
+    Returns:
+        ``(sample,)`` of bool.
+    """
+    return torch.stack([holds(relation, states[:, 0], relaxed=True) for relation in parse(goal)]).all(dim=0)
+
+
+DOMAIN = Domain(
+    name=NAME,
+    horizon=1,
+    state_names=STATE_NAMES,
+    state_units=STATE_UNITS,
+    training_concepts=TRAINING_CONCEPTS,
+    suites=SUITES,
+    descriptions=tuple(
+        dict.fromkeys((*TRAINING_CONCEPTS, *(text for suite in SUITES.values() for task in suite.tasks for text in (task.goal,))))
+    ),
+    training_set=functools.partial(_demonstrations, TRAINING_CONCEPTS),
+    generate=lambda task, count, seed: _demonstrations((task,), count, seed),
+    succeeded=succeeded,
+    render=render,
+    references={
+        "random scenes": lambda goal, count, seed: random_scenes(count, seed)[:, None],
+        "generator (oracle)": lambda goal, count, seed: generate(goal, count, seed)[:, None],
+    },
+    published=PUBLISHED,
+)

@@ -1,0 +1,113 @@
+"""Scenes drawn by vectorised rejection sampling: propose many, keep those that show the task and nothing else."""
+
+import zlib
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.domains.object_rearrangement.relations import (
+    EXTENT,
+    PER_SHAPE,
+    SHAPES,
+    TRAINING_RELATIONS,
+    Relation,
+    holds,
+    overlap,
+    parse,
+)
+from ftl_lightning.errors import UserError
+
+SIZE = (0.3, 1.0)
+"""Range of a shape's radius (paper)."""
+PROPOSALS = 32_768
+"""Scenes proposed at a time."""
+PATIENCE = 200
+"""Rounds without reaching the count after which a task is declared infeasible."""
+
+
+def generate(task: str, count: int, seed: int) -> Tensor:
+    """Draw scenes in which a task holds exactly, no shapes overlap and no training relation that it does not name holds.
+
+    Args:
+        task: relations in words, see :func:`~ftl_lightning.domains.object_rearrangement.relations.parse`.
+        count: number of scenes.
+        seed: the same task and seed give the same bytes, whatever else is drawn.
+
+    Returns:
+        ``(count, 21)`` float32: for circle, triangle and square: x, y in [0, 5], radius in [0.3, 1], angle in [0, 2 pi],
+        one-hot type.
+
+    Raises:
+        UserError: if the task cannot be read, or hardly any scene shows it.
+    """
+    relations = parse(task)
+    related = {named for relation in relations for named in _related(relation)}
+    unrelated = [relation for relation in TRAINING_RELATIONS if relation not in related]
+    rng = np.random.default_rng([seed, zlib.crc32(task.encode())])
+    kept: list[Tensor] = []
+    for _ in range(PATIENCE):
+        scenes = _propose(relations, rng)
+        good = ~overlap(scenes)
+        for relation in relations:
+            good &= holds(relation, scenes, relaxed=False)
+        for relation in unrelated:
+            good &= ~holds(relation, scenes, relaxed=False)
+        kept.append(scenes[good])
+        if sum(map(len, kept)) >= count:
+            return torch.cat(kept)[:count].contiguous()
+    raise UserError(
+        f"object_rearrangement task {task!r}: {sum(map(len, kept))} of {count} scenes found in {PATIENCE * PROPOSALS:,} "
+        "proposals; its relations contradict each other or leave hardly any room"
+    )
+
+
+def _related(relation: Relation) -> tuple[Relation, ...]:
+    """A relation and the training relations that it speaks of by its definition."""
+    if relation.kind == "diagonal to":
+        return (relation, Relation("right of", relation.shapes), Relation("above", relation.shapes))
+    if relation.kind == "antidiagonal to":
+        return (relation, Relation("right of", relation.shapes[::-1]), Relation("above", relation.shapes))
+    if relation.kind == "next to":
+        both = (relation.shapes, relation.shapes[::-1])
+        return (relation, *(Relation(kind, pair) for kind in ("right of", "above") for pair in both))
+    return (relation,)
+
+
+def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tensor:
+    """Uniform scenes ``(PROPOSALS, 21)``, with centres put where a relation of measure zero wants them."""
+    scenes = _uniform_scenes(rng, PROPOSALS)
+    for relation in relations:
+        which = [SHAPES.index(shape) for shape in relation.shapes]
+        if relation.kind == "diagonal to":
+            scenes[:, which, 1] = scenes[:, which, 0]
+        elif relation.kind == "antidiagonal to":
+            scenes[:, which, 1] = EXTENT - scenes[:, which, 0]
+        elif relation.kind == "ring":
+            centre = rng.uniform(0, EXTENT, (PROPOSALS, 1, 2))
+            turn = rng.uniform(0, 2 * np.pi, (PROPOSALS, 1))
+            clockwise = rng.choice((-1, 1), (PROPOSALS, 1))  # either order of the shapes around the ring
+            angle = turn + clockwise * np.arange(len(SHAPES)) * 2 * np.pi / len(SHAPES)
+            scenes[..., :2] = centre + relation.radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    inside = ((scenes[..., :2] >= 0) & (scenes[..., :2] <= EXTENT)).all(axis=(1, 2))
+    return _flat(scenes[inside])
+
+
+def _uniform_scenes(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    """Scenes ``(count, shape, 7)`` whose centres, radii and angles are uniform; shapes may overlap."""
+    scenes = np.zeros((count, len(SHAPES), PER_SHAPE), dtype=np.float32)
+    scenes[..., :2] = rng.uniform(0, EXTENT, (count, len(SHAPES), 2))
+    scenes[..., 2] = rng.uniform(*SIZE, (count, len(SHAPES)))
+    scenes[..., 3] = rng.uniform(0, 2 * np.pi, (count, len(SHAPES)))
+    scenes[..., 4:] = np.eye(len(SHAPES), dtype=np.float32)
+    return scenes
+
+
+def random_scenes(count: int, seed: int) -> Tensor:
+    """The same as states ``(count, 21)``: a reference line, what a policy that knows nothing of the task reaches."""
+    return _flat(_uniform_scenes(np.random.default_rng(seed), count))
+
+
+def _flat(scenes: NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(scenes.reshape(len(scenes), len(SHAPES) * PER_SHAPE))

@@ -1,0 +1,146 @@
+"""Spatial relations between the three shapes: their grammar, their exact form and their relaxed form.
+
+A task is a conjunction of relations written in words (``'circle right of square and triangle above square'``).
+Each relation is defined once, in :func:`holds`; generation uses the exact margin, evaluation the relaxed one
+(Netanyahu et al., 2024, appendix 'Object Rearrangement').
+"""
+
+import itertools
+import re
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.errors import UserError
+
+SHAPES = ("circle", "triangle", "square")
+EXTENT = 5.0
+"""Centres lie in ``[0, EXTENT]^2`` (length units of the paper)."""
+PER_SHAPE = 4 + len(SHAPES)
+"""Columns of one shape: x, y, size, angle, one-hot type."""
+
+ORDERED_PAIRS = tuple(itertools.permutations(SHAPES, 2))
+PAIRWISE = ("right of", "above", "diagonal to", "antidiagonal to", "next to")
+RADIUS_TOLERANCE = 0.3
+"""A ring's circumradius may differ from its nominal value by this much in evaluation."""
+EXACT_TOLERANCE = 1e-3
+"""The same for generated scenes and for centres that must lie on a line: rounding only."""
+NEXT_TO_GAP = (0.3, 0.8)
+"""Largest gap between two outlines that are 'next to' each other: exact, relaxed. A relation of the validation suite."""
+
+
+@dataclass(frozen=True)
+class Relation:
+    """One relation.
+
+    Attributes:
+        kind: one of :data:`PAIRWISE`, or ``'ring'`` (all three shapes on the circumference of a circle).
+        shapes: the ordered pair (A, B), or all three shapes for a ring.
+        radius: circumradius of a ring, 0 otherwise.
+    """
+
+    kind: str
+    shapes: tuple[str, ...]
+    radius: float = 0.0
+
+    def __str__(self) -> str:
+        if self.kind == "ring":
+            return f"circle, triangle and square in a circle of radius {self.radius:g}"
+        return f"{self.shapes[0]} {self.kind} {self.shapes[1]}"
+
+
+TRAINING_RELATIONS = tuple(Relation(kind, pair) for kind in ("right of", "above") for pair in ORDERED_PAIRS)
+
+_PAIR = re.compile(rf"({'|'.join(SHAPES)}) ({'|'.join(PAIRWISE)}) ({'|'.join(SHAPES)})")
+_RING = re.compile(r"circle,? triangle and square in a circle of radius (\d+(?:\.\d+)?)")
+
+
+def parse(task: str) -> tuple[Relation, ...]:
+    """Read a task in words.
+
+    Args:
+        task: relations joined by ``' and '``.
+
+    Returns:
+        The relations in the order they were written.
+
+    Raises:
+        UserError: where a part is not a relation.
+    """
+    relations, rest = [], task
+    while True:
+        if pair := _PAIR.match(rest):
+            relations.append(Relation(pair[2], (pair[1], pair[3])))
+        elif ring := _RING.match(rest):
+            relations.append(Relation("ring", SHAPES, float(ring[1])))
+        if not (match := pair or ring) or (pair and pair[1] == pair[3]):
+            raise UserError(
+                f"object_rearrangement task {task!r}: found {rest!r}, expected 'A <relation> B' with A, B different among "
+                f"{', '.join(SHAPES)} and <relation> among {', '.join(PAIRWISE)}, or "
+                f"'{Relation('ring', SHAPES, 1.67)}', joined by ' and '"
+            )
+        rest = rest[match.end() :]
+        if not rest:
+            return tuple(relations)
+        rest = rest.removeprefix(" and ")
+
+
+def columns(states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres and sizes of the shapes: three tensors ``(scene, shape)``: x, y and radius, from ``(scene, 21)``."""
+    shapes = states.unflatten(-1, (len(SHAPES), PER_SHAPE))
+    return shapes[..., 0], shapes[..., 1], shapes[..., 2]
+
+
+def circumradius(x: Tensor, y: Tensor) -> Tensor:
+    """Radius ``(scene,)`` of the circle through three centres ``(scene, 3)``; infinite where they are collinear."""
+    points = torch.stack((x, y), dim=-1)
+    a, b, c = ((points[:, i] - points[:, j]).norm(dim=-1) for i, j in ((0, 1), (1, 2), (2, 0)))
+    twice_area = ((x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])).abs()
+    return a * b * c / (2 * twice_area)
+
+
+def holds(relation: Relation, states: Tensor, relaxed: bool) -> Tensor:
+    """Whether a relation holds in each scene.
+
+    Args:
+        relation: the relation.
+        states: ``(scene, 21)`` in the domain's units.
+        relaxed: the margins of evaluation instead of those of generation.
+
+    Returns:
+        ``(scene,)`` of bool.
+    """
+    x, y, radius = columns(states)
+    if relation.kind == "ring":
+        return (circumradius(x, y) - relation.radius).abs() < (RADIUS_TOLERANCE if relaxed else EXACT_TOLERANCE)
+    a, b = (SHAPES.index(shape) for shape in relation.shapes)
+    dx, dy = x[:, a] - x[:, b], y[:, a] - y[:, b]
+    reach = 2 * torch.maximum(radius[:, a], radius[:, b])
+    margin = reach if relaxed else radius[:, a]
+    on_line = reach if relaxed else torch.full_like(reach, EXACT_TOLERANCE)
+    match relation.kind:
+        case "right of":
+            return (dx > 0) & (dy.abs() <= margin)
+        case "above":
+            return (dy > 0) & (dx.abs() <= margin)
+        case "diagonal to":  # both centres on f(x) = x
+            offset = torch.maximum((y[:, a] - x[:, a]).abs(), (y[:, b] - x[:, b]).abs())
+            return (dx > 0) & (dy > 0) & (offset <= on_line)
+        case "antidiagonal to":  # both centres on f(x) = EXTENT - x, A upper left
+            offset = torch.maximum((y[:, a] + x[:, a] - EXTENT).abs(), (y[:, b] + x[:, b] - EXTENT).abs())
+            return (dx < 0) & (dy > 0) & (offset <= on_line)
+        case "next to":
+            gap = torch.hypot(dx, dy) - radius[:, a] - radius[:, b]
+            return (gap >= 0) & (gap <= NEXT_TO_GAP[relaxed])
+    raise ValueError(f"unknown relation kind {relation.kind!r}")
+
+
+def overlap(states: Tensor) -> Tensor:
+    """Whether any two shapes' circumscribed circles meet: ``(scene,)`` of bool from ``(scene, 21)``."""
+    x, y, radius = columns(states)
+    touching = [
+        torch.hypot(x[:, i] - x[:, j], y[:, i] - y[:, j]) <= radius[:, i] + radius[:, j]
+        for i, j in itertools.combinations(range(len(SHAPES)), 2)
+    ]
+    return torch.stack(touching).any(dim=0)

@@ -1,0 +1,47 @@
+"""Pictures of scenes, framed green where the task holds and red where it does not (as in the paper's figures)."""
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, RegularPolygon
+from torch import Tensor
+
+from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
+
+COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
+CORNERS = {"triangle": 3, "square": 4}
+MAX_COLUMNS = 8
+
+
+def render(states: Tensor, right: Sequence[bool], title: str) -> Figure:
+    """A grid of scenes.
+
+    Args:
+        states: ``(scene, 1, 21)`` in the domain's units.
+        right: whether the task holds, one entry a scene.
+        title: above the grid.
+    """
+    columns = min(len(states), MAX_COLUMNS)
+    rows = -(-len(states) // columns)
+    figure = Figure(figsize=(1.5 * columns, 1.5 * rows + 0.4), layout="constrained")
+    figure.suptitle(title, fontsize=9)
+    for axes, state, good in zip(figure.subplots(rows, columns, squeeze=False).flat, states[:, 0], right, strict=False):
+        _scene(axes, state, "#2e9e46" if good else "#d03a3a")
+    for axes in figure.axes[len(states) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _scene(axes: Axes, state: Tensor, frame: str) -> None:
+    for shape, (x, y, radius, angle, *_) in zip(SHAPES, state.unflatten(0, (len(SHAPES), PER_SHAPE)).tolist(), strict=True):
+        colour = COLOURS[shape]
+        size = max(radius, 0.0)
+        if shape in CORNERS:
+            axes.add_patch(RegularPolygon((x, y), CORNERS[shape], radius=size, orientation=angle, color=colour))
+        else:
+            axes.add_patch(Circle((x, y), size, color=colour))
+    margin = 1.0  # the largest radius
+    axes.set(xlim=(-margin, EXTENT + margin), ylim=(-margin, EXTENT + margin), xticks=[], yticks=[], aspect="equal")
+    for spine in axes.spines.values():
+        spine.set(color=frame, linewidth=2.5)

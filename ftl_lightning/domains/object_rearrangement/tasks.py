@@ -1,0 +1,84 @@
+"""The paper's settings for object rearrangement, as data, and the validation suite on which everything is tuned."""
+
+from ftl_lightning.domains.domain import EvaluationTask, Suite
+from ftl_lightning.domains.object_rearrangement.relations import SHAPES, TRAINING_RELATIONS, Relation
+
+TRAINING_CONCEPTS = tuple(str(relation) for relation in TRAINING_RELATIONS)
+
+
+def _suite(compositions: tuple[str, ...], new_concepts: tuple[str, ...], composed: str, with_training: tuple[str, ...]) -> Suite:
+    return Suite(
+        tuple(EvaluationTask("training composition", task, learned=task) for task in compositions)
+        + tuple(EvaluationTask("new concept", task, learned=task) for task in new_concepts)
+        + tuple(
+            EvaluationTask("new + training", f"{composed} and {text}", learned=composed, texts=(text,)) for text in with_training
+        )
+    )
+
+
+TRAINING = Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in TRAINING_CONCEPTS))
+
+PAPER = _suite(
+    compositions=(
+        "triangle right of square and circle above square",
+        "square right of triangle and circle above triangle",
+        "circle right of square and triangle above square",
+        "square right of circle and triangle above circle",
+        "circle right of triangle and triangle right of square",
+    ),
+    new_concepts=(
+        str(Relation("ring", SHAPES, 1.67)),
+        "square diagonal to triangle",
+        "triangle diagonal to square",
+        "circle diagonal to triangle",
+        "triangle diagonal to circle",
+    ),
+    composed="square diagonal to triangle",
+    with_training=(
+        "circle right of square",
+        "circle above square",
+        "circle above triangle",
+        "circle right of triangle",
+        "triangle above circle",
+    ),
+)
+
+VALIDATION = _suite(
+    compositions=(
+        "triangle right of circle and square above circle",
+        "circle right of triangle and square above triangle",
+        "square right of triangle and triangle right of circle",
+        "triangle above square and square above circle",
+        "circle right of square and circle above triangle",
+        "triangle right of circle and triangle above square",
+    ),
+    new_concepts=(
+        str(Relation("ring", SHAPES, 1.25)),
+        str(Relation("ring", SHAPES, 2.1)),
+        "circle antidiagonal to triangle",
+        "triangle antidiagonal to square",
+        "square antidiagonal to circle",
+        "circle next to square",
+    ),
+    composed="circle antidiagonal to triangle",
+    with_training=(
+        "square right of circle",
+        "square above circle",
+        "square above triangle",
+        "square right of triangle",
+        "triangle right of square",
+    ),
+)
+
+COMPONENTS = Suite(
+    tuple(
+        EvaluationTask(f"component {component}", part, learned=task.goal, component=component)
+        for task in PAPER.tasks
+        if task.setting == "training composition"
+        for part in task.goal.split(" and ")
+        for component in (1, 2)
+    )
+)
+"""What each of two learned components generates alone (paper, table 'Analysis of learned concepts')."""
+
+SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION}

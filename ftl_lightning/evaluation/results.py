@@ -1,0 +1,78 @@
+"""The results file: one row for every evaluated number."""
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import pandas as pd
+
+from ftl_lightning import __version__
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import atomic
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number.
+
+    Attributes:
+        domain, setting, task, method: what was evaluated.
+        K: number of concept components; 0 where nothing was learned.
+        omega: the fixed guidance weight as text, or ``'learned'``.
+        seed: of pretraining and inversion.
+        n: number of samples or episodes behind the value.
+        metric: for example ``'accuracy'``.
+        value: the number.
+        model_hash: of the pretrained model.
+        config_hash: of everything that was configured; the same hash and version give the same value.
+        version: of this package.
+    """
+
+    domain: str
+    setting: str
+    task: str
+    method: str
+    K: int
+    omega: str
+    seed: int
+    n: int
+    metric: str
+    value: float
+    model_hash: str
+    config_hash: str
+    version: str = __version__
+
+
+COLUMNS = [field.name for field in fields(Row)]
+_TEXT = {"omega": str, "model_hash": str, "config_hash": str, "version": str}
+_KEY = [column for column in COLUMNS if column != "value"]
+
+
+def append_rows(path: str | Path, rows: list[Row]) -> None:
+    """Add rows to a results file, made if missing; a row that is there already is replaced. Whole or not at all."""
+    table = pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS)
+    if Path(path).is_file():
+        table = pd.concat([read_rows(path), table])
+    with atomic(path) as temporary:
+        table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
+
+
+def read_rows(path: str | Path) -> pd.DataFrame:
+    """Read one results file, or all ``.csv`` files of a folder.
+
+    Raises:
+        UserError: if there is none, or a file has other columns.
+    """
+    path = Path(path)
+    files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
+    tables = []
+    for file in files:
+        try:
+            table = pd.read_csv(file, dtype=_TEXT, keep_default_na=False)
+        except (OSError, ValueError) as error:
+            raise UserError(f"{file}: expected a results file, found something else ({error})") from error
+        if list(table.columns) != COLUMNS:
+            raise UserError(f"{file}: expected the columns {', '.join(COLUMNS)}, found {', '.join(table.columns)}")
+        tables.append(table)
+    if not tables:
+        raise UserError(f"{path}: expected results (.csv files), found none; run: make run")
+    return pd.concat(tables, ignore_index=True)

@@ -1,0 +1,232 @@
+"""The conditional generative model: denoiser, schedule, normalisation and concept space, and the folder it is kept in."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning import diffusion
+from ftl_lightning.concepts.composition import composed_epsilon
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.diffusion.schedule import cosine_alpha_bar
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import FORMAT, bytes_hash, file_hash, load_tensors, save_tensors, serialise, write_text
+
+KIND = "generative model"
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What is needed to build a model before its weights are read.
+
+    Attributes:
+        domain: name of the domain.
+        horizon, state_dim, initial_state_dim, concept_dim: sizes.
+        training_concepts: texts, in the order of the model's table of training embeddings.
+        encoder: identity of the text encoder.
+        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
+        denoiser_args: its arguments other than the sizes.
+        diffusion_steps: T.
+        training: how it was trained, for the record.
+    """
+
+    domain: str
+    horizon: int
+    state_dim: int
+    initial_state_dim: int
+    concept_dim: int
+    training_concepts: tuple[str, ...]
+    encoder: str
+    denoiser: str = "MLPDenoiser"
+    denoiser_args: Mapping[str, Any] = field(default_factory=dict)
+    diffusion_steps: int = 100
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+
+def build_denoiser(config: ModelConfig) -> nn.Module:
+    """A fresh denoiser of the configured class and size.
+
+    Raises:
+        UserError: for a class that :mod:`ftl_lightning.diffusion` does not have, or arguments it does not take.
+    """
+    if config.denoiser not in diffusion.__all__:
+        raise UserError(f"denoiser: expected one of {', '.join(diffusion.__all__)}, found {config.denoiser!r}")
+    kind: type[nn.Module] = getattr(diffusion, config.denoiser)
+    try:
+        return kind(
+            horizon=config.horizon,
+            state_dim=config.state_dim,
+            initial_state_dim=config.initial_state_dim,
+            concept_dim=config.concept_dim,
+            **config.denoiser_args,
+        )
+    except TypeError as error:
+        raise UserError(f"denoiser_args: {config.denoiser} does not take them ({error})") from error
+
+
+class GenerativeModel(nn.Module):
+    """A denoiser with everything that is needed to go from words and states to states.
+
+    The model's concept space is the encoder's, centred on the training concepts and scaled to unit mean square: language
+    models put a large common part into all embeddings, which hides what tells two concepts apart.
+
+    Args:
+        config: sizes and names.
+        normalization: of states.
+        embeddings: the encoder's embeddings ``(1 + training concepts, n)``, the empty text first.
+        initial_normalization: of initial states, where the domain has them.
+    """
+
+    alpha_bar: Tensor
+    centre: Tensor
+    spread: Tensor
+    empty: Tensor
+    training_embeddings: Tensor
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.denoiser = build_denoiser(config)
+        self.normalization = normalization
+        self.initial_normalization = initial_normalization
+        self.register_buffer("alpha_bar", cosine_alpha_bar(config.diffusion_steps))
+        training = embeddings[1:]
+        self.register_buffer("centre", training.mean(dim=0))
+        self.register_buffer("spread", (training - self.centre).square().mean().sqrt())
+        self.register_buffer("empty", self.standardise(embeddings[0]))
+        self.register_buffer("training_embeddings", self.standardise(training))
+
+    def standardise(self, embeddings: Tensor) -> Tensor:
+        """The encoder's embeddings ``(..., n)`` to the model's concept space."""
+        return (embeddings - self.centre) / self.spread
+
+    def concept(self, text: str) -> Tensor:
+        """The embedding ``(n,)`` of a training concept.
+
+        Raises:
+            UserError: for a text that is none.
+        """
+        if text not in self.config.training_concepts:
+            raise UserError(
+                f"concept {text!r}: expected a training concept of the model: {'; '.join(self.config.training_concepts)}"
+            )
+        return self.training_embeddings[self.config.training_concepts.index(text)]
+
+    def named_embeddings(self) -> dict[str, Tensor]:
+        """The training concepts' embeddings ``(n,)`` by text, and the empty one's."""
+        return {"(empty)": self.empty} | dict(zip(self.config.training_concepts, self.training_embeddings, strict=True))
+
+    def check(self, concept: Concept, path: str | Path) -> None:
+        """Refuse a learned concept that belongs to another model.
+
+        Raises:
+            UserError: if encoder, domain or pretrained model differ.
+        """
+        mine = {"encoder": self.config.encoder, "domain": self.config.domain, "pretrained": self.hash}
+        for key, expected in mine.items():
+            if (found := getattr(concept.origin, key)) != expected:
+                raise UserError(
+                    f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
+                )
+
+    @torch.no_grad()
+    def sample(
+        self,
+        concepts: Sequence[Tensor],
+        weights: Sequence[Tensor],
+        count: int,
+        sampler: Sampler,
+        steps: int,
+        temperature: float,
+        generator: torch.Generator,
+        initial_states: Tensor | None = None,
+    ) -> Tensor:
+        """Generate behaviour of several compositions in one batch.
+
+        Args:
+            concepts: for each composition ``(K, n)``; K may differ between them.
+            weights: for each composition ``(K,)``.
+            count: samples of each.
+            sampler, steps, temperature, generator: see :mod:`ftl_lightning.diffusion.samplers`.
+            initial_states: ``(composition * count, initial state)`` in the domain's units, or ``None``.
+
+        Returns:
+            ``(composition, count, horizon, state)`` in the domain's units.
+        """
+        # Compositions with fewer components are padded with empty ones of weight zero, which add nothing.
+        embeddings = nn.utils.rnn.pad_sequence(list(concepts), batch_first=True).repeat_interleave(count, dim=0)
+        omega = nn.utils.rnn.pad_sequence(list(weights), batch_first=True).repeat_interleave(count, dim=0)
+        s0 = None
+        if initial_states is not None and self.initial_normalization is not None:
+            s0 = self.initial_normalization.encode(initial_states)
+
+        def epsilon(x: Tensor, t: Tensor) -> Tensor:
+            return composed_epsilon(self.denoiser, x, t, embeddings, omega, self.empty, s0)
+
+        shape = (len(embeddings), self.config.horizon, self.config.state_dim)
+        plans = sampler(epsilon, shape, self.alpha_bar, steps, temperature, generator)
+        return self.normalization.decode(plans).unflatten(0, (len(concepts), count))
+
+    @property
+    def hash(self) -> str:
+        """Hash of the weights, the same as :func:`~ftl_lightning.tensor_file.file_hash` of the saved file."""
+        return bytes_hash(serialise(KIND, self.state_dict(), {"domain": self.config.domain}))
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``config.json`` and ``model.safetensors``, each whole or not at all."""
+        folder = Path(folder)
+        save_tensors(folder / WEIGHTS, KIND, self.state_dict(), {"domain": self.config.domain})
+        write_text(folder / CONFIG, json.dumps({"format": FORMAT, "hash": self.hash, **asdict(self.config)}, indent=2) + "\n")
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """Read a folder written by :meth:`save`; the model is frozen and in evaluation mode.
+
+        Raises:
+            UserError: naming the file, if it is missing, damaged, or the two files do not belong together.
+        """
+        path = Path(folder) / CONFIG
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            expected_hash = content.pop("hash")
+            if content.pop("format") != FORMAT:
+                raise ValueError(f"format is not {FORMAT}")
+            config = ModelConfig(**content | {"training_concepts": tuple(content["training_concepts"])})
+        except OSError as error:
+            raise UserError(
+                f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit"
+            ) from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path}: expected the configuration of a pretrained model, found something else ({error})") from error
+        weights = Path(folder) / WEIGHTS
+        tensors, _ = load_tensors(weights, KIND)
+        if (found := file_hash(weights)) != expected_hash:
+            raise UserError(
+                f"{weights}: expected the hash {expected_hash} that {CONFIG} names, found {found}; copy both files again"
+            )
+        blank = torch.zeros(config.state_dim)
+        initial = torch.zeros(config.initial_state_dim)
+        model = cls(
+            config,
+            Normalization(blank, blank),
+            torch.zeros(1 + len(config.training_concepts), config.concept_dim),
+            Normalization(initial, initial) if config.initial_state_dim else None,
+        )
+        try:
+            model.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise UserError(f"{weights}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()})") from error
+        return model.requires_grad_(False).eval()

@@ -1,0 +1,260 @@
+"""Inversion: learning concepts from a few demonstrations through the frozen model (Eq. 2 of the paper)."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.concepts.composition import composed_epsilon
+from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.datamodule import InversionData
+from ftl_lightning.diffusion.schedule import denoising_loss
+from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.seeding import generator
+
+
+class InversionModule(pl.LightningModule):
+    """Learns K embeddings and their weights for every concept of an :class:`InversionData`, all in one batch.
+
+    Its only parameters are ``embeddings (run, K, n)`` and, unless omega is fixed, ``weights (run, K)``, where the runs are
+    concepts times restarts. The pretrained model is frozen and not part of a checkpoint.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        components: K.
+        omega: fixed guidance weight of every component, or ``'learned'``.
+        initial_omega: where learned weights start (the paper draws them from U(0, 1)).
+        off_span: how freely embeddings leave the affine span of the training embeddings: 1 is the paper's free form, 0 keeps
+            them in the span, between the two the part off the span is scaled, which slows its learning down.
+        initial_spread: embeddings start at the mean of the training embeddings plus so much normal noise a column.
+        restarts: independent starts of each concept; the one with the lowest loss on common noise is kept.
+        learning_rate: of the embeddings (Adam, cosine decay to 0).
+        weight_learning_rate: of the weights; with the embeddings' rate they collapse.
+        samples: noised demonstrations a step and run, spread over demonstrations and timesteps.
+        high_noise: emphasis on noisy timesteps: the loss at t is weighted by ``1 / max(abar_t, 0.05)`` to this power (0 is Eq. 2).
+        training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
+            omega, or 1 when weights are learned.
+        output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
+        seed: decides starts, noise and timesteps.
+    """
+
+    strict_loading = False
+
+    def __init__(
+        self,
+        pretrained: str,
+        components: int = 2,
+        omega: float | Literal["learned"] = 1.2,
+        initial_omega: float = 1.0,
+        off_span: float = 1.0,
+        initial_spread: float = 0.05,
+        restarts: int = 1,
+        learning_rate: float = 0.1,
+        weight_learning_rate: float = 3e-3,
+        samples: int = 32,
+        high_noise: float = 0.0,
+        training_omega: float | None = None,
+        output: str | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        if components < 1:
+            raise UserError(f"model.components: expected 1 or more, found {components}")
+        if not 0 <= off_span <= 1:
+            raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {off_span}")
+        self.model = GenerativeModel.load(pretrained)
+        self.restarts = restarts
+        self.off_span = off_span
+        self.seed = seed
+        training = self.model.training_embeddings
+        # Rows span the training embeddings, whose mean is the origin of the concept space.
+        basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
+        self.register_buffer("basis", basis, persistent=False)
+        self.register_buffer("emphasis", self._emphasis(high_noise), persistent=False)
+        self.basis: Tensor
+        self.emphasis: Tensor
+        self.embeddings: nn.Parameter
+        self.weights: nn.Parameter | Tensor
+        self.concepts: tuple[str, ...] = ()
+
+    @property
+    def method(self) -> str:
+        """The method's name in tables."""
+        form = {1.0: "free", 0.0: "span"}.get(self.off_span, f"near span {self.off_span:g}")
+        return f"FTL-IGM ({form})"
+
+    def _emphasis(self, power: float) -> Tensor:
+        """Weights of the timesteps ``(T,)`` with mean 1."""
+        weight = self.model.alpha_bar.clamp(min=0.05) ** -power
+        return weight / weight.mean()
+
+    def configure_model(self) -> None:
+        """Create the parameters once the demonstrations are known. Does nothing the second time."""
+        if "embeddings" in self._parameters:
+            return
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(data, InversionData):
+            raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
+        if data.domain.name != self.model.config.domain:
+            raise UserError(
+                f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain.name!r}"
+            )
+        self.concepts = data.concepts
+        self.demonstrations: Demonstrations = data.demonstrations
+        components, omega = self.hparams["components"], self.hparams["omega"]
+        runs = len(self.concepts) * self.restarts
+        draw = generator("cpu", self.seed, 0)
+        start = torch.randn((runs, components, self.model.config.concept_dim), generator=draw)
+        self.embeddings = nn.Parameter(self.hparams["initial_spread"] * start)
+        if omega == "learned":
+            self.weights = nn.Parameter(torch.full((runs, components), float(self.hparams["initial_omega"])))
+        else:
+            self.register_buffer("weights", torch.full((runs, components), float(omega)))
+        normalised = self.model.normalization.encode(data.demonstrations.states)
+        initial = data.demonstrations.initial_states
+        encoder = self.model.initial_normalization
+        self.register_buffer("_states", normalised, persistent=False)
+        self.register_buffer("_initial", encoder.encode(initial) if encoder and initial is not None else None, persistent=False)
+
+    def _rows(self, samples: int) -> Tensor:
+        """Which demonstration each sample of each run uses, evenly: ``(run, samples)``."""
+        texts = self.demonstrations.concepts
+        rows = [[row for row, text in enumerate(texts) if text == concept] for concept in self.concepts]
+        each = torch.tensor([[own[sample % len(own)] for sample in range(samples)] for own in rows])
+        return each.repeat_interleave(self.restarts, dim=0)
+
+    @property
+    def parametrised(self) -> Tensor:
+        """The embeddings ``(run, K, n)`` after the part off the span is scaled."""
+        if self.off_span == 1:
+            return self.embeddings
+        inside = self.embeddings @ self.basis.T @ self.basis
+        return inside + self.off_span * (self.embeddings - inside)
+
+    def _losses(self, samples: int, draw: torch.Generator) -> Tensor:
+        """Eq. 2 for every run and sample, ``(run, samples)``. Timesteps are stratified; noise is shared between the runs."""
+        runs = len(self.embeddings)
+        total = len(self.model.alpha_bar)
+        jitter = torch.rand(samples, generator=draw, device=self.device)
+        t = ((torch.arange(samples, device=self.device) + jitter) / samples * total).long()
+        t = t[torch.randperm(samples, generator=draw, device=self.device)]
+        noise = torch.randn((samples, *self._states.shape[1:]), generator=draw, device=self.device)
+        rows = self._rows(samples).flatten().to(self.device)
+        embeddings = self.parametrised.repeat_interleave(samples, dim=0)
+        weights = self.weights.repeat_interleave(samples, dim=0)
+        initial = None if self._initial is None else self._initial[rows]
+        losses = denoising_loss(
+            lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, weights, self.model.empty, initial),
+            self._states[rows],
+            noise.repeat(runs, 1, 1),
+            t.repeat(runs),
+            self.model.alpha_bar,
+        )
+        return losses.unflatten(0, (runs, samples)) * self.emphasis[t]
+
+    def training_step(self, step: int) -> Tensor:
+        losses = self._losses(self.hparams["samples"], generator(self.device, self.seed, 1, self.global_step))
+        mean = losses.detach().mean()
+        if not mean.isfinite():
+            raise UserError(f"inversion: the loss became {mean.item()} at step {self.global_step}; lower model.learning_rate")
+        self.log("train/loss", mean, prog_bar=True)
+        # A sum over runs: each run's gradient is what it would be if it were learned alone.
+        return losses.mean(dim=1).sum()
+
+    def train(self, mode: bool = True) -> "InversionModule":
+        """Switch modes; the pretrained model stays in evaluation mode."""
+        super().train(mode)
+        self.model.eval()
+        return self
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Adam with cosine decay; weights have a rate of their own."""
+        groups: list[dict[str, Any]] = [{"params": [self.embeddings], "lr": self.hparams["learning_rate"]}]
+        if isinstance(self.weights, nn.Parameter):
+            groups.append({"params": [self.weights], "lr": self.hparams["weight_learning_rate"]})
+        optimizer = torch.optim.Adam(groups)
+        total = int(self.trainer.estimated_stepping_batches)
+        scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, total)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Sign the checkpoint and leave the frozen model out; its folder is a hyper-parameter."""
+        sign(self, checkpoint)
+        own = {"embeddings", "weights"}
+        checkpoint["state_dict"] = {key: value for key, value in checkpoint["state_dict"].items() if key in own}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse another module's checkpoint."""
+        check_signature(self, checkpoint)
+
+    @torch.no_grad()
+    def learned(self, samples: int = 640) -> dict[str, Concept]:
+        """The concepts by name: of each, the restart with the lowest loss on common noise."""
+        losses = self._losses(samples, generator(self.device, self.seed, 2)).mean(dim=1).unflatten(0, (-1, self.restarts))
+        best = losses.argmin(dim=1)
+        embeddings = self.parametrised.detach().unflatten(0, (-1, self.restarts))
+        weights = self.weights.detach().unflatten(0, (-1, self.restarts))
+        found = {}
+        for index, name in enumerate(self.concepts):
+            own = self.demonstrations.select(name)
+            origin = Origin(
+                name=name,
+                domain=self.model.config.domain,
+                encoder=self.model.config.encoder,
+                pretrained=self.model.hash,
+                demonstrations=own.hash,
+                count=len(own),
+                weights="learned" if self.hparams["omega"] == "learned" else "fixed",
+                loss=losses[index, best[index]].item(),
+            )
+            found[name] = Concept(embeddings[index, best[index]].cpu(), weights[index, best[index]].cpu(), origin)
+        return found
+
+    def on_fit_end(self) -> None:
+        """Write every concept to a file of its own."""
+        folder = self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts"
+        for name, concept in self.learned().items():
+            concept.save(Path(folder) / f"{file_name(name)}.safetensors")
+
+    def on_test_start(self) -> None:
+        self._found = self.learned()
+
+    on_validation_start = on_test_start
+
+    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
+        """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
+        if task.learned not in self._found or (task.component or 0) > self.hparams["components"]:
+            return None
+        concept = self._found[task.learned]
+        embeddings, weights = concept.embeddings.to(self.device), concept.weights.to(self.device)
+        if task.component is not None:
+            chosen = slice(task.component - 1, task.component)
+            return embeddings[chosen], weights[chosen]
+        if not task.texts:
+            return embeddings, weights
+        added = torch.stack([self.model.concept(text) for text in task.texts])
+        omega = self.hparams["training_omega"]
+        if omega is None:
+            omega = 1.0 if self.hparams["omega"] == "learned" else self.hparams["omega"]
+        return torch.cat((embeddings, added)), torch.cat((weights, weights.new_full((len(added),), omega)))
+
+    def concept_embeddings(self) -> dict[str, Tensor]:
+        """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""
+        learned = {
+            f"{name} [component {number}]": embedding
+            for name, concept in self._found.items()
+            for number, embedding in enumerate(concept.embeddings, start=1)
+        }
+        return self.model.named_embeddings() | learned
+
+
+def file_name(concept: str) -> str:
+    """A concept's name as a file name: letters, digits and dots kept, the rest underscores."""
+    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)

@@ -1,0 +1,178 @@
+"""Pretraining: a denoiser conditioned on concepts, with condition dropout (Eq. 1 of the paper)."""
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.concepts.encoder import EMPTY
+from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.schedule import denoising_loss
+from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig
+from ftl_lightning.seeding import generator
+
+
+class PretrainingModule(pl.LightningModule):
+    """Trains a denoiser on a domain's pairs of behaviour and concept.
+
+    ``model`` holds the running average of the denoiser's weights, which is what is validated, exported and inverted; the
+    published code uses the raw weights. Sizes come from the data module, so layers are built when a trainer attaches both.
+
+    Args:
+        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
+        denoiser_args: its arguments other than the sizes.
+        diffusion_steps: T.
+        condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
+            (the published code draws once a batch).
+        learning_rate: of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
+        warmup_steps: of the learning rate.
+        weight_decay: of AdamW.
+        ema_decay: of the running average; it starts lower.
+        guidance: weight omega with which training concepts are generated in evaluation.
+        compile: compile the denoiser for training (worth it on GPUs).
+        seed: decides noise, timesteps and condition dropout as a function of the step.
+    """
+
+    method = "FTL-IGM"
+
+    def __init__(
+        self,
+        denoiser: str = "MLPDenoiser",
+        denoiser_args: Mapping[str, Any] | None = None,
+        diffusion_steps: int = 100,
+        condition_dropout: float = 0.1,
+        learning_rate: float = 1e-3,
+        warmup_steps: int = 200,
+        weight_decay: float = 0.01,
+        ema_decay: float = 0.999,
+        guidance: float = 1.2,
+        compile: bool = False,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self.denoiser_args = dict(denoiser_args or {})
+        self.seed = seed
+        self.guidance = guidance
+        self.model: GenerativeModel
+        self.denoiser: nn.Module
+
+    def configure_model(self) -> None:
+        """Build the layers once the data are known. Does nothing the second time."""
+        if "model" in self._modules:
+            return
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(data, PretrainingData):
+            raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
+        embeddings = data.encoder((EMPTY, *data.domain.training_concepts))
+        initial = data.training.initial_states
+        config = ModelConfig(
+            domain=data.domain.name,
+            horizon=data.domain.horizon,
+            state_dim=len(data.domain.state_names),
+            initial_state_dim=0 if initial is None else initial.shape[-1],
+            concept_dim=embeddings.shape[-1],
+            training_concepts=data.domain.training_concepts,
+            encoder=data.encoder.identity,
+            denoiser=self.hparams["denoiser"],
+            denoiser_args=self.denoiser_args,
+            diffusion_steps=self.hparams["diffusion_steps"],
+            training={"model": dict(self.hparams), "data": dict(data.hparams), "max_steps": self.trainer.max_steps},
+        )
+        # The initial weights are a function of the seed, wherever in a process this is called.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            self.model = GenerativeModel(
+                config,
+                Normalization.fit(data.training.states),
+                embeddings,
+                None if initial is None else Normalization.fit(initial),
+            )
+        self.denoiser = copy.deepcopy(self.model.denoiser)
+        self.model.requires_grad_(False).eval()
+        self._trained = torch.compile(self.denoiser) if self.hparams["compile"] else self.denoiser
+
+    def train(self, mode: bool = True) -> "PretrainingModule":
+        """Switch modes; the average is always in evaluation mode."""
+        super().train(mode)
+        if "model" in self._modules:
+            self.model.eval()
+        return self
+
+    def _loss(self, denoiser: nn.Module, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
+        """Eq. 1 on a batch, ``(batch,)``."""
+        clean = self.model.normalization.encode(batch.states)
+        initial = None
+        if batch.initial_states is not None and self.model.initial_normalization is not None:
+            initial = self.model.initial_normalization.encode(batch.initial_states)
+        count = len(clean)
+        removed = torch.rand((count, 1), generator=draw, device=self.device) < dropout
+        concepts = torch.where(removed, self.model.empty, self.model.training_embeddings[batch.concepts])
+        t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
+        noise = torch.randn(clean.shape, generator=draw, device=self.device)
+        return denoising_loss(lambda x, t: denoiser(x, t, concepts, initial), clean, noise, t, self.model.alpha_bar)
+
+    def training_step(self, batch: Batch) -> Tensor:
+        draw = generator(self.device, self.seed, self.global_step)
+        loss = self._loss(self._trained, batch, draw, self.hparams["condition_dropout"]).mean()
+        if not loss.isfinite():
+            raise UserError(
+                f"training: the loss became {loss.item()} at step {self.global_step}; the last checkpoint before it is kept; "
+                "lower model.learning_rate"
+            )
+        self.log("train/loss", loss, prog_bar=True)
+        return loss
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Update the running average."""
+        decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.model.denoiser.parameters()), list(self.denoiser.parameters()), 1 - decay)
+
+    def validation_step(self, batch: Batch) -> None:
+        # The same noise every time, so that the curve shows the model and not the draw.
+        draw = generator(self.device, self.seed)
+        self.log("val/loss", self._loss(self.model.denoiser, batch, draw, 0.0).mean(), prog_bar=True, batch_size=len(batch.states))
+
+    test_step = validation_step
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """AdamW with warm-up and cosine decay."""
+        total = int(self.trainer.estimated_stepping_batches)
+        warmup = min(self.hparams["warmup_steps"], max(total // 10, 1))
+        optimizer = torch.optim.AdamW(
+            self.denoiser.parameters(), lr=self.hparams["learning_rate"], weight_decay=self.hparams["weight_decay"]
+        )
+
+        def factor(step: int) -> float:
+            return min(1.0, (step + 1) / warmup) * 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
+
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
+        """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if it needs a learned concept."""
+        if task.learned:
+            return None
+        embeddings = torch.stack([self.model.concept(text) for text in task.texts])
+        return embeddings, embeddings.new_full((len(embeddings),), self.guidance)
+
+    def concept_embeddings(self) -> dict[str, Tensor]:
+        """Every embedding ``(n,)`` by name, for the projector."""
+        return self.model.named_embeddings()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Sign the checkpoint."""
+        sign(self, checkpoint)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse another module's checkpoint."""
+        check_signature(self, checkpoint)

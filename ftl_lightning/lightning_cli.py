@@ -1,0 +1,63 @@
+"""The verbs that need a trainer: Lightning's command line with ``invert`` added."""
+
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from jsonargparse import set_parsing_settings
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.trainer import Trainer
+
+
+class CommandLine(LightningCLI):
+    """Lightning's command line; see its documentation for everything but ``invert``."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """The verbs, each with the arguments that are not options of it."""
+        verbs = LightningCLI.subcommands()
+        del verbs["predict"]  # `sample` is the verb for that
+        return verbs | {"invert": {"model", "datamodule"}}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """One seed for everything, unless a configuration says otherwise."""
+        parser.set_defaults({"seed_everything": 0})
+
+    def _parse_ckpt_path(self) -> None:
+        # Lightning would let the checkpoint's hyper-parameters, class included, override configuration and command line.
+        # Here the configuration rules, and a checkpoint of another class is refused.
+        path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
+        if path and path not in ("last", "best"):
+            if not Path(path).is_file():
+                raise UserError(f"ckpt_path: expected a checkpoint file, 'last' or 'best', found {path!r}, which does not exist")
+            try:
+                torch.load(path, weights_only=True, map_location="cpu")
+            except Exception as error:  # torch raises several kinds, none of its own
+                raise UserError(f"{path}: expected a checkpoint, found a damaged or foreign file") from error
+
+
+def run(arguments: list[str]) -> None:
+    """Parse and run one of Lightning's verbs or ``invert``."""
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
+    warnings.filterwarnings(
+        "ignore", message=".*resuming from a checkpoint that ended before the epoch ended.*"
+    )  # steps are stateless
+    warnings.filterwarnings("ignore", message=".*LightningCLI's args parameter is intended.*")
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    parser: dict[str, Any] = {"parser_mode": "omegaconf+"}
+    CommandLine(
+        pl.LightningModule,
+        pl.LightningDataModule,
+        trainer_class=Trainer,
+        subclass_mode_model=True,
+        subclass_mode_data=True,
+        save_config_kwargs={"overwrite": True},
+        parser_kwargs=parser,
+        args=arguments,
+    )

@@ -1,0 +1,15 @@
+"""Randomness as a function of a key: nothing depends on what was drawn before, so a resumed run repeats the unbroken one."""
+
+import numpy as np
+import torch
+
+
+def generator(device: torch.device | str, *key: int) -> torch.Generator:
+    """A generator that the key alone decides, for example ``(seed, step)``.
+
+    Args:
+        device: where it draws.
+        key: non-negative integers. They are mixed, since torch keeps 32 bits of a seed on CPUs.
+    """
+    seed = int(np.random.SeedSequence(key).generate_state(1)[0])
+    return torch.Generator(device=device).manual_seed(seed)

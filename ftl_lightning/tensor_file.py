@@ -1,0 +1,118 @@
+"""Files: written whole or not at all, read without unpickling anything."""
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+from torch import Tensor
+
+from ftl_lightning.errors import UserError
+
+_HEADER = "ftl_lightning"
+FORMAT = 1
+"""Version of the file form; a reader refuses others."""
+
+
+@contextmanager
+def atomic(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary name in the same folder, renamed to ``path`` when the block ends well and removed when it does not.
+
+    Raises:
+        UserError: where the folder cannot be written or the disk is full.
+    """
+    path = Path(path)
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror or error}); choose a writable place with room") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    value = os.umask(0)
+    os.umask(value)
+    return value
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> bytes:
+    """A safetensors file with a JSON header; the same content gives the same bytes.
+
+    Args:
+        kind: what the file is, checked when it is read.
+        tensors: by name.
+        header: anything JSON can hold.
+    """
+    # One metadata key: safetensors does not keep the order of several, and bytes would differ from run to run.
+    text = json.dumps({"kind": kind, "format": FORMAT, **header}, sort_keys=True)
+    return safetensors.torch.save({name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}, {_HEADER: text})
+
+
+def save_tensors(path: str | Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write what :func:`serialise` makes of its arguments, whole or not at all."""
+    with atomic(path) as temporary:
+        temporary.write_bytes(serialise(kind, tensors, header))
+
+
+def load_tensors(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what :func:`save_tensors` wrote.
+
+    Returns:
+        Tensors by name, and the header.
+
+    Raises:
+        UserError: for a file that is missing, damaged, or of another kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: expected a {kind} file, found {'a folder' if path.is_dir() else 'nothing'}")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get(_HEADER, "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({error})") from error
+    found = header.get("kind")
+    if found != kind:
+        raise UserError(f"{path}: expected a {kind} file, found {f'a {found} file' if found else 'a file of other software'}")
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path}: key 'format': expected {FORMAT}, found {header.get('format')!r}; it is of another version")
+    return tensors, header
+
+
+def bytes_hash(content: bytes) -> str:
+    """First 16 hexadecimal digits of the SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def file_hash(path: str | Path) -> str:
+    """The same of a file's bytes."""
+    return bytes_hash(Path(path).read_bytes())
+
+
+def content_hash(content: Any) -> str:
+    """The same of anything JSON can hold."""
+    return bytes_hash(json.dumps(content, sort_keys=True, default=str).encode())
