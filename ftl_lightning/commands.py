@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
+from ftl_lightning.ablation import Stage
+
 
 def generate(domain: str, task: str = "", count: int = 100, seed: int = 0, out: str = "demonstrations.safetensors") -> None:
     """Draw demonstrations of a task into a file.
@@ -123,7 +125,28 @@ def sample(
         print(figure)
 
 
-def ablate(config_file: str = "", dry_run: bool = False) -> None: ...
+def ablate(stages: list[Stage], results: str, seeds: list[int] = [0]) -> None:  # noqa: B006 (never changed)
+    """Run every cell of an ablation that the results do not hold yet.
+
+    Args:
+        stages: verbs with grids of options, in order.
+        results: results file that rows are added to.
+        seeds: each stage runs once a seed.
+    """
+    from ftl_lightning.ablation import run_ablation
+
+    run_ablation(stages, seeds, results)
 
 
-def report(results: str = "results", out: str = "results/report") -> None: ...
+def report(results: str = "results", out: str = "results/report", readme: str = "") -> None:
+    """Tables and figures from results, beside the paper's numbers.
+
+    Args:
+        results: a results file, or a folder of them.
+        out: folder for Markdown, LaTeX and figures.
+        readme: a Markdown file to update between its marks.
+    """
+    from ftl_lightning.reporting.report import write_report
+
+    print(write_report(Path(results), Path(out), Path(readme) if readme else None))
+    print(f"written to {out}")

@@ -3,7 +3,6 @@
 import logging
 import warnings
 from pathlib import Path
-from typing import Any
 
 import lightning.pytorch as pl
 import torch
@@ -11,6 +10,7 @@ from jsonargparse import set_parsing_settings
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.trainer import Trainer
 
 
@@ -25,7 +25,8 @@ class CommandLine(LightningCLI):
         return verbs | {"invert": {"model", "datamodule"}}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """One seed for everything, unless a configuration says otherwise."""
+        """One seed for everything, unless a configuration says otherwise, and the evaluator's options."""
+        parser.add_lightning_class_args(Evaluator, "evaluation")
         parser.set_defaults({"seed_everything": 0})
 
     def _parse_ckpt_path(self) -> None:
@@ -43,21 +44,31 @@ class CommandLine(LightningCLI):
 
 def run(arguments: list[str]) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
+    _command_line(arguments, run=True)
+
+
+def build(options: list[str]) -> CommandLine:
+    """Parse the options of a verb and build trainer, model and data without running anything."""
+    return _command_line(options, run=False)
+
+
+def _command_line(arguments: list[str], run: bool) -> CommandLine:
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
-    warnings.filterwarnings(
-        "ignore", message=".*resuming from a checkpoint that ended before the epoch ended.*"
-    )  # steps are stateless
+    warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
+    warnings.filterwarnings("ignore", message=".*module.s. in eval mode at the start of training.*")  # averaged or frozen
+    warnings.filterwarnings("ignore", message=".*resuming from a checkpoint that ended before the epoch ended.*")  # steps are stateless
     warnings.filterwarnings("ignore", message=".*LightningCLI's args parameter is intended.*")
+    warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    parser: dict[str, Any] = {"parser_mode": "omegaconf+"}
-    CommandLine(
+    return CommandLine(
         pl.LightningModule,
         pl.LightningDataModule,
         trainer_class=Trainer,
         subclass_mode_model=True,
         subclass_mode_data=True,
         save_config_kwargs={"overwrite": True},
-        parser_kwargs=parser,
+        parser_kwargs={"parser_mode": "omegaconf+"},
+        run=run,
         args=arguments,
     )

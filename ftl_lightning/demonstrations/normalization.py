@@ -18,8 +18,8 @@ class Normalization(nn.Module):
 
     def __init__(self, low: Tensor, high: Tensor) -> None:
         super().__init__()
-        self.register_buffer("low", low.float())
-        self.register_buffer("high", high.float())
+        self.register_buffer("low", low.float().clone())
+        self.register_buffer("high", high.float().clone())
 
     @classmethod
     def fit(cls, states: Tensor) -> Self:

@@ -93,6 +93,7 @@ class Domain:
         render: ``(states (sample, horizon, state), right (sample,) of bool, title) -> figure``.
         references: trivial policies to print beside every rate: name to ``(goal, count, seed) -> states``.
         published: the paper's numbers for this domain.
+        omega: the fixed guidance weight of the paper's main figures, as text.
     """
 
     name: str
@@ -108,6 +109,7 @@ class Domain:
     render: Callable[[Tensor, Sequence[bool], str], Figure]
     references: Mapping[str, Callable[[str, int, int], Tensor]] = field(default_factory=dict)
     published: tuple[Published, ...] = ()
+    omega: str = "1.2"
 
     @property
     def table(self) -> Path:

@@ -7,7 +7,7 @@ model and :class:`Generates`.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import lightning.pytorch as pl
 import torch
@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torchmetrics import MeanMetric
 
+from ftl_lightning import __version__
 from ftl_lightning.diffusion.samplers import SAMPLERS
 from ftl_lightning.domains.domain import Domain, EvaluationTask, Suite, load_domain
 from ftl_lightning.errors import UserError
@@ -48,6 +49,11 @@ class Judged:
     states: Tensor
     right: Tensor
 
+    @classmethod
+    def of(cls, task: EvaluationTask, states: Tensor, domain: Domain) -> Self:
+        """Judge states by the task's goal."""
+        return cls(task, states, domain.succeeded(task.goal, states))
+
     @property
     def accuracy(self) -> float:
         """Share of right samples."""
@@ -78,11 +84,11 @@ class Evaluator(pl.Callback):
 
     def __init__(
         self,
-        suites: Sequence[str],
+        suites: Sequence[str] = ("training",),
         samples: int = 50,
         sampler: str = "ddpm",
         steps: int = 100,
-        temperature: float = 0.5,
+        temperature: float = 0.2,
         figures: int = 16,
         results: str | None = None,
         seed: int = 0,
@@ -96,6 +102,7 @@ class Evaluator(pl.Callback):
         self.results = results
         self.seed = seed
         self.judged: list[Judged] = []
+        self._projected = False
 
     def _tasks(self, domain: Domain, module: Generates) -> Suite:
         for name in self.suites:
@@ -121,7 +128,7 @@ class Evaluator(pl.Callback):
             self.temperature,
             generator(model.alpha_bar.device, self.seed),
         ).cpu()
-        return [Judged(task, own, domain.succeeded(task.goal, own)) for task, own in zip(tasks, states, strict=True)]
+        return [Judged.of(task, own, domain) for task, own in zip(tasks, states, strict=True)]
 
     def _run(self, trainer: pl.Trainer, module: pl.LightningModule, stage: str) -> None:
         if trainer.sanity_checking:
@@ -140,12 +147,14 @@ class Evaluator(pl.Callback):
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 self._draw(logger, domain, trainer.global_step)
-                log_projector(logger, module.concept_embeddings(), trainer.global_step)
+                if not self._projected:  # training embeddings do not change while fitting
+                    log_projector(logger, module.concept_embeddings(), trainer.global_step)
+                    self._projected = True
                 if stage == "test":
-                    log_hparams(logger, self._configuration(module, trainer), metrics)
+                    log_hparams(logger, self._configuration(module, trainer.datamodule), metrics)  # type: ignore[attr-defined]
         if stage == "test" and self.judged:
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
-            append_rows(path, self._rows(module, trainer))
+            append_rows(path, self._rows(module, trainer.datamodule))  # type: ignore[attr-defined]
 
     def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
         for one in self.judged if self.figures else ():
@@ -153,8 +162,11 @@ class Evaluator(pl.Callback):
             figure = domain.render(one.states[shown], one.right[shown].tolist(), f"{one.task.name}: {one.accuracy:.2f}")
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
 
-    def _configuration(self, module: Generates, trainer: pl.Trainer) -> dict[str, Any]:
-        data = trainer.datamodule  # type: ignore[attr-defined]
+    def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:
+        """16 hexadecimal digits that everything configured decides: model, data, evaluation and the pretrained weights."""
+        return content_hash([__version__, self._configuration(module, data)])
+
+    def _configuration(self, module: Generates, data: pl.LightningDataModule) -> dict[str, Any]:
         return {
             **{f"model/{key}": value for key, value in dict(module.hparams).items() if key not in ("pretrained", "output")},
             **{f"data/{key}": value for key, value in dict(data.hparams).items() if key != "demonstrations"},
@@ -162,25 +174,35 @@ class Evaluator(pl.Callback):
             "model/pretrained": module.model.hash,
         }
 
-    def _rows(self, module: Generates, trainer: pl.Trainer) -> list[Row]:
-        configuration = self._configuration(module, trainer)
-        return [
-            Row(
-                domain=module.model.config.domain,
-                setting=one.task.setting,
-                task=one.task.name,
-                method=module.method,
-                K=module.hparams.get("components", 0),
-                omega=str(module.hparams.get("omega", module.hparams.get("guidance"))),
-                seed=module.hparams["seed"],
-                n=len(one.right),
+    def _rows(self, module: Generates, data: pl.LightningDataModule) -> list[Row]:
+        hparams = module.hparams
+        model_hash, config_hash = module.model.hash, self.config_hash(module, data)
+        domain = load_domain(module.model.config.domain)
+
+        def row(task: EvaluationTask, method: str, components: int, omega: str, value: float) -> Row:
+            return Row(
+                domain=domain.name,
+                setting=task.setting,
+                task=task.name,
+                method=method,
+                K=components,
+                omega=omega,
+                seed=hparams["seed"],
+                n=self.samples,
                 metric="accuracy",
-                value=one.accuracy,
-                model_hash=module.model.hash,
-                config_hash=content_hash(configuration),
+                value=round(value, 6),
+                model_hash=model_hash,
+                config_hash=config_hash,
             )
+
+        omega = str(hparams.get("omega", hparams.get("guidance")))
+        ours = [row(one.task, module.method, hparams.get("components", 0), omega, one.accuracy) for one in self.judged]
+        references = [
+            row(one.task, name, 0, "", Judged.of(one.task, policy(one.task.goal, self.samples, self.seed), domain).accuracy)
+            for name, policy in domain.references.items()
             for one in self.judged
         ]
+        return ours + references
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

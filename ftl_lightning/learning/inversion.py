@@ -18,6 +18,9 @@ from ftl_lightning.learning.checkpoint import check_signature, sign
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
 
+FINAL_SAMPLES = 640
+"""Noised demonstrations on which a learned concept is judged, the same for all restarts."""
+
 
 class InversionModule(pl.LightningModule):
     """Learns K embeddings and their weights for every concept of an :class:`InversionData`, all in one batch.
@@ -168,6 +171,13 @@ class InversionModule(pl.LightningModule):
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         return losses.mean(dim=1).sum()
 
+    @torch.no_grad()
+    def test_step(self, step: int) -> None:
+        # The loss on common noise; behaviour is judged by the evaluator.
+        self.log("test/loss", self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(), batch_size=1)
+
+    validation_step = test_step
+
     def train(self, mode: bool = True) -> "InversionModule":
         """Switch modes; the pretrained model stays in evaluation mode."""
         super().train(mode)
@@ -195,9 +205,9 @@ class InversionModule(pl.LightningModule):
         check_signature(self, checkpoint)
 
     @torch.no_grad()
-    def learned(self, samples: int = 640) -> dict[str, Concept]:
+    def learned(self) -> dict[str, Concept]:
         """The concepts by name: of each, the restart with the lowest loss on common noise."""
-        losses = self._losses(samples, generator(self.device, self.seed, 2)).mean(dim=1).unflatten(0, (-1, self.restarts))
+        losses = self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(dim=1).unflatten(0, (-1, self.restarts))
         best = losses.argmin(dim=1)
         embeddings = self.parametrised.detach().unflatten(0, (-1, self.restarts))
         weights = self.weights.detach().unflatten(0, (-1, self.restarts))
@@ -230,20 +240,19 @@ class InversionModule(pl.LightningModule):
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
         """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
-        if task.learned not in self._found or (task.component or 0) > self.hparams["components"]:
-            return None
-        concept = self._found[task.learned]
-        embeddings, weights = concept.embeddings.to(self.device), concept.weights.to(self.device)
-        if task.component is not None:
-            chosen = slice(task.component - 1, task.component)
-            return embeddings[chosen], weights[chosen]
-        if not task.texts:
-            return embeddings, weights
-        added = torch.stack([self.model.concept(text) for text in task.texts])
         omega = self.hparams["training_omega"]
         if omega is None:
             omega = 1.0 if self.hparams["omega"] == "learned" else self.hparams["omega"]
-        return torch.cat((embeddings, added)), torch.cat((weights, weights.new_full((len(added),), omega)))
+        embeddings = [self.model.concept(text) for text in task.texts]
+        weights = [omega] * len(task.texts)
+        if task.learned:
+            if task.learned not in self._found or (task.component or 0) > self.hparams["components"]:
+                return None
+            concept = self._found[task.learned]
+            chosen = slice(None) if task.component is None else slice(task.component - 1, task.component)
+            embeddings += concept.embeddings[chosen].to(self.device)
+            weights += concept.weights[chosen].tolist()
+        return torch.stack(embeddings), torch.tensor(weights, device=self.device)
 
     def concept_embeddings(self) -> dict[str, Tensor]:
         """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""

@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
@@ -38,7 +39,8 @@ class PretrainingModule(pl.LightningModule):
         ema_decay: of the running average; it starts lower.
         guidance: weight omega with which training concepts are generated in evaluation.
         compile: compile the denoiser for training (worth it on GPUs).
-        seed: decides noise, timesteps and condition dropout as a function of the step.
+        output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
+        seed: decides initial weights, and noise, timesteps and condition dropout as a function of the step.
     """
 
     method = "FTL-IGM"
@@ -55,6 +57,7 @@ class PretrainingModule(pl.LightningModule):
         ema_decay: float = 0.999,
         guidance: float = 1.2,
         compile: bool = False,
+        output: str | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -85,7 +88,7 @@ class PretrainingModule(pl.LightningModule):
             denoiser=self.hparams["denoiser"],
             denoiser_args=self.denoiser_args,
             diffusion_steps=self.hparams["diffusion_steps"],
-            training={"model": dict(self.hparams), "data": dict(data.hparams), "max_steps": self.trainer.max_steps},
+            training={"model": {key: value for key, value in self.hparams.items() if key != "output"}, "data": dict(data.hparams), "max_steps": self.trainer.max_steps},
         )
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
@@ -131,8 +134,9 @@ class PretrainingModule(pl.LightningModule):
         self.log("train/loss", loss, prog_bar=True)
         return loss
 
-    def on_train_batch_end(self, *_: Any) -> None:
-        """Update the running average."""
+    def optimizer_step(self, *arguments: Any, **options: Any) -> None:
+        """Step, then update the running average; here, so that no checkpoint falls between the two."""
+        super().optimizer_step(*arguments, **options)
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.model.denoiser.parameters()), list(self.denoiser.parameters()), 1 - decay)
@@ -157,6 +161,10 @@ class PretrainingModule(pl.LightningModule):
 
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_fit_end(self) -> None:
+        """Write the averaged model for ``invert`` and ``sample``."""
+        self.model.save(self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
         """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if it needs a learned concept."""

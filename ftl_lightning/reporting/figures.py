@@ -1,0 +1,46 @@
+"""Figures from results."""
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.reporting.tables import summarise
+
+PAPER_COLOUR = "#9a9a9a"
+COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3")
+
+
+def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
+    """Accuracy of every setting beside the paper's, K = 2 and the paper's fixed omega; bars show standard errors over tasks.
+
+    Args:
+        domain: the domain.
+        results: rows of the results file.
+    """
+    rows = results[(results["domain"] == domain.name) & (results["metric"] == "accuracy")]
+    ours = rows[(rows["K"] == 2) & (rows["omega"] == domain.omega)]
+    names = ("training", "paper")
+    settings = [s for name in names for s in domain.suites[name].settings if s in set(ours["setting"])]
+    methods = sorted(set(ours["method"]))
+    figure = Figure(figsize=(1.9 * max(len(settings), 2) + 1.5, 3.4), layout="constrained")
+    axes = figure.subplots()
+    width = 0.8 / (len(methods) + 1)
+    published = {found.setting: found for found in domain.published if not found.task and found.omega == domain.omega}
+    chance = rows[rows["K"] == 0]
+    for place, setting in enumerate(settings):
+        found = published.get(setting)
+        if found:
+            axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label="paper" if place == 1 else None)
+        for index, method in enumerate(methods, start=1):
+            number = summarise(ours[(ours["setting"] == setting) & (ours["method"] == method)])
+            if number:
+                label = method if place == 0 else None
+                axes.bar(place + index * width, number.mean, width, yerr=number.error, color=COLOURS[index - 1], capsize=2, label=label)
+        trivial = summarise(chance[(chance["setting"] == setting) & chance["method"].str.startswith("random")])
+        if trivial:
+            span = (place - width / 2, place + (len(methods) + 0.5) * width)
+            axes.hlines(trivial.mean, *span, colors="black", linestyles="dotted", label="chance" if place == 0 else None)
+    axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
+    axes.set(ylim=(0, 1.05), ylabel="accuracy", title=f"{domain.name}, K = 2, omega = {domain.omega}")
+    axes.legend(fontsize=8, loc="lower left")
+    return figure

@@ -1,0 +1,209 @@
+"""Tables from results, each number beside the paper's: Markdown to read, LaTeX to paste."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from ftl_lightning.domains.domain import Domain, Published
+from ftl_lightning.evaluation.evaluator import standard_error
+
+MISSING = "-"
+
+
+@dataclass(frozen=True)
+class Number:
+    """A measured accuracy.
+
+    Attributes:
+        mean: over tasks and seeds.
+        error: standard error over tasks, of the means over seeds; ``None`` for a single task.
+        spread: standard deviation over seeds, of the means over tasks; ``None`` for a single seed.
+        seeds: how many.
+    """
+
+    mean: float
+    error: float | None
+    spread: float | None
+    seeds: int
+
+    def __str__(self) -> str:
+        error = "" if self.error is None else f" ± {self.error:.2f}"
+        spread = "" if self.spread is None else f" (seeds {self.spread:.2f})"
+        return f"{self.mean:.2f}{error}{spread}"
+
+
+def summarise(rows: pd.DataFrame) -> Number | None:
+    """The number behind some rows of the results, or ``None`` for no rows."""
+    if rows.empty:
+        return None
+    by_task = rows.groupby("task")["value"].mean()
+    by_seed = rows.groupby("seed")["value"].mean()
+    return Number(
+        mean=float(by_task.mean()),
+        error=standard_error(by_task.tolist()) if len(by_task) > 1 else None,
+        spread=float(by_seed.std()) if len(by_seed) > 1 else None,
+        seeds=len(by_seed),
+    )
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes:
+        name: of its files.
+        caption: one sentence.
+        cells: rows and columns of text.
+    """
+
+    name: str
+    caption: str
+    cells: pd.DataFrame
+
+    def markdown(self) -> str:
+        """GitHub's Markdown, caption first."""
+        lines = [list(self.cells.columns), ["---"] * len(self.cells.columns), *self.cells.to_numpy().tolist()]
+        return f"**{self.caption}**\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+    def latex(self) -> str:
+        """A booktabs table."""
+        lines = [" & ".join(map(_escape, row)) + r" \\" for row in [list(self.cells.columns), *self.cells.to_numpy().tolist()]]
+        columns = "l" + "c" * (len(self.cells.columns) - 1)
+        body = "\n".join((lines[0], r"\midrule", *lines[1:]))
+        return (
+            f"\\begin{{table}}\n\\caption{{{_escape(self.caption)}}}\n\\begin{{tabular}}{{{columns}}}\n\\toprule\n{body}\n"
+            "\\bottomrule\n\\end{tabular}\n\\end{table}\n"
+        )
+
+
+def _escape(text: str) -> str:
+    for plain, escaped in (("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$")):
+        text = text.replace(plain, escaped)
+    return text
+
+
+def _select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
+    for column, value in values.items():
+        rows = rows[rows[column] == value]
+    return rows
+
+
+def _paper(found: Published | None) -> str:
+    if found is None:
+        return MISSING
+    return f"{found.value:.2f}" + ("" if found.error is None else f" ± {found.error:.2f}")
+
+
+def _text(number: Number | None) -> str:
+    return MISSING if number is None else str(number)
+
+
+def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
+    """Learned methods and reference policies among the results, each sorted."""
+    learned = sorted(set(rows.loc[rows["K"] > 0, "method"]))
+    return learned, sorted(set(rows.loc[rows["K"] == 0, "method"]) - set(learned))
+
+
+def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
+    """Every table of a domain for which there are results."""
+    rows = _select(results, domain=domain.name, metric="accuracy")
+    candidates = (_accuracy(domain, rows), _count(domain, rows), _omega(domain, rows), _components(domain, rows))
+    return [table for table in candidates if not table.cells.empty]
+
+
+def _lookup(domain: Domain, setting: str, task: str, components: int, omega: str) -> Published | None:
+    for found in domain.published:
+        if (found.setting, found.task, found.components, found.omega) == (setting, task, components, omega):
+            return found
+    return None
+
+
+def _accuracy(domain: Domain, rows: pd.DataFrame) -> Table:
+    """The bars of the paper's main figure, with trivial policies and the oracle beside them."""
+    learned, references = _columns(rows)
+    lines = []
+    for setting in _settings(domain):
+        alone = [found.task for found in domain.published if found.setting == setting and found.task and found.omega == domain.omega]
+        for task in ("", *alone):
+            own = _select(rows, setting=setting) if not task else _select(rows, setting=setting, task=task)
+            ours = _select(own, K=2, omega=domain.omega)
+            if ours.empty:
+                continue
+            line = [f"- {task}" if task else setting, _paper(_lookup(domain, setting, task, 2, domain.omega))]
+            line += [_text(summarise(_select(ours, method=method))) for method in learned]
+            line += [_text(summarise(_select(own, K=0, method=method))) for method in references]
+            lines.append(line)
+    caption = f"{domain.name}: accuracy, K = 2, fixed omega {domain.omega}. Mean ± standard error over tasks (spread over seeds)"
+    return Table("accuracy", caption, pd.DataFrame(lines, columns=["setting", "paper", *learned, *references], dtype=str))
+
+
+def _settings(domain: Domain) -> list[str]:
+    """Settings of the paper's suites, without the analysis of components."""
+    names = [setting for suite in ("training", "paper") for setting in domain.suites[suite].settings]
+    return list(dict.fromkeys(names))
+
+
+def _grid(
+    name: str, caption: str, learned: Sequence[str], lines: list[tuple[str, str, str, Callable[[str], Number | None]]], heads: tuple[str, str]
+) -> Table:
+    cells = [
+        [first, second, paper, *(_text(ours(method)) for method in learned)]
+        for first, second, paper, ours in lines
+        if any(ours(method) for method in learned)
+    ]
+    return Table(name, caption, pd.DataFrame(cells, columns=[*heads, "paper", *learned], dtype=str))
+
+
+def _count(domain: Domain, rows: pd.DataFrame) -> Table:
+    """The ablation on the number of learned concepts, with learned weights."""
+    learned, _ = _columns(rows)
+    own = _select(rows, omega="learned")
+    lines = [
+        (
+            setting,
+            str(count),
+            _paper(_lookup(domain, setting, "", count, "learned")),
+            lambda method, setting=setting, count=count: summarise(_select(own, setting=setting, K=count, method=method)),
+        )
+        for setting in domain.suites["paper"].settings
+        for count in sorted(set(own.loc[own["K"] > 0, "K"]))
+    ]
+    caption = f"{domain.name}: number of learned concepts K, with learned weights"
+    return _grid("concept_count", caption, learned, lines, ("setting", "K"))
+
+
+def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
+    """The effect of the guidance weight, K = 2."""
+    learned, _ = _columns(rows)
+    own = _select(rows, K=2)
+    settings = domain.suites["paper"].settings
+    lines = [
+        (
+            setting,
+            omega,
+            _paper(_lookup(domain, setting, "", 2, omega)),
+            lambda method, setting=setting, omega=omega: summarise(_select(own, setting=setting, omega=omega, method=method)),
+        )
+        for setting in settings
+        for omega in sorted(set(own["omega"]))
+    ]
+    return _grid("omega", f"{domain.name}: guidance weight omega, K = 2", learned, lines, ("setting", "omega"))
+
+
+def _components(domain: Domain, rows: pd.DataFrame) -> Table:
+    """What each learned component generates alone, with learned weights."""
+    learned, _ = _columns(rows)
+    own = _select(rows, K=2, omega="learned")
+    suite = domain.suites.get("components")
+    lines = [
+        (
+            task.name,
+            task.setting,
+            _paper(_lookup(domain, task.setting, task.name, 2, "learned")),
+            lambda method, task=task: summarise(_select(own, setting=task.setting, task=task.name, method=method)),
+        )
+        for task in (suite.tasks if suite else ())
+    ]
+    caption = f"{domain.name}: accuracy of what each learned component generates alone, learned weights"
+    return _grid("components", caption, learned, lines, ("concept", "generated from"))

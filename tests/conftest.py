@@ -1,0 +1,62 @@
+"""Fixtures: a small model trained once a session, through the command line that users have."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+
+ROOT = Path(__file__).parent.parent
+CONF = ROOT / "conf"
+TINY = [
+    "--model.denoiser_args={hidden_dim: 64, depth: 2, condition_dim: 32}",
+    "--data.samples_per_concept=50",
+    "--data.validation_per_concept=4",
+    "--data.batch_size=64",
+    "--trainer.enable_progress_bar=false",
+    "--trainer.accelerator=cpu",
+]
+"""Options that make any fit of object rearrangement a matter of seconds."""
+
+
+@pytest.fixture(autouse=True)
+def _in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # logs and outputs of a test stay its own
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small pretrained model; its log folder is the parent."""
+    folder = tmp_path_factory.mktemp("tiny")
+    arguments = ["fit", "--config", str(CONF / "object_rearrangement.yaml"), *TINY, "--trainer.max_steps=150"]
+    arguments += ["--data.steps_per_epoch=75", f"--trainer.logger.init_args.save_dir={folder}", "--evaluation.samples=4"]
+    assert main(arguments) == 0
+    return folder / "object_rearrangement" / "fit" / "pretrained"
+
+
+@pytest.fixture(scope="session")
+def shipped() -> Path:
+    """Folder of the model that ships with the repository."""
+    return ROOT / "pretrained" / "object_rearrangement"
+
+
+@pytest.fixture
+def invert(tiny: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Run a short inversion through the tiny model; returns its log folder."""
+
+    def run(*options: str) -> Path:
+        arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+        arguments += ["--data.steps=5", "--model.samples=4", "--evaluation.samples=3", "--evaluation.steps=3"]
+        arguments += ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", *options]
+        assert main(arguments) == 0
+        return tmp_path / "logs" / "object_rearrangement" / "invert"
+
+    return run

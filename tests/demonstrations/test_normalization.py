@@ -1,0 +1,31 @@
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ftl_lightning.demonstrations.normalization import Normalization
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    rows=st.integers(1, 6),
+    columns=st.integers(1, 5),
+    constant=st.integers(0, 4),
+    scale=st.floats(1e-2, 1e4),
+    seed=st.integers(0, 2**31),
+)
+def test_round_trip_and_range_survive_constant_columns(rows: int, columns: int, constant: int, scale: float, seed: int) -> None:
+    states = scale * torch.randn((rows, 2, columns), generator=torch.Generator().manual_seed(seed))
+    states[..., constant % columns] = 3.25
+    normalization = Normalization.fit(states)
+    normalised = normalization.encode(states)
+    assert normalised.isfinite().all()
+    assert normalised.abs().max() <= 1 + 1e-5
+    assert (normalised[..., constant % columns] == 0).all()
+    assert torch.allclose(normalization.decode(normalised), states, rtol=1e-4, atol=1e-4 * scale)
+
+
+def test_it_is_kept_with_a_model() -> None:
+    fitted = Normalization.fit(torch.tensor([[0.0, 1.0], [2.0, 1.0]]))
+    other = Normalization(torch.zeros(2), torch.zeros(2))
+    other.load_state_dict(fitted.state_dict())
+    assert torch.equal(other.encode(torch.tensor([[1.0, 1.0]])), torch.tensor([[0.0, 0.0]]))

@@ -1,0 +1,113 @@
+"""The samplers against diffusers' schedulers, on an epsilon that is known in closed form."""
+
+from typing import Any
+
+import pytest
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
+from torch import Tensor
+
+from ftl_lightning.diffusion.samplers import SAMPLERS, ddim, ddpm, dpm_solver, timesteps
+from ftl_lightning.diffusion.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
+
+ALPHA_BAR = cosine_alpha_bar(100)
+SHAPE = (400, 1, 2)
+MEAN, DEVIATION = 0.2, 0.1
+
+
+def exact(x: Tensor, t: Tensor) -> Tensor:
+    """The optimal noise estimate for data from N(MEAN, DEVIATION^2)."""
+    alpha_bar = ALPHA_BAR[t][:, None, None]
+    variance = alpha_bar * DEVIATION**2 + 1 - alpha_bar
+    return (1 - alpha_bar).sqrt() * (x - alpha_bar.sqrt() * MEAN) / variance
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def theirs(scheduler: Any, steps: list[int], noises: torch.Generator) -> Tensor:
+    x = torch.randn(SHAPE, generator=noises)
+    for t in steps:
+        x = scheduler.step(exact(x, torch.full((len(x),), t)), t, x, generator=noises).prev_sample
+    return x
+
+
+def betas() -> Any:
+    alpha = ALPHA_BAR / torch.cat((torch.ones(1), ALPHA_BAR[:-1]))
+    return (1 - alpha).numpy()
+
+
+def test_the_schedule_is_the_cosine_one() -> None:
+    theirs = DDPMScheduler(num_train_timesteps=100, beta_schedule="squaredcos_cap_v2").alphas_cumprod
+    assert torch.allclose(ALPHA_BAR, theirs, atol=1e-5)
+
+
+def test_ddpm_equals_diffusers() -> None:
+    scheduler = DDPMScheduler(num_train_timesteps=100, trained_betas=betas(), variance_type="fixed_small", clip_sample_range=1.0)
+    scheduler.set_timesteps(100)
+    ours = ddpm(exact, SHAPE, ALPHA_BAR, 100, 1.0, generator())
+    assert torch.allclose(ours, theirs(scheduler, list(range(99, -1, -1)), generator()), atol=1e-4)
+
+
+@pytest.mark.parametrize("steps", [10, 25, 100])
+def test_ddim_equals_diffusers(steps: int) -> None:
+    # Their spacing of few steps differs from ours at the ends, so each of our steps is given to them as a schedule of two.
+    x = torch.randn(SHAPE, generator=generator())
+    scheduler = DDIMScheduler(num_train_timesteps=100, trained_betas=betas(), clip_sample_range=1.0)
+    scheduler.num_inference_steps = 100
+    visited = timesteps(100, steps)
+    for t, before in zip(visited, visited[1:], strict=False):
+        scheduler.alphas_cumprod = ALPHA_BAR[[before, t]]
+        x = scheduler.step(exact(x, torch.full((len(x),), t)), 1, x).prev_sample
+    x = clean_from_epsilon(x, exact(x, torch.full((len(x),), 0)), ALPHA_BAR[0])
+    assert torch.allclose(ddim(exact, SHAPE, ALPHA_BAR, steps, 1.0, generator()), x, atol=1e-4)
+
+
+@pytest.mark.parametrize("steps", [10, 20])
+def test_dpm_solver_equals_diffusers(steps: int) -> None:
+    scheduler = DPMSolverMultistepScheduler(
+        num_train_timesteps=100, trained_betas=betas(), solver_order=2, lower_order_final=False, final_sigmas_type="zero"
+    )
+    scheduler.set_timesteps(steps)
+    visited = torch.tensor(timesteps(100, steps))
+    scheduler.timesteps = visited
+    scheduler.sigmas = torch.cat((((1 - ALPHA_BAR) / ALPHA_BAR).sqrt()[visited], torch.zeros(1)))
+    x = torch.randn(SHAPE, generator=generator())
+    for t in visited:
+        x = scheduler.step(exact(x, t.expand(len(x))), t, x).prev_sample
+    assert torch.allclose(dpm_solver(exact, SHAPE, ALPHA_BAR, steps, 1.0, generator()), x, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_every_sampler_finds_the_distribution(name: str) -> None:
+    samples = SAMPLERS[name](exact, SHAPE, ALPHA_BAR, 50, 1.0, generator())
+    assert samples.mean().item() == pytest.approx(MEAN, abs=0.02)
+    assert samples.std().item() == pytest.approx(DEVIATION, abs=0.02)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_a_seed_repeats_and_a_low_temperature_narrows(name: str) -> None:
+    first, again, cold = (SAMPLERS[name](exact, SHAPE, ALPHA_BAR, 20, alpha, generator()) for alpha in (1.0, 1.0, 0.1))
+    assert torch.equal(first, again)
+    assert cold.std() < 0.6 * first.std()
+
+
+def test_timesteps_cover_the_schedule() -> None:
+    assert timesteps(100, 100) == list(range(99, -1, -1))
+    assert timesteps(100, 12) == [99, 90, 81, 72, 63, 54, 45, 36, 27, 18, 9, 0]
+    with pytest.raises(ValueError, match="expected 1 to 100"):
+        timesteps(100, 101)
+
+
+def test_noise_can_be_taken_off_again() -> None:
+    clean = torch.rand(5, 2, 3) * 2 - 1
+    noise = torch.randn(5, 2, 3)
+    alpha_bar = ALPHA_BAR[torch.tensor([0, 10, 50, 70, 80])]
+    assert torch.allclose(clean_from_epsilon(add_noise(clean, noise, alpha_bar), noise, alpha_bar), clean, atol=1e-4)
+
+
+def test_the_loss_of_the_true_noise_is_zero() -> None:
+    noise = torch.randn(4, 1, 3)
+    t = torch.tensor([0, 10, 50, 99])
+    assert torch.equal(denoising_loss(lambda x, t: noise, torch.zeros(4, 1, 3), noise, t, ALPHA_BAR), torch.zeros(4))

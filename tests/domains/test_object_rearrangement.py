@@ -1,0 +1,160 @@
+import itertools
+import time
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ftl_lightning.domains.domain import domain_names, load_domain
+from ftl_lightning.domains.object_rearrangement.relations import (
+    PER_SHAPE,
+    SHAPES,
+    TRAINING_RELATIONS,
+    Relation,
+    circumradius,
+    columns,
+    holds,
+    overlap,
+    parse,
+)
+from ftl_lightning.errors import UserError
+
+DOMAIN = load_domain("object_rearrangement")
+TASKS = [task.goal for suite in ("training", "paper", "validation") for task in DOMAIN.suites[suite].tasks]
+
+
+def scene(**shapes: tuple[float, float, float]) -> torch.Tensor:
+    """One state from ``shape=(x, y, radius)``."""
+    state = torch.zeros(len(SHAPES), PER_SHAPE)
+    for index, shape in enumerate(SHAPES):
+        state[index, :3] = torch.tensor(shapes.get(shape, (0.0, 5.0, 0.3)))
+        state[index, 4 + index] = 1
+    return state.reshape(1, -1)
+
+
+def test_the_papers_numbers_of_concepts_and_tasks() -> None:
+    assert len(DOMAIN.training_concepts) == 12
+    count = {name: [task.setting for task in suite.tasks] for name, suite in DOMAIN.suites.items()}
+    assert {setting: count["paper"].count(setting) for setting in DOMAIN.suites["paper"].settings} == {
+        "training composition": 5,
+        "new concept": 5,
+        "new + training": 5,
+    }
+    assert count["validation"].count("training composition") >= 6
+    learned = DOMAIN.suites["validation"].learned
+    assert not set(learned) & set(DOMAIN.suites["paper"].learned)
+    assert len(DOMAIN.suites["paper"].learned) == 10
+
+
+def test_the_training_set_is_the_papers_size_and_quick() -> None:
+    start = time.perf_counter()
+    training = DOMAIN.training_set(920, 0)
+    assert time.perf_counter() - start < 10
+    assert training.states.shape == (11_040, 1, 21)
+    assert torch.equal(training.states, DOMAIN.training_set(920, 0).states)
+    assert not torch.equal(training.states, DOMAIN.training_set(920, 1).states)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_generated_scenes_show_the_task_and_nothing_else(task: str) -> None:
+    states = DOMAIN.generate(task, 20, 3).states
+    assert DOMAIN.succeeded(task, states).all()
+    flat = states[:, 0]
+    assert not overlap(flat).any()
+    x, y, radius = columns(flat)
+    assert ((x >= 0) & (x <= 5) & (y >= 0) & (y <= 5)).all()
+    assert ((radius >= 0.3) & (radius <= 1.0)).all()
+    assert torch.equal(flat.unflatten(-1, (3, 7))[..., 4:], torch.eye(3).expand(20, 3, 3))
+    named = parse(task)
+    for relation in named:
+        assert holds(relation, flat, relaxed=False).all()
+    about = {frozenset(relation.shapes) for relation in named if relation.kind in ("diagonal to", "antidiagonal to", "next to")}
+    for relation in TRAINING_RELATIONS:
+        if relation not in named and frozenset(relation.shapes) not in about:
+            assert not holds(relation, flat, relaxed=False).any()
+
+
+def test_a_task_is_independent_of_others_and_of_the_count() -> None:
+    task = "circle right of square"
+    training = DOMAIN.training_set(8, 5).select(task).states
+    assert torch.equal(DOMAIN.generate(task, 8, 5).states, training)
+    assert torch.equal(DOMAIN.generate(task, 4, 5).states, training[:4])
+
+
+@pytest.mark.parametrize(
+    ("relation", "shapes", "exact", "relaxed"),
+    [
+        ("circle right of square", {"circle": (3, 2, 0.5), "square": (1, 1.6, 0.9)}, True, True),
+        ("circle right of square", {"circle": (3, 2, 0.5), "square": (1, 1, 0.9)}, False, True),
+        ("circle right of square", {"circle": (3, 4, 0.5), "square": (1, 1, 0.9)}, False, False),
+        ("circle right of square", {"circle": (1, 2, 0.5), "square": (3, 2, 0.9)}, False, False),
+        ("circle above square", {"circle": (2, 4, 0.5), "square": (2.5, 1, 0.3)}, True, True),
+        ("circle above square", {"circle": (2, 4, 0.5), "square": (2.9, 1, 0.3)}, False, True),
+        ("square diagonal to triangle", {"square": (3, 3, 0.5), "triangle": (1, 1, 0.3)}, True, True),
+        ("square diagonal to triangle", {"square": (3, 3.9, 0.5), "triangle": (1, 1, 0.3)}, False, True),
+        ("square diagonal to triangle", {"square": (3, 4.1, 0.5), "triangle": (1, 1, 0.3)}, False, False),
+        ("square diagonal to triangle", {"square": (1, 1, 0.5), "triangle": (3, 3, 0.3)}, False, False),
+        ("square antidiagonal to triangle", {"square": (1, 4, 0.5), "triangle": (4, 1, 0.3)}, True, True),
+        ("square next to triangle", {"square": (1, 1, 0.5), "triangle": (2, 1, 0.3)}, True, True),
+        ("square next to triangle", {"square": (1, 1, 0.5), "triangle": (2.5, 1, 0.3)}, False, True),
+    ],
+)
+def test_relations_by_hand(relation: str, shapes: dict[str, tuple[float, float, float]], exact: bool, relaxed: bool) -> None:
+    state = scene(**shapes)
+    assert holds(parse(relation)[0], state, relaxed=False).item() == exact
+    assert holds(parse(relation)[0], state, relaxed=True).item() == relaxed
+
+
+def test_ring_by_hand() -> None:
+    ring = Relation("ring", SHAPES, 1.67)
+    for radius, good in ((1.67, True), (1.9, True), (2.0, False), (1.3, False)):
+        state = scene(circle=(2.5 + radius, 2.5, 0.4), triangle=(2.5, 2.5 + radius, 0.4), square=(2.5 - radius, 2.5, 0.4))
+        assert holds(ring, state, relaxed=True).item() == good
+    line = scene(circle=(1, 1, 0.4), triangle=(2, 2, 0.4), square=(3, 3, 0.4))
+    assert not holds(ring, line, relaxed=True).item()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31))
+def test_relaxed_contains_exact_and_right_of_excludes_its_reverse(seed: int) -> None:
+    states = DOMAIN.references["random scenes"]("", 200, seed)[:, 0]
+    for kind, pair in itertools.product(("right of", "above", "next to"), itertools.permutations(SHAPES, 2)):
+        relation, reverse = Relation(kind, pair), Relation(kind, pair[::-1])
+        exact = holds(relation, states, relaxed=False)
+        assert (holds(relation, states, relaxed=True) | ~exact).all()
+        if kind != "next to":
+            assert not (exact & holds(reverse, states, relaxed=False)).any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(radius=st.floats(0.5, 3), x=st.floats(-2, 2), y=st.floats(-2, 2), turn=st.floats(0, 6.28), gap=st.floats(0.5, 1.5))
+def test_the_circumradius_is_that_of_the_circle_points_were_put_on(radius: float, x: float, y: float, turn: float, gap: float) -> None:
+    angle = torch.tensor([turn, turn + gap, turn + 3.1 * gap])
+    found = circumradius((x + radius * angle.cos())[None], (y + radius * angle.sin())[None])
+    assert found.item() == pytest.approx(radius, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "task", ["circle left of square", "circle right of circle", "circle right of square and", "", "circle right of squarex"]
+)
+def test_an_unreadable_task_is_a_clear_error(task: str) -> None:
+    with pytest.raises(UserError, match="expected 'A <relation> B'"):
+        parse(task)
+
+
+def test_contradicting_relations_are_a_clear_error() -> None:
+    with pytest.raises(UserError, match="0 of 3 scenes found"):
+        DOMAIN.generate("circle right of square and square right of circle", 3, 0)
+
+
+def test_domains_are_the_folders() -> None:
+    assert "object_rearrangement" in domain_names()
+    with pytest.raises(UserError, match=r"domain: expected one of .*object_rearrangement.*, found 'chess'"):
+        load_domain("chess")
+
+
+def test_the_oracle_is_right_and_chance_is_not() -> None:
+    for task in TASKS[::7]:
+        assert DOMAIN.succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, 0)).all()
+        assert DOMAIN.succeeded(task, DOMAIN.references["random scenes"](task, 500, 0)).float().mean() < 0.5

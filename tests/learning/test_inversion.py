@@ -1,0 +1,113 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.datamodule import InversionData
+from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.learning import InversionModule
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.tensor_file import file_hash
+from ftl_lightning.trainer import Trainer
+
+
+def learn(tiny: Path, data: InversionData | None = None, **options: object) -> InversionModule:
+    module = InversionModule(str(tiny), samples=8, **options)  # type: ignore[arg-type]
+    data = data or InversionData("object_rearrangement", suite="validation", steps=6)
+    settings = {"logger": False, "check_val_every_n_epoch": 2, "log_every_n_steps": 1, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
+    trainer = Trainer(max_epochs=1, accelerator="cpu", **settings)
+    trainer.fit(module, datamodule=data)
+    return module
+
+
+def test_the_only_parameters_are_embeddings_and_weights_and_each_gets_a_gradient(tiny: Path) -> None:
+    before = file_hash(tiny / "model.safetensors")
+    for omega, names in (("learned", {"embeddings", "weights"}), (1.2, {"embeddings"})):
+        module = learn(tiny, omega=omega, components=3)
+        trainable = {name: parameter for name, parameter in module.named_parameters() if parameter.requires_grad}
+        assert set(trainable) == names
+        for parameter in trainable.values():
+            assert parameter.grad is not None
+            assert (parameter.grad.abs().flatten(2 if parameter.dim() == 3 else 1).amax(dim=-1) > 0).all()
+        assert module.model.hash == before  # not one bit of the pretrained model has changed
+        assert (module.weights == 1.2).all() or omega == "learned"
+
+
+def test_learning_lowers_the_loss(tiny: Path) -> None:
+    data = [InversionData("object_rearrangement", suite="validation", steps=steps) for steps in (1, 60)]
+    short, long = (learn(tiny, one, learning_rate=0.03).learned() for one in data)
+    assert all(long[name].origin.loss < short[name].origin.loss for name in long)
+
+
+def test_what_is_learned_does_not_depend_on_what_is_learned_beside_it(tiny: Path) -> None:
+    together = InversionData("object_rearrangement", suite="validation", steps=6)
+    name = together.concepts[0]
+    file = Path("one.safetensors")
+    together.demonstrations.select(name).save(file)
+    alone = InversionData("object_rearrangement", demonstrations=str(file), steps=6)
+    one, other = (learn(tiny, data).learned()[name] for data in (together, alone))
+    assert one.origin.demonstrations == other.origin.demonstrations
+    assert torch.allclose(one.embeddings, other.embeddings, atol=2e-4)
+
+
+def test_more_restarts_are_never_worse(tiny: Path) -> None:
+    one, four = learn(tiny, initial_spread=1.0), learn(tiny, initial_spread=1.0, restarts=4)
+    assert four.embeddings.shape[0] == 4 * one.embeddings.shape[0]
+    assert len(four.learned()) == len(one.learned())
+    losses = four._losses(640, torch.Generator().manual_seed(0)).mean(dim=1).unflatten(0, (-1, 4))
+    assert (losses.amin(dim=1) <= losses[:, 0]).all()
+
+
+@pytest.mark.parametrize(("off_span", "inside"), [(0.0, True), (0.3, False), (1.0, False)])
+def test_the_span_form_stays_in_the_span(tiny: Path, off_span: float, inside: bool) -> None:
+    module = learn(tiny, off_span=off_span)
+    training = module.model.training_embeddings
+    found = module.parametrised.detach().flatten(0, 1)
+    solution = torch.linalg.lstsq(training.T.double(), found.T.double()).solution
+    outside = (training.T.double() @ solution - found.T).norm() / found.norm()
+    assert (outside < 1e-3) == inside
+
+
+def test_a_concept_file_names_where_it_comes_from(invert: Callable[..., Path], tiny: Path) -> None:
+    folder = invert("--data.suite=validation", "--evaluation.suites=[validation]") / "concepts"
+    files = sorted(folder.iterdir())
+    assert len(files) == 12
+    concept = Concept.load(files[0])
+    model = GenerativeModel.load(tiny)
+    assert concept.origin.pretrained == model.hash
+    assert concept.origin.encoder == model.config.encoder
+    assert concept.origin.weights == "fixed"
+    assert concept.origin.count == 5
+    assert concept.embeddings.shape == (2, 384)
+    assert concept.weights.tolist() == pytest.approx([1.2, 1.2])
+
+
+def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    task = "circle right of square and triangle above square"
+    assert main(["generate", "object_rearrangement", f"--task={task}", "--count=3", "--out=mine.safetensors"]) == 0
+    log = invert("--data.demonstrations=mine.safetensors", "--model.omega=learned")
+    (file,) = (log / "concepts").iterdir()
+    assert Concept.load(file).origin.weights == "learned"
+    options = [f"--pretrained={tiny}", f"--concept={file}", "--compose=circle above square:1.2", "--count=4", "--steps=3"]
+    assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors", "--figure=states.png"]) == 0
+    assert "accuracy on" in capsys.readouterr().out
+    assert Path("states.png").stat().st_size > 1000
+    first = file_hash("states.safetensors")
+    assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors"]) == 0
+    assert file_hash("states.safetensors") == first
+
+
+def test_inverting_twice_gives_the_same_rows(invert: Callable[..., Path]) -> None:
+    options = ["--evaluation.suites=[paper, components]", "--evaluation.figures=0", "--evaluation.results=r.csv"]
+    invert(*options)
+    first = read_rows("r.csv")
+    invert(*options)
+    assert read_rows("r.csv").equals(first)  # replaced, not added
+    ours = first[first["K"] == 2]
+    assert set(ours["setting"]) == {"training composition", "new concept", "new + training", "component 1", "component 2"}
+    assert set(first["method"]) == {"FTL-IGM (free)", "random scenes", "generator (oracle)"}
+    oracle = first[(first["method"] == "generator (oracle)")]
+    assert (oracle["value"] == 1).all()
