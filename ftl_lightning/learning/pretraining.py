@@ -88,7 +88,11 @@ class PretrainingModule(pl.LightningModule):
             denoiser=self.hparams["denoiser"],
             denoiser_args=self.denoiser_args,
             diffusion_steps=self.hparams["diffusion_steps"],
-            training={"model": {key: value for key, value in self.hparams.items() if key != "output"}, "data": dict(data.hparams), "max_steps": self.trainer.max_steps},
+            training={
+                "model": {key: value for key, value in self.hparams.items() if key != "output"},
+                "data": dict(data.hparams),
+                "max_steps": self.trainer.max_steps,
+            },
         )
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):

@@ -30,12 +30,16 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
     for place, setting in enumerate(settings):
         found = published.get(setting)
         if found:
-            axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label="paper" if place == 1 else None)
+            axes.bar(
+                place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label="paper" if place == 1 else None
+            )
         for index, method in enumerate(methods, start=1):
             number = summarise(ours[(ours["setting"] == setting) & (ours["method"] == method)])
             if number:
                 label = method if place == 0 else None
-                axes.bar(place + index * width, number.mean, width, yerr=number.error, color=COLOURS[index - 1], capsize=2, label=label)
+                axes.bar(
+                    place + index * width, number.mean, width, yerr=number.error, color=COLOURS[index - 1], capsize=2, label=label
+                )
         trivial = summarise(chance[(chance["setting"] == setting) & chance["method"].str.startswith("random")])
         if trivial:
             span = (place - width / 2, place + (len(methods) + 0.5) * width)

@@ -124,7 +124,9 @@ def _accuracy(domain: Domain, rows: pd.DataFrame) -> Table:
     learned, references = _columns(rows)
     lines = []
     for setting in _settings(domain):
-        alone = [found.task for found in domain.published if found.setting == setting and found.task and found.omega == domain.omega]
+        alone = [
+            found.task for found in domain.published if found.setting == setting and found.task and found.omega == domain.omega
+        ]
         for task in ("", *alone):
             own = _select(rows, setting=setting) if not task else _select(rows, setting=setting, task=task)
             ours = _select(own, K=2, omega=domain.omega)
@@ -145,7 +147,11 @@ def _settings(domain: Domain) -> list[str]:
 
 
 def _grid(
-    name: str, caption: str, learned: Sequence[str], lines: list[tuple[str, str, str, Callable[[str], Number | None]]], heads: tuple[str, str]
+    name: str,
+    caption: str,
+    learned: Sequence[str],
+    lines: list[tuple[str, str, str, Callable[[str], Number | None]]],
+    heads: tuple[str, str],
 ) -> Table:
     cells = [
         [first, second, paper, *(_text(ours(method)) for method in learned)]

@@ -129,7 +129,9 @@ def test_relaxed_contains_exact_and_right_of_excludes_its_reverse(seed: int) -> 
 
 @settings(max_examples=30, deadline=None)
 @given(radius=st.floats(0.5, 3), x=st.floats(-2, 2), y=st.floats(-2, 2), turn=st.floats(0, 6.28), gap=st.floats(0.5, 1.5))
-def test_the_circumradius_is_that_of_the_circle_points_were_put_on(radius: float, x: float, y: float, turn: float, gap: float) -> None:
+def test_the_circumradius_is_that_of_the_circle_points_were_put_on(
+    radius: float, x: float, y: float, turn: float, gap: float
+) -> None:
     angle = torch.tensor([turn, turn + gap, turn + 3.1 * gap])
     found = circumradius((x + radius * angle.cos())[None], (y + radius * angle.sin())[None])
     assert found.item() == pytest.approx(radius, rel=1e-3)

@@ -17,7 +17,14 @@ from ftl_lightning.trainer import Trainer
 def learn(tiny: Path, data: InversionData | None = None, **options: object) -> InversionModule:
     module = InversionModule(str(tiny), samples=8, **options)  # type: ignore[arg-type]
     data = data or InversionData("object_rearrangement", suite="validation", steps=6)
-    settings = {"logger": False, "check_val_every_n_epoch": 2, "log_every_n_steps": 1, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
+    settings = {
+        "logger": False,
+        "check_val_every_n_epoch": 2,
+        "log_every_n_steps": 1,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+    }
     trainer = Trainer(max_epochs=1, accelerator="cpu", **settings)
     trainer.fit(module, datamodule=data)
     return module

@@ -99,7 +99,9 @@ def test_condition_dropout_is_drawn_per_sample() -> None:
     def spy(module: torch.nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
         seen.append(inputs[2].detach().clone())
 
-    trainer = Trainer(max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False, limit_val_batches=0, accelerator="cpu")
+    trainer = Trainer(
+        max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False, limit_val_batches=0, accelerator="cpu"
+    )
     data.setup("fit")
     module.trainer = trainer
     trainer._data_connector.attach_datamodule(module, datamodule=data)

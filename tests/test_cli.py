@@ -1,0 +1,178 @@
+"""The command line: help, configuration files, and every mistake of a user's as one clear line with exit code 2."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from ftl_lightning.cli import COMMANDS, TRAINER_VERBS, main
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.container import Demonstrations
+from tests.conftest import CONF, ROOT, TINY
+
+CONFIGS = sorted(path.relative_to(CONF) for path in CONF.rglob("*.yaml"))
+PRETRAINING = str(CONF / "object_rearrangement.yaml")
+INVERSION = str(CONF / "invert" / "object_rearrangement.yaml")
+
+
+def error(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run, expect exit code 2, and return what standard error says."""
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert "Traceback" not in told
+    return told
+
+
+@pytest.mark.parametrize("verb", [*TRAINER_VERBS, *COMMANDS])
+def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([verb, "--help"]) == 0
+    assert verb in capsys.readouterr().out
+
+
+def test_the_overview_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(verb in out for verb in (*TRAINER_VERBS, *COMMANDS))
+
+
+def test_verbs_without_a_trainer_start_at_once() -> None:
+    code = (
+        "import sys; from ftl_lightning.cli import main; main(['generate', '--help']);"
+        "sys.exit(any(m in sys.modules for m in ('lightning', 'torch', 'transformers')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=str)
+def test_every_configuration_file_parses(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kind = path.parts[0]
+    if kind == "size":
+        base = ["fit", "--config", PRETRAINING]
+    else:
+        base = [{"invert": "invert", "ablation": "ablate"}.get(kind, "fit")]
+    assert main([*base, "--config", str(CONF / path), "--print_config"]) == 0
+    printed = yaml.safe_load(capsys.readouterr().out)
+    for key in yaml.safe_load((CONF / path).read_text()):
+        assert key in printed
+
+
+def test_configuration_keys_can_be_read_back(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "--config", PRETRAINING, "--seed_everything=7", "--print_config"]) == 0
+    config = yaml.safe_load(capsys.readouterr().out)
+    # One seed decides all of them, wherever it is given.
+    assert config["model"]["init_args"]["seed"] == config["data"]["init_args"]["seed"] == config["evaluation"]["seed"] == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["fly"], "verb: expected one of fit, invert"),
+        (["fit", "--config", "nothing.yaml"], "nothing.yaml"),
+        (["fit", "--config", PRETRAINING, "--model.depht=3"], "depht"),
+        (["fit", "--config", PRETRAINING, "--trainer.max_steps=many"], "max_steps"),
+        (["fit", "--config", PRETRAINING, "--ckpt_path=no.ckpt"], "ckpt_path: expected a checkpoint file"),
+        (["fit", "--config", PRETRAINING, *TINY, "--model.denoiser=Transformer"], "denoiser: expected one of MLPDenoiser"),
+        (["fit", "--config", PRETRAINING, *TINY, "--model.denoiser_args={width: 3}"], "denoiser_args: MLPDenoiser does not take"),
+        (["fit", "--config", PRETRAINING, *TINY, "--evaluation.sampler=euler"], "sampler: expected one of ddpm"),
+        (["fit", "--config", PRETRAINING, *TINY, "--data.encoder=no/such/model"], "encoder: expected a folder"),
+        (["invert", "--config", INVERSION, "--model.pretrained=nowhere"], "nowhere/config.json: expected a pretrained model"),
+        (["sample", "--pretrained=nowhere"], "nowhere/config.json: expected a pretrained model"),
+        (["generate", "chess"], "domain: expected one of"),
+        (["generate", "object_rearrangement", "--task=circle on square"], "expected 'A <relation> B'"),
+        (["generate", "object_rearrangement", "--count=0"], "count: expected 1 or more"),
+        (["generate", "object_rearrangement", "--count=5", "--out=/proc/d.safetensors"], "cannot be written"),
+        (["report", "--results=nothing"], "expected"),
+        (["ablate", "--stages=[]"], "results"),
+    ],
+)
+def test_mistakes_are_one_clear_line(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert expected in error(capsys, *arguments)
+    assert not list(Path().rglob("*.safetensors"))  # nothing half-written
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--compose=circle left of square:1"], "concept 'circle left of square': expected a training concept"),
+        (["--compose=circle right of square:heavy"], "expected 'concept:weight"),
+        ([], "expected a learned concept, training concepts or both"),
+        (["--compose=circle right of square", "--steps=1000"], "steps: expected 1 to 100"),
+        (["--compose=circle right of square", "--count=0"], "count: expected 1 or more"),
+        (["--concept=no.safetensors"], "no.safetensors: expected a concept file, found nothing"),
+    ],
+)
+def test_mistakes_in_sampling(tiny: Path, options: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert expected in error(capsys, "sample", f"--pretrained={tiny}", *options)
+
+
+def test_a_concept_of_another_model_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str], invert: Callable[..., Path]) -> None:
+    log = invert("--data.suite=validation", "--evaluation.suites=[training]")
+    file = next((log / "concepts").iterdir())
+    concept = Concept.load(file)
+    for key in ("pretrained", "encoder", "domain"):
+        origin = type(concept.origin)(**{**concept.origin.__dict__, key: "other"})
+        Concept(concept.embeddings, concept.weights, origin).save("c.safetensors")
+        told = error(capsys, "sample", f"--pretrained={tiny}", "--concept=c.safetensors")
+        assert f"c.safetensors: key '{key}': expected" in told
+        assert "found 'other'" in told
+    told = error(capsys, "sample", f"--pretrained={tiny}", f"--concept={tiny / 'model.safetensors'}")
+    assert "expected a concept file, found a generative model file" in told
+
+
+def demonstrations(states: torch.Tensor, domain: str = "object_rearrangement") -> Demonstrations:
+    count, time, columns = states.shape
+    names = tuple(map(str, range(columns)))
+    return Demonstrations(states, torch.full((count,), time), domain, names, names, ("task",) * count)
+
+
+def test_demonstrations_that_do_not_fit(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    demonstrations(torch.zeros(2, 1, 21), "driving").save("other.safetensors")
+    demonstrations(torch.zeros(2, 1, 20)).save("size.safetensors")
+    Path("cut.safetensors").write_bytes(Path("size.safetensors").read_bytes()[:100])
+    np.savez("nan.npz", states=np.full((1, 1, 21), np.nan))
+    np.savez("none.npz", states=np.zeros((0, 1, 21)))
+    np.savez("keys.npz", state=np.zeros((1, 1, 21)))
+    for file, expected in {
+        "missing.safetensors": "found nothing",
+        "other.safetensors": "key 'domain': expected 'object_rearrangement', found 'driving'",
+        "size.safetensors": "key 'states': expected shape (demo, 1, 21), found (2, 1, 20)",
+        "cut.safetensors": "damaged or foreign",
+        "nan.npz": "expected finite numbers, found nan",
+        "none.npz": "expected at least one demonstration, found none",
+        "keys.npz": "key 'states': expected (demo, time, state)",
+    }.items():
+        told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", f"--data.demonstrations={file}")
+        assert file in told
+        assert expected in told
+    assert not Path("logs/object_rearrangement/invert/concepts").exists()
+
+
+def test_a_checkpoint_of_the_other_module_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = tiny.parent / "checkpoints" / "last.ckpt"
+    options = [f"--model.pretrained={tiny}", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false"]
+    told = error(capsys, "invert", "--config", INVERSION, *options)
+    assert "ckpt_path: key 'module_class': expected InversionModule, found PretrainingModule" in told
+    Path("damaged.ckpt").write_bytes(checkpoint.read_bytes()[:1000])
+    told = error(capsys, "test", "--config", PRETRAINING, "--ckpt_path=damaged.ckpt")
+    assert "damaged.ckpt: expected a checkpoint, found a damaged or foreign file" in told
+
+
+def test_fit_validate_and_test_of_a_checkpoint_agree(tiny: Path) -> None:
+    checkpoint = f"--ckpt_path={tiny.parent / 'checkpoints' / 'last.ckpt'}"
+    for verb in ("validate", "test"):
+        assert main([verb, "--config", PRETRAINING, *TINY, checkpoint, "--evaluation.samples=4"]) == 0
+    assert Path("logs/object_rearrangement/fit/results.csv").is_file()
+
+
+def test_the_model_card_and_config_of_the_shipped_model(shipped: Path) -> None:
+    config = json.loads((shipped / "config.json").read_text())
+    assert config["domain"] == "object_rearrangement"
+    assert (shipped / "model.safetensors").stat().st_size <= 8e6
+    assert config["hash"] in (shipped / "README.md").read_text()
+    assert main(["sample", f"--pretrained={shipped}", "--compose=circle right of square:1.2", "--count=5", "--steps=10"]) == 0
