@@ -1,0 +1,105 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ftl_lightning.domains.domain import EvaluationTask, load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.evaluator import Evaluator, Judged, standard_error
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows
+from ftl_lightning.learning.generative_model import GenerativeModel
+
+
+class Trained:
+    """The least that an evaluated module offers: a model and its training concepts."""
+
+    method = "trained"
+
+    def __init__(self, model: GenerativeModel, seed: int = 0) -> None:
+        self.model, self.hparams = model, {"seed": seed}
+
+    def composition(self, task: EvaluationTask) -> tuple[torch.Tensor, torch.Tensor] | None:
+        if task.learned:
+            return None
+        return torch.stack([self.model.concept(text) for text in task.texts]), torch.ones(len(task.texts))
+
+    def concept_embeddings(self) -> dict[str, torch.Tensor]:
+        return self.model.named_embeddings()
+
+
+def test_accuracy_is_the_share_of_right_samples() -> None:
+    domain = load_domain("object_rearrangement")
+    task = domain.suites["training"].tasks[0]
+    good = domain.generate(task.goal, 3, 0).states
+    bad = domain.generate("square right of circle", 1, 0).states
+    assert Judged.of(task, torch.cat((good, bad)), domain).accuracy == pytest.approx(0.75)
+
+
+def test_standard_error_over_tasks() -> None:
+    values = [0.1, 0.5, 0.6, 1.0]
+    assert standard_error(values) == pytest.approx(float(np.std(values, ddof=1)) / 2)
+    assert standard_error([0.3]) == 0
+
+
+def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: Path) -> None:
+    evaluator = Evaluator(suites=["training", "paper"], samples=3, sampler="ddim", steps=4)
+    first, again = (evaluator.evaluate(Trained(GenerativeModel.load(tiny))) for _ in range(2))
+    assert len(first) == 12
+    assert all(torch.equal(one.states, other.states) for one, other in zip(first, again, strict=True))
+    with pytest.raises(UserError, match="suites: expected some of training, paper"):
+        Evaluator(suites=["exam"]).evaluate(Trained(GenerativeModel.load(tiny)))
+
+
+def row(**changes: object) -> Row:
+    values = {"domain": "d", "setting": "s", "task": "t", "method": "m", "K": 2, "omega": "1.2", "seed": 0, "n": 50}
+    values |= {"metric": "accuracy", "value": 0.5, "model_hash": "00e1", "config_hash": "c"}
+    return Row(**(values | changes))  # type: ignore[arg-type]
+
+
+def test_rows_are_added_replaced_and_keep_their_types(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    append_rows(path, [row(), row(task="u")])
+    append_rows(path, [row(value=0.75), row(omega="learned")])
+    table = read_rows(tmp_path)
+    assert len(table) == 3
+    assert table.loc[(table["task"] == "t") & (table["omega"] == "1.2"), "value"].tolist() == [0.75]
+    assert set(table["omega"]) == {"1.2", "learned"}
+    assert set(table["model_hash"]) == {"00e1"}  # not read as a number
+
+
+def test_a_foreign_results_file_is_refused(tmp_path: Path) -> None:
+    pd.DataFrame({"a": [1]}).to_csv(tmp_path / "r.csv", index=False)
+    with pytest.raises(UserError, match=r"r\.csv: expected the columns domain, setting"):
+        read_rows(tmp_path)
+
+
+def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable[..., Path]) -> None:
+    log = invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[training, paper]")
+    events = EventAccumulator(str(log), size_guidance={"images": 0, "scalars": 0}).Reload()
+    tags = events.Tags()
+    assert len(events.Scalars("train/loss")) == 5
+    for setting in ("training concept", "training composition", "new concept", "new + training"):
+        assert 0 <= events.Scalars(f"test/accuracy/{setting}")[0].value <= 1
+        assert f"test/standard error/{setting}" in tags["scalars"]
+    assert "test/accuracy/new concept/square diagonal to triangle" in tags["scalars"]
+    image = events.Images("new concept/square diagonal to triangle")[0]
+    assert image.encoded_image_string.startswith(b"\x89PNG")
+    assert events.summary_metadata["_hparams_/session_start_info"]
+    labels = next(log.rglob("metadata.tsv")).read_text().splitlines()
+    assert "square diagonal to triangle [component 2]" in labels
+    assert "(empty)" in labels
+    assert len(labels) == 1 + 12 + 10 * 2
+
+
+def test_figures_frame_right_green_and_wrong_red(tmp_path: Path) -> None:
+    domain = load_domain("object_rearrangement")
+    states = domain.generate("circle right of square", 2, 0).states
+    domain.render(states, [True, False], "two scenes").savefig(tmp_path / "f.png", dpi=100)
+    pixels = np.asarray(Image.open(tmp_path / "f.png").convert("RGB")).reshape(-1, 3).astype(int)
+    for colour in ((46, 158, 70), (208, 58, 58)):
+        assert (np.abs(pixels - colour).sum(axis=1) < 12).sum() > 200

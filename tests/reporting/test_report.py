@@ -1,0 +1,88 @@
+from pathlib import Path
+
+import pytest
+
+from ftl_lightning.cli import main
+from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows
+from ftl_lightning.reporting.report import BEGIN, END
+from ftl_lightning.reporting.tables import summarise, tables
+from tests.conftest import ROOT
+
+DOMAIN = load_domain("object_rearrangement")
+
+
+def row(setting: str, task: str, value: float, seed: int = 0, **changes: object) -> Row:
+    values = {"domain": DOMAIN.name, "setting": setting, "task": task, "method": "FTL-IGM (free)", "K": 2, "omega": "1.2", "seed": seed}
+    values |= {"n": 50, "metric": "accuracy", "value": value, "model_hash": "m", "config_hash": f"c{seed}"}
+    return Row(**(values | changes))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    rows = [
+        row(setting, task, value, seed)
+        for setting, values in (("training composition", (0.8, 1.0)), ("new concept", (0.4, 0.6)))
+        for task, value in zip(("one", "two"), values, strict=True)
+        for seed in (0, 1)
+    ]
+    rows += [row("new concept", task, 0.1, method="random scenes", K=0, omega="") for task in ("one", "two")]
+    rows += [row("new concept", "one", 0.7, omega="learned", K=1, config_hash="d")]
+    append_rows(tmp_path / "r" / "rows.csv", rows)
+    return tmp_path / "r"
+
+
+def test_a_number_tells_error_over_tasks_from_spread_over_seeds(tmp_path: Path) -> None:
+    append_rows(tmp_path / "r.csv", [row("s", task, value, seed) for task, seed, value in (("a", 0, 0.2), ("a", 1, 0.4), ("b", 0, 0.6), ("b", 1, 0.8))])
+    number = summarise(read_rows(tmp_path / "r.csv"))
+    assert number is not None
+    assert number.mean == pytest.approx(0.5)
+    assert number.error == pytest.approx(0.2)  # task means 0.3 and 0.7
+    assert number.spread == pytest.approx(0.2 / 2**0.5)  # seed means 0.4 and 0.6
+    assert str(number) == "0.50 ± 0.20 (seeds 0.14)"
+
+
+def test_tables_stand_beside_the_papers_numbers(results: Path) -> None:
+    found = {table.name: table for table in tables(DOMAIN, read_rows(results))}
+    accuracy = found["accuracy"].cells.set_index("setting")
+    assert accuracy.loc["training composition", "paper"] == "0.90 ± 0.04"
+    assert accuracy.loc["training composition", "FTL-IGM (free)"].startswith("0.90 ± 0.10")
+    assert accuracy.loc["new concept", "random scenes"].startswith("0.10")
+    count = found["concept_count"].cells
+    assert count[["setting", "K", "paper"]].to_numpy().tolist() == [["new concept", "1", "0.49 ± 0.11"]]
+    assert "omega" in found
+    assert r"\toprule" in found["accuracy"].latex()
+    assert r"\pm" in found["accuracy"].latex()
+    assert "±" not in found["accuracy"].latex()
+
+
+def test_the_report_writes_files_and_updates_a_readme(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    options = [f"--results={results}", "--out=out", f"--readme={readme}"]
+    assert main(["report", *options]) == 0
+    text = readme.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith(f"{END}\nafter\n")
+    assert "old" not in text
+    assert "| training composition | 0.90 ± 0.04 |" in text
+    folder = Path("out") / DOMAIN.name
+    assert {path.name for path in folder.iterdir()} >= {"accuracy.md", "accuracy.tex", "accuracy.png"}
+    readme.write_text("no marks")
+    assert main(["report", *options]) == 2
+    assert "expected the lines" in capsys.readouterr().err
+
+
+def test_the_readmes_table_is_what_the_committed_results_say(tmp_path: Path) -> None:
+    copy = tmp_path / "README.md"
+    copy.write_text((ROOT / "README.md").read_text())
+    assert main(["report", f"--results={ROOT / 'results'}", "--out=out", f"--readme={copy}"]) == 0
+    assert copy.read_text() == (ROOT / "README.md").read_text()
+
+
+def test_every_published_number_belongs_to_a_task_or_setting() -> None:
+    tasks = {(task.setting, task.name) for suite in DOMAIN.suites.values() for task in suite.tasks}
+    for published in DOMAIN.published:
+        assert published.setting in {setting for setting, _ in tasks}
+        assert not published.task or (published.setting, published.task) in tasks
+        assert 0 <= published.value <= 1
