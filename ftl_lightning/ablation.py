@@ -58,8 +58,9 @@ def run_ablation(stages: Sequence[Stage], seeds: Sequence[int], results: str) ->
     failed = []
     start = time.monotonic()
     for number, (stage, seed, cell) in enumerate(plan, start=1):
-        left = (time.monotonic() - start) / max(number - 1, 1) * (len(plan) - number + 1) if number > 1 else float("nan")
-        print(f"[{number}/{len(plan)}, about {left / 60:.0f} min left] {stage.verb} {' '.join(cell)}", flush=True)
+        left = (time.monotonic() - start) / max(number - 1, 1) * (len(plan) - number + 1)
+        ahead = f", about {left / 60:.0f} min left" if number > 1 else ""
+        print(f"[{number}/{len(plan)}{ahead}] {stage.verb} {' '.join(cell)}", flush=True)
         try:
             _run(stage, seed, cell, results)
         except UserError as error:
@@ -84,7 +85,8 @@ def _run(stage: Stage, seed: int, cell: list[str], results: str) -> None:
 def _hash(line: "CommandLine") -> str:
     from ftl_lightning.evaluation.evaluator import Evaluator
 
-    evaluator = next(callback for callback in line.trainer.callbacks if isinstance(callback, Evaluator))
+    callbacks = line.trainer.callbacks  # type: ignore[attr-defined]
+    evaluator = next(callback for callback in callbacks if isinstance(callback, Evaluator))
     return evaluator.config_hash(line.model, line.datamodule)
 
 

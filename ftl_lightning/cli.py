@@ -39,22 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
         _dispatch(arguments)
-    except Exception as error:
-        cause = _user_error(error)
-        if cause is None:
-            raise
-        print(f"error: {cause}", file=sys.stderr)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
         return 2
     except SystemExit as stop:  # jsonargparse has told what is wrong
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     return 0
-
-
-def _user_error(error: BaseException | None) -> UserError | None:
-    """The mistake behind an exception; jsonargparse wraps what a constructor raises."""
-    while error is not None and not isinstance(error, UserError):
-        error = error.__cause__ or error.__context__
-    return error
 
 
 def _dispatch(arguments: list[str]) -> None:

@@ -76,8 +76,8 @@ def sample(
     """
     import torch
 
-    from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.concepts.composition import parse_composition
+    from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.demonstrations.container import Demonstrations
     from ftl_lightning.diffusion.samplers import SAMPLERS
     from ftl_lightning.domains.domain import load_domain

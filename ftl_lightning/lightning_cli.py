@@ -9,7 +9,7 @@ import torch
 from jsonargparse import set_parsing_settings
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.trainer import Trainer
 
@@ -64,14 +64,19 @@ def _command_line(arguments: list[str], run: bool) -> CommandLine:
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
         logging.getLogger(name).setLevel(logging.WARNING)
-    return CommandLine(
-        pl.LightningModule,
-        pl.LightningDataModule,
-        trainer_class=Trainer,
-        subclass_mode_model=True,
-        subclass_mode_data=True,
-        save_config_kwargs={"overwrite": True},
-        parser_kwargs={"parser_mode": "omegaconf+"},
-        run=run,
-        args=arguments,
-    )
+    try:
+        return CommandLine(
+            pl.LightningModule,
+            pl.LightningDataModule,
+            trainer_class=Trainer,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            save_config_kwargs={"overwrite": True},
+            parser_kwargs={"parser_mode": "omegaconf+"},
+            run=run,
+            args=arguments,
+        )
+    except Exception as error:
+        if mistake := mistake_behind(error):
+            raise mistake from None
+        raise

@@ -95,7 +95,8 @@ class PretrainingData(pl.LightningDataModule):
         return Batch(demonstrations.states[rows], concepts, None if initial is None else initial[rows])
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(Steps(self, self.steps_per_epoch), batch_size=None, collate_fn=self.batch)
+        steps = Steps(self, self.steps_per_epoch)
+        return DataLoader(steps, batch_size=None, collate_fn=self.batch)  # type: ignore[arg-type]
 
     def val_dataloader(self) -> DataLoader[Batch]:
         whole = torch.arange(len(self.validation))

@@ -28,7 +28,8 @@ class MLPDenoiser(nn.Module):
         initial_state_dim: columns of the initial state; 0 where the domain has none.
         hidden_dim: width.
         depth: hidden layers.
-        condition_dim: features of the timestep and of the concept, each.
+        condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
+        time_dim: features of the timestep; even.
         dropout: of the hidden layers, in training.
     """
 
@@ -38,18 +39,19 @@ class MLPDenoiser(nn.Module):
         state_dim: int,
         concept_dim: int,
         initial_state_dim: int = 0,
-        hidden_dim: int = 512,
+        hidden_dim: int = 384,
         depth: int = 4,
-        condition_dim: int = 128,
+        condition_dim: int = 384,
+        time_dim: int = 32,
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        self.condition_dim = condition_dim
-        self.time = nn.Sequential(nn.Linear(condition_dim, condition_dim), nn.SiLU(), nn.Linear(condition_dim, condition_dim))
+        self.time_dim = time_dim
+        self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim))
         self.concept = nn.Linear(concept_dim, condition_dim)
         inputs = [horizon * state_dim + initial_state_dim] + [hidden_dim] * (depth - 1)
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
-        self.film = nn.ModuleList(nn.Linear(2 * condition_dim, 2 * hidden_dim) for _ in inputs)
+        self.film = nn.ModuleList(nn.Linear(time_dim + condition_dim, 2 * hidden_dim) for _ in inputs)
         self.dropout = nn.Dropout(dropout)
         self.head = nn.Linear(hidden_dim, horizon * state_dim)
 
@@ -62,7 +64,7 @@ class MLPDenoiser(nn.Module):
             concept: ``(batch, concept)`` in the model's concept space.
             initial_state: ``(batch, initial state)``, normalised, or ``None``.
         """
-        condition = torch.cat((self.time(sinusoidal_embedding(t, self.condition_dim)), self.concept(concept)), dim=-1)
+        condition = torch.cat((self.time(sinusoidal_embedding(t, self.time_dim)), self.concept(concept)), dim=-1)
         condition = functional.silu(condition)
         hidden = x.flatten(1) if initial_state is None else torch.cat((x.flatten(1), initial_state), dim=-1)
         for index, (layer, film) in enumerate(zip(self.layers, self.film, strict=True)):

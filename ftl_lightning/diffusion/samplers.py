@@ -6,6 +6,7 @@ pretraining. ``steps <= T`` are spread evenly over it. ``temperature`` is the pa
 of every noise added later is scaled by it. ``generator`` alone decides the result.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Protocol
 
@@ -78,7 +79,7 @@ def ddim(
     """Deterministic after the first noise (Song et al., 2021, eta = 0)."""
     x = _noise(shape, alpha_bar, temperature, generator)
     visited = timesteps(len(alpha_bar), steps)
-    for t, before in zip(visited, visited[1:], strict=False):
+    for t, before in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
         implied = (x - alpha_bar[t].sqrt() * clean) / (1 - alpha_bar[t]).sqrt()
         x = alpha_bar[before].sqrt() * clean + (1 - alpha_bar[before]).sqrt() * implied
@@ -95,7 +96,7 @@ def dpm_solver(
     scale, sigma = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
     half_log_snr = scale.log() - sigma.log()
     previous: tuple[Tensor, Tensor] | None = None  # the last step's clean estimate and its length in half log-SNR
-    for t, before in zip(visited, visited[1:], strict=False):
+    for t, before in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
         step = half_log_snr[before] - half_log_snr[t]
         estimate = clean

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from ftl_lightning.concepts.composition import composed_epsilon
@@ -85,6 +86,8 @@ class InversionModule(pl.LightningModule):
         self.emphasis: Tensor
         self.embeddings: nn.Parameter
         self.weights: nn.Parameter | Tensor
+        self._states: Tensor
+        self._initial: Tensor | None
         self.concepts: tuple[str, ...] = ()
 
     @property
@@ -184,7 +187,7 @@ class InversionModule(pl.LightningModule):
         self.model.eval()
         return self
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Adam with cosine decay; weights have a rate of their own."""
         groups: list[dict[str, Any]] = [{"params": [self.embeddings], "lr": self.hparams["learning_rate"]}]
         if isinstance(self.weights, nn.Parameter):

@@ -8,8 +8,10 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
+from ftl_lightning.concepts.composition import Denoiser
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
 from ftl_lightning.demonstrations.normalization import Normalization
@@ -114,7 +116,7 @@ class PretrainingModule(pl.LightningModule):
             self.model.eval()
         return self
 
-    def _loss(self, denoiser: nn.Module, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
+    def _loss(self, denoiser: Denoiser, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
         """Eq. 1 on a batch, ``(batch,)``."""
         clean = self.model.normalization.encode(batch.states)
         initial = None
@@ -152,7 +154,7 @@ class PretrainingModule(pl.LightningModule):
 
     test_step = validation_step
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with warm-up and cosine decay."""
         total = int(self.trainer.estimated_stepping_batches)
         warmup = min(self.hparams["warmup_steps"], max(total // 10, 1))

@@ -43,7 +43,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
         trivial = summarise(chance[(chance["setting"] == setting) & chance["method"].str.startswith("random")])
         if trivial:
             span = (place - width / 2, place + (len(methods) + 0.5) * width)
-            axes.hlines(trivial.mean, *span, colors="black", linestyles="dotted", label="chance" if place == 0 else None)
+            axes.hlines(trivial.mean, *span, colors="black", linestyles="dotted", label="chance" if place == 0 else "")
     axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
     axes.set(ylim=(0, 1.05), ylabel="accuracy", title=f"{domain.name}, K = 2, omega = {domain.omega}")
     axes.legend(fontsize=8, loc="lower left")

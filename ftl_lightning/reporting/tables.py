@@ -1,6 +1,6 @@
 """Tables from results, each number beside the paper's: Markdown to read, LaTeX to paste."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -150,13 +150,13 @@ def _grid(
     name: str,
     caption: str,
     learned: Sequence[str],
-    lines: list[tuple[str, str, str, Callable[[str], Number | None]]],
+    lines: Sequence[tuple[str, str, str, pd.DataFrame]],
     heads: tuple[str, str],
 ) -> Table:
     cells = [
-        [first, second, paper, *(_text(ours(method)) for method in learned)]
+        [first, second, paper, *(_text(summarise(_select(ours, method=method))) for method in learned)]
         for first, second, paper, ours in lines
-        if any(ours(method) for method in learned)
+        if not ours.empty
     ]
     return Table(name, caption, pd.DataFrame(cells, columns=[*heads, "paper", *learned], dtype=str))
 
@@ -170,7 +170,7 @@ def _count(domain: Domain, rows: pd.DataFrame) -> Table:
             setting,
             str(count),
             _paper(_lookup(domain, setting, "", count, "learned")),
-            lambda method, setting=setting, count=count: summarise(_select(own, setting=setting, K=count, method=method)),
+            _select(own, setting=setting, K=count),
         )
         for setting in domain.suites["paper"].settings
         for count in sorted(set(own.loc[own["K"] > 0, "K"]))
@@ -189,7 +189,7 @@ def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
             setting,
             omega,
             _paper(_lookup(domain, setting, "", 2, omega)),
-            lambda method, setting=setting, omega=omega: summarise(_select(own, setting=setting, omega=omega, method=method)),
+            _select(own, setting=setting, omega=omega),
         )
         for setting in settings
         for omega in sorted(set(own["omega"]))
@@ -207,7 +207,7 @@ def _components(domain: Domain, rows: pd.DataFrame) -> Table:
             task.name,
             task.setting,
             _paper(_lookup(domain, task.setting, task.name, 2, "learned")),
-            lambda method, task=task: summarise(_select(own, setting=task.setting, task=task.name, method=method)),
+            _select(own, setting=task.setting, task=task.name),
         )
         for task in (suite.tasks if suite else ())
     ]

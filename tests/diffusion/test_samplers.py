@@ -1,5 +1,6 @@
 """The samplers against diffusers' schedulers, on an epsilon that is known in closed form."""
 
+import itertools
 from typing import Any
 
 import pytest
@@ -57,7 +58,7 @@ def test_ddim_equals_diffusers(steps: int) -> None:
     scheduler = DDIMScheduler(num_train_timesteps=100, trained_betas=betas(), clip_sample_range=1.0)
     scheduler.num_inference_steps = 100
     visited = timesteps(100, steps)
-    for t, before in zip(visited, visited[1:], strict=False):
+    for t, before in itertools.pairwise(visited):
         scheduler.alphas_cumprod = ALPHA_BAR[[before, t]]
         x = scheduler.step(exact(x, torch.full((len(x),), t)), 1, x).prev_sample
     x = clean_from_epsilon(x, exact(x, torch.full((len(x),), 0)), ALPHA_BAR[0])

@@ -13,7 +13,15 @@ DOMAIN = load_domain("object_rearrangement")
 
 
 def row(setting: str, task: str, value: float, seed: int = 0, **changes: object) -> Row:
-    values = {"domain": DOMAIN.name, "setting": setting, "task": task, "method": "FTL-IGM (free)", "K": 2, "omega": "1.2", "seed": seed}
+    values = {
+        "domain": DOMAIN.name,
+        "setting": setting,
+        "task": task,
+        "method": "FTL-IGM (free)",
+        "K": 2,
+        "omega": "1.2",
+        "seed": seed,
+    }
     values |= {"n": 50, "metric": "accuracy", "value": value, "model_hash": "m", "config_hash": f"c{seed}"}
     return Row(**(values | changes))  # type: ignore[arg-type]
 
@@ -33,7 +41,10 @@ def results(tmp_path: Path) -> Path:
 
 
 def test_a_number_tells_error_over_tasks_from_spread_over_seeds(tmp_path: Path) -> None:
-    append_rows(tmp_path / "r.csv", [row("s", task, value, seed) for task, seed, value in (("a", 0, 0.2), ("a", 1, 0.4), ("b", 0, 0.6), ("b", 1, 0.8))])
+    append_rows(
+        tmp_path / "r.csv",
+        [row("s", task, value, seed) for task, seed, value in (("a", 0, 0.2), ("a", 1, 0.4), ("b", 0, 0.6), ("b", 1, 0.8))],
+    )
     number = summarise(read_rows(tmp_path / "r.csv"))
     assert number is not None
     assert number.mean == pytest.approx(0.5)

@@ -1,0 +1,145 @@
+"""Speed, each ratio measured in one run on this machine: inversion and sampling in batches against the published procedure.
+
+    python benchmarks/speed.py [--pretrained pretrained/object_rearrangement] [--out results/speed.json]
+
+The published inversion takes one noised demonstration at a time, accumulates two, and evaluates the K + 1 branches one after
+another, for 5 x 10,000 optimiser steps a concept; a slice of its steps is timed and scaled up.
+"""
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.datamodule import InversionData
+from ftl_lightning.diffusion.samplers import ddpm
+from ftl_lightning.diffusion.schedule import denoising_loss
+from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.learning import InversionModule
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import write_text
+from ftl_lightning.trainer import Trainer
+
+PUBLISHED_STEPS = 50_000
+OMEGA = 1.2
+
+
+def seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def branch_by_branch(model: GenerativeModel, x: Tensor, t: Tensor, concepts: Tensor, weights: Tensor) -> Tensor:
+    """Eq. 2 as the published code evaluates it: one call of the network for each branch."""
+    empty: Tensor = model.denoiser(x, t, model.empty.expand(len(x), -1), None)
+    total = empty
+    for concept, weight in zip(concepts, weights, strict=True):
+        total = total + weight * (model.denoiser(x, t, concept.expand(len(x), -1), None) - empty)
+    return total
+
+
+def published_inversion(model: GenerativeModel, demonstrations: Tensor, steps: int) -> None:
+    """So many optimiser steps of the published procedure for one concept."""
+    states = model.normalization.encode(demonstrations)
+    concepts = torch.randn(2, model.config.concept_dim, requires_grad=True)
+    weights = torch.full((2,), OMEGA)
+    optimiser = torch.optim.Adam([concepts], lr=2e-4)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        for _ in range(2):
+            clean = states[torch.randint(len(states), (1,))]
+            t = torch.randint(len(model.alpha_bar), (1,))
+            noise = torch.randn_like(clean)
+            loss = denoising_loss(lambda x, t: branch_by_branch(model, x, t, concepts, weights), clean, noise, t, model.alpha_bar)
+            (loss.mean() / 2).backward()
+        optimiser.step()
+
+
+def our_inversion(pretrained: str, concepts: int, steps: int) -> None:
+    """What ``invert`` does with the shipped configuration, for the first so many concepts of the validation suite."""
+    data = InversionData("object_rearrangement", suite="validation", steps=steps)
+    data.concepts = data.concepts[:concepts]
+    module = InversionModule(pretrained, omega=OMEGA)
+    trainer = Trainer(
+        max_epochs=1,
+        check_val_every_n_epoch=2,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        default_root_dir="logs/benchmark",
+    )
+    trainer.fit(module, datamodule=data)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pretrained", default="pretrained/object_rearrangement")
+    parser.add_argument("--out", default="results/speed.json")
+    parser.add_argument("--steps", type=int, default=400, help="of our inversion")
+    parser.add_argument("--slice", type=int, default=300, help="timed steps of the published inversion")
+    options = parser.parse_args()
+    torch.manual_seed(0)
+    model = GenerativeModel.load(options.pretrained)
+    domain = load_domain(model.config.domain)
+    task = domain.suites["validation"].learned[0]
+    demonstrations = domain.generate(task, 5, 0).states
+
+    published_inversion(model, demonstrations, 20)  # warm-up
+    published_step = seconds(lambda: published_inversion(model, demonstrations, options.slice)) / options.slice
+    one = seconds(lambda: our_inversion(options.pretrained, 1, options.steps))
+    ten = seconds(lambda: our_inversion(options.pretrained, 10, options.steps))
+
+    concepts, weights = model.training_embeddings[:2], torch.full((2,), OMEGA)
+    shape = (1, model.config.horizon, model.config.state_dim)
+    singles = 3
+
+    def one_at_a_time() -> None:
+        for seed in range(singles):
+            ddpm(
+                lambda x, t: branch_by_branch(model, x, t, concepts, weights),
+                shape,
+                model.alpha_bar,
+                100,
+                0.5,
+                generator("cpu", seed),
+            )
+
+    single = seconds(one_at_a_time) / singles * 500
+    batch = seconds(lambda: model.sample([concepts] * 10, [weights] * 10, 50, ddpm, 100, 0.5, generator("cpu", 0)))
+    generation = seconds(lambda: domain.training_set(920, 0))
+
+    found = {
+        "machine": {
+            "processor": platform.processor() or platform.machine(),
+            "capability": torch.backends.cpu.get_cpu_capability(),
+            "threads": torch.get_num_threads(),
+            "torch": torch.__version__,
+        },
+        "seconds": {
+            "published inversion, one concept (scaled from a slice)": round(published_step * PUBLISHED_STEPS, 1),
+            "our inversion, one concept": round(one, 1),
+            "our inversion, ten concepts": round(ten, 1),
+            "sampling 500 states one at a time (scaled)": round(single, 1),
+            "sampling 500 states in one batch": round(batch, 2),
+            "drawing the training set": round(generation, 2),
+        },
+        "ratio": {
+            "inversion, one concept": round(published_step * PUBLISHED_STEPS / one, 1),
+            "inversion, ten concepts": round(10 * published_step * PUBLISHED_STEPS / ten, 1),
+            "sampling": round(single / batch, 1),
+        },
+    }
+    write_text(Path(options.out), json.dumps(found, indent=2) + "\n")
+    print(json.dumps(found, indent=2))
+
+
+if __name__ == "__main__":
+    main()
