@@ -38,10 +38,10 @@ def seconds(work: Callable[[], object]) -> float:
 
 def branch_by_branch(model: GenerativeModel, x: Tensor, t: Tensor, concepts: Tensor, weights: Tensor) -> Tensor:
     """Eq. 2 as the published code evaluates it: one call of the network for each branch."""
-    empty: Tensor = model.denoiser(x, t, model.empty.expand(len(x), -1), None)
+    empty: Tensor = model.denoiser(x, t, model.empty[None], torch.zeros_like(t))
     total = empty
     for concept, weight in zip(concepts, weights, strict=True):
-        total = total + weight * (model.denoiser(x, t, concept.expand(len(x), -1), None) - empty)
+        total = total + weight * (model.denoiser(x, t, concept[None], torch.zeros_like(t)) - empty)
     return total
 
 

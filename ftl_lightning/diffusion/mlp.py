@@ -39,37 +39,41 @@ class MLPDenoiser(nn.Module):
         state_dim: int,
         concept_dim: int,
         initial_state_dim: int = 0,
-        hidden_dim: int = 384,
+        hidden_dim: int = 512,
         depth: int = 4,
         condition_dim: int = 384,
-        time_dim: int = 32,
+        time_dim: int = 64,
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.time_dim = time_dim
-        self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim))
-        self.concept = nn.Linear(concept_dim, condition_dim)
+        self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
+        self.concept = nn.Sequential(nn.Linear(concept_dim, condition_dim), nn.SiLU())
         inputs = [horizon * state_dim + initial_state_dim] + [hidden_dim] * (depth - 1)
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
-        self.film = nn.ModuleList(nn.Linear(time_dim + condition_dim, 2 * hidden_dim) for _ in inputs)
+        self.time_film = nn.Linear(time_dim, 2 * hidden_dim * depth)
+        self.concept_film = nn.Linear(condition_dim, 2 * hidden_dim * depth, bias=False)
         self.dropout = nn.Dropout(dropout)
         self.head = nn.Linear(hidden_dim, horizon * state_dim)
 
-    def forward(self, x: Tensor, t: Tensor, concept: Tensor, initial_state: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
         """Estimated noise ``(batch, horizon, state)``.
+
+        What depends on the concept alone, two thirds of the arithmetic, is computed once for each row of ``concepts``.
 
         Args:
             x: noisy plan ``(batch, horizon, state)``, normalised.
             t: ``(batch,)`` int64.
-            concept: ``(batch, concept)`` in the model's concept space.
+            concepts: ``(concept, n)``, the different concepts in the batch, in the model's concept space.
+            index: ``(batch,)`` int64, each sample's row of ``concepts``.
             initial_state: ``(batch, initial state)``, normalised, or ``None``.
         """
-        condition = torch.cat((self.time(sinusoidal_embedding(t, self.time_dim)), self.concept(concept)), dim=-1)
-        condition = functional.silu(condition)
+        by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim)))
+        film = (by_time + self.concept_film(self.concept(concepts))[index]).chunk(2 * len(self.layers), dim=-1)
         hidden = x.flatten(1) if initial_state is None else torch.cat((x.flatten(1), initial_state), dim=-1)
-        for index, (layer, film) in enumerate(zip(self.layers, self.film, strict=True)):
-            scale, shift = film(condition).chunk(2, dim=-1)
+        for depth, layer in enumerate(self.layers):
+            scale, shift = film[2 * depth], film[2 * depth + 1]
             update = self.dropout(functional.silu(layer(hidden) * (1 + scale) + shift))
-            hidden = hidden + update if index else update
+            hidden = hidden + update if depth else update
         out: Tensor = self.head(hidden)
         return out.unflatten(-1, x.shape[1:])

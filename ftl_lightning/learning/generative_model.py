@@ -167,8 +167,8 @@ class GenerativeModel(nn.Module):
             ``(composition, count, horizon, state)`` in the domain's units.
         """
         # Compositions with fewer components are padded with empty ones of weight zero, which add nothing.
-        embeddings = nn.utils.rnn.pad_sequence(list(concepts), batch_first=True).repeat_interleave(count, dim=0)
-        omega = nn.utils.rnn.pad_sequence(list(weights), batch_first=True).repeat_interleave(count, dim=0)
+        embeddings = nn.utils.rnn.pad_sequence(list(concepts), batch_first=True)
+        omega = nn.utils.rnn.pad_sequence(list(weights), batch_first=True)
         s0 = None
         if initial_states is not None and self.initial_normalization is not None:
             s0 = self.initial_normalization.encode(initial_states)
@@ -176,19 +176,23 @@ class GenerativeModel(nn.Module):
         def epsilon(x: Tensor, t: Tensor) -> Tensor:
             return composed_epsilon(self.denoiser, x, t, embeddings, omega, self.empty, s0)
 
-        shape = (len(embeddings), self.config.horizon, self.config.state_dim)
+        shape = (len(embeddings) * count, self.config.horizon, self.config.state_dim)
         plans = sampler(epsilon, shape, self.alpha_bar, steps, temperature, generator)
         return self.normalization.decode(plans).unflatten(0, (len(concepts), count))
 
     @property
     def hash(self) -> str:
         """Hash of the weights, the same as :func:`~ftl_lightning.tensor_file.file_hash` of the saved file."""
-        return bytes_hash(serialise(KIND, self.state_dict(), {"domain": self.config.domain}))
+        return bytes_hash(serialise(KIND, self._stored(), {"domain": self.config.domain}))
+
+    def _stored(self) -> dict[str, Tensor]:
+        """What the file holds: the denoiser's weights in half precision, everything else as it is."""
+        return {name: value.half() if name.startswith("denoiser.") else value for name, value in self.state_dict().items()}
 
     def save(self, folder: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``, each whole or not at all."""
+        """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision."""
         folder = Path(folder)
-        save_tensors(folder / WEIGHTS, KIND, self.state_dict(), {"domain": self.config.domain})
+        save_tensors(folder / WEIGHTS, KIND, self._stored(), {"domain": self.config.domain})
         write_text(folder / CONFIG, json.dumps({"format": FORMAT, "hash": self.hash, **asdict(self.config)}, indent=2) + "\n")
 
     @classmethod

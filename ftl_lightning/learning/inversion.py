@@ -153,11 +153,10 @@ class InversionModule(pl.LightningModule):
         t = t[torch.randperm(samples, generator=draw, device=self.device)]
         noise = torch.randn((samples, *self._states.shape[1:]), generator=draw, device=self.device)
         rows = self._rows(samples).flatten().to(self.device)
-        embeddings = self.parametrised.repeat_interleave(samples, dim=0)
-        weights = self.weights.repeat_interleave(samples, dim=0)
+        embeddings = self.parametrised
         initial = None if self._initial is None else self._initial[rows]
         losses = denoising_loss(
-            lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, weights, self.model.empty, initial),
+            lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, self.weights, self.model.empty, initial),
             self._states[rows],
             noise.repeat(runs, 1, 1),
             t.repeat(runs),

@@ -123,11 +123,12 @@ class PretrainingModule(pl.LightningModule):
         if batch.initial_states is not None and self.model.initial_normalization is not None:
             initial = self.model.initial_normalization.encode(batch.initial_states)
         count = len(clean)
-        removed = torch.rand((count, 1), generator=draw, device=self.device) < dropout
-        concepts = torch.where(removed, self.model.empty, self.model.training_embeddings[batch.concepts])
+        removed = torch.rand(count, generator=draw, device=self.device) < dropout
+        concepts = torch.cat((self.model.empty[None], self.model.training_embeddings))
+        index = torch.where(removed, 0, batch.concepts + 1)
         t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
         noise = torch.randn(clean.shape, generator=draw, device=self.device)
-        return denoising_loss(lambda x, t: denoiser(x, t, concepts, initial), clean, noise, t, self.model.alpha_bar)
+        return denoising_loss(lambda x, t: denoiser(x, t, concepts, index, initial), clean, noise, t, self.model.alpha_bar)
 
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
@@ -159,7 +160,10 @@ class PretrainingModule(pl.LightningModule):
         total = int(self.trainer.estimated_stepping_batches)
         warmup = min(self.hparams["warmup_steps"], max(total // 10, 1))
         optimizer = torch.optim.AdamW(
-            self.denoiser.parameters(), lr=self.hparams["learning_rate"], weight_decay=self.hparams["weight_decay"]
+            self.denoiser.parameters(),
+            lr=self.hparams["learning_rate"],
+            weight_decay=self.hparams["weight_decay"],
+            fused=True,
         )
 
         def factor(step: int) -> float:

@@ -24,7 +24,7 @@ def inputs(count: int, seed: int, batch: int = 3) -> dict[str, torch.Tensor]:
 
 
 def plain(of: dict[str, torch.Tensor], concept: torch.Tensor) -> torch.Tensor:
-    noise: torch.Tensor = DENOISER(of["x"], of["t"], concept, of["initial_state"])
+    noise: torch.Tensor = DENOISER(of["x"], of["t"], concept, torch.arange(len(of["x"])), of["initial_state"])
     return noise
 
 
@@ -68,6 +68,13 @@ def test_one_batched_call_equals_the_formula_branch_by_branch(seed: int, count: 
     with torch.no_grad():
         assert close(composed_epsilon(DENOISER, empty=EMPTY, **of), expected)
     assert close(composed_epsilon(DENOISER, empty=EMPTY, **of), expected)
+
+
+def test_consecutive_samples_share_a_composition() -> None:
+    of = inputs(2, 3, batch=6)
+    shared = of | {"concepts": of["concepts"][::3], "weights": of["weights"][::3]}
+    apart = shared | {name: shared[name].repeat_interleave(3, dim=0) for name in ("concepts", "weights")}
+    assert close(composed_epsilon(DENOISER, empty=EMPTY, **shared), composed_epsilon(DENOISER, empty=EMPTY, **apart))
 
 
 def test_the_empty_branch_is_evaluated_without_gradient_and_the_rest_in_one_call() -> None:
