@@ -88,7 +88,7 @@ class Evaluator(pl.Callback):
         samples: int = 50,
         sampler: str = "ddpm",
         steps: int = 100,
-        temperature: float = 0.2,
+        temperature: float = 0.1,
         figures: int = 16,
         results: str | None = None,
         seed: int = 0,
