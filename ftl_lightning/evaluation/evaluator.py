@@ -23,18 +23,24 @@ from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.evaluation.tensorboard import log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import content_hash
+from ftl_lightning.tensor_file import content_hash, file_hash
+
+OWN = "own demonstrations"
+"""The setting of learned concepts that no suite asks for."""
 
 
 @runtime_checkable
 class Generates(Protocol):
-    """What an evaluated module offers: the model, the method's name, embeddings and weights for a task, and all embeddings."""
+    """What an evaluated module offers: the model, names of the method and of learned concepts, and embeddings."""
 
     model: GenerativeModel
     hparams: Any
 
     @property
     def method(self) -> str: ...
+
+    @property
+    def concepts(self) -> tuple[str, ...]: ...
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None: ...
 
@@ -72,7 +78,8 @@ class Evaluator(pl.Callback):
     """Accuracy of generated behaviour.
 
     Args:
-        suites: names of suites of the domain. Tasks whose concept was not learned are left out.
+        suites: names of suites of the domain. Tasks whose concept was not learned are left out; learned concepts that no suite
+            asks for are judged by their own name, if the domain can read it.
         samples: generated for each task; the paper's number is 50.
         sampler: ``'ddpm'`` (the paper's), ``'ddim'`` or ``'dpm_solver'``.
         steps: of the sampler, at most the model's T.
@@ -108,7 +115,10 @@ class Evaluator(pl.Callback):
         for name in self.suites:
             if name not in domain.suites:
                 raise UserError(f"suites: expected some of {', '.join(domain.suites)}, found {name!r}")
-        return Suite(tuple(task for name in self.suites for task in domain.suites[name].tasks if module.composition(task)))
+        tasks = [task for name in self.suites for task in domain.suites[name].tasks]
+        asked = {task.learned for task in tasks}
+        tasks += [EvaluationTask(OWN, name, learned=name) for name in module.concepts if name not in asked and domain.reads(name)]
+        return Suite(tuple(task for task in tasks if module.composition(task)))
 
     @torch.no_grad()
     def evaluate(self, module: Generates) -> list[Judged]:
@@ -167,11 +177,13 @@ class Evaluator(pl.Callback):
         return content_hash([__version__, self._configuration(module, data)])
 
     def _configuration(self, module: Generates, data: pl.LightningDataModule) -> dict[str, Any]:
+        own = data.hparams.get("demonstrations")
         return {
             **{f"model/{key}": value for key, value in dict(module.hparams).items() if key not in ("pretrained", "output")},
             **{f"data/{key}": value for key, value in dict(data.hparams).items() if key != "demonstrations"},
             **{f"evaluation/{key}": value for key, value in self.settings.items()},
             "model/pretrained": module.model.hash,
+            **({"data/demonstrations": file_hash(own)} if own else {}),
         }
 
     def _rows(self, module: Generates, data: pl.LightningDataModule) -> list[Row]:

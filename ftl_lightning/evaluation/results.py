@@ -44,11 +44,12 @@ class Row:
 
 COLUMNS = [field.name for field in fields(Row)]
 _TEXT = {"omega": str, "model_hash": str, "config_hash": str, "version": str}
-_KEY = [column for column in COLUMNS if column != "value"]
+_KEY = ["domain", "setting", "task", "method", "K", "omega", "seed", "n", "metric"]
+"""What a row says something about; a new measurement of the same replaces the old one, whatever it was configured with."""
 
 
 def append_rows(path: str | Path, rows: list[Row]) -> None:
-    """Add rows to a results file, made if missing; a row that is there already is replaced. Whole or not at all."""
+    """Add rows to a results file, made if missing; rows about the same are replaced. Whole or not at all."""
     table = pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS)
     if Path(path).is_file():
         table = pd.concat([read_rows(path), table])

@@ -10,7 +10,11 @@ from torch.utils.tensorboard.summary import hparams
 
 def log_hparams(logger: TensorBoardLogger, configuration: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
     """Put one run into the HPARAMS tab, with its results as the run's metrics."""
-    plain = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in configuration.items()}
+    plain = {
+        key: value if isinstance(value, bool | int | float) else str(value)
+        for key, value in configuration.items()
+        if "/_" not in key
+    }
     writer = logger.experiment.file_writer
     for summary in hparams(plain, dict(metrics)):
         writer.add_summary(summary)

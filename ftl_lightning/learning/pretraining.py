@@ -46,6 +46,8 @@ class PretrainingModule(pl.LightningModule):
     """
 
     method = "FTL-IGM"
+    concepts: tuple[str, ...] = ()
+    """Names of learned concepts; pretraining learns none."""
 
     def __init__(
         self,
@@ -91,8 +93,8 @@ class PretrainingModule(pl.LightningModule):
             denoiser_args=self.denoiser_args,
             diffusion_steps=self.hparams["diffusion_steps"],
             training={
-                "model": {key: value for key, value in self.hparams.items() if key != "output"},
-                "data": dict(data.hparams),
+                "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
+                "data": {key: value for key, value in data.hparams.items() if not key.startswith("_")},
                 "max_steps": self.trainer.max_steps,
             },
         )

@@ -19,6 +19,7 @@ class Trained:
     """The least that an evaluated module offers: a model and its training concepts."""
 
     method = "trained"
+    concepts: tuple[str, ...] = ()
 
     def __init__(self, model: GenerativeModel, seed: int = 0) -> None:
         self.model, self.hparams = model, {"seed": seed}

@@ -98,6 +98,8 @@ def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: P
     log = invert("--data.demonstrations=mine.safetensors", "--model.omega=learned")
     (file,) = (log / "concepts").iterdir()
     assert Concept.load(file).origin.weights == "learned"
+    rows = read_rows(log / "results.csv")
+    assert rows.loc[rows["setting"] == "own demonstrations", "task"].tolist() == [task] * 3  # ours and two reference lines
     options = [f"--pretrained={tiny}", f"--concept={file}", "--compose=circle above square:1.2", "--count=4", "--steps=3"]
     assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors", "--figure=states.png"]) == 0
     assert "accuracy on" in capsys.readouterr().out

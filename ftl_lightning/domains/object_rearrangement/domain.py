@@ -12,6 +12,7 @@ from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse
 from ftl_lightning.domains.object_rearrangement.rendering import render
 from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.errors import UserError
 
 NAME = "object_rearrangement"
 STATE_NAMES = tuple(
@@ -32,6 +33,14 @@ def _demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrat
         concepts=tuple(task for task in tasks for _ in range(count)),
         provenance={"generator": NAME, "seed": seed, "count_per_task": count},
     )
+
+
+def reads(task: str) -> bool:
+    """Whether a text is a conjunction of relations."""
+    try:
+        return bool(parse(task))
+    except UserError:
+        return False
 
 
 def succeeded(goal: str, states: Tensor) -> Tensor:
@@ -59,6 +68,7 @@ DOMAIN = Domain(
     ),
     training_set=functools.partial(_demonstrations, TRAINING_CONCEPTS),
     generate=lambda task, count, seed: _demonstrations((task,), count, seed),
+    reads=reads,
     succeeded=succeeded,
     render=render,
     references={
