@@ -53,7 +53,7 @@ def sample(
     seed: int = 0,
     sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddpm",
     steps: int = 100,
-    temperature: float = 0.5,
+    temperature: float = 0.1,
     goal: str = "",
     out: str = "states.safetensors",
     figure: str = "",
