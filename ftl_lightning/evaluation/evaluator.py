@@ -103,7 +103,15 @@ class Evaluator(pl.Callback):
         if sampler not in SAMPLERS:
             raise UserError(f"sampler: expected one of {', '.join(SAMPLERS)}, found {sampler!r}")
         self.suites = tuple(suites)
-        self.settings = {"samples": samples, "sampler": sampler, "steps": steps, "temperature": temperature, "sample_seed": seed}
+        # The suites too: all tasks are drawn as one batch from one generator.
+        self.settings = {
+            "suites": ", ".join(suites),
+            "samples": samples,
+            "sampler": sampler,
+            "steps": steps,
+            "temperature": temperature,
+            "sample_seed": seed,
+        }
         self.samples, self.sampler, self.steps, self.temperature = samples, SAMPLERS[sampler], steps, temperature
         self.figures = figures
         self.results = results
