@@ -24,7 +24,7 @@ run: install # pretrain, learn the ten new concepts, evaluate, print our table b
 	$(BIN)/python -m ftl_lightning report --results $(LOGS) --out $(LOGS)/report
 
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2
 
 lint: install
 	$(BIN)/ruff check .
