@@ -103,7 +103,7 @@ def sample(
     if not embeddings:
         raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
     states = model.sample(
-        [torch.stack(embeddings)], [torch.tensor(weights)], count, SAMPLERS[sampler], steps, temperature, generator("cpu", seed)
+        [torch.stack(embeddings)], [torch.tensor(weights)], count, SAMPLERS[sampler], steps, temperature, [generator("cpu", seed)]
     )[0]
     result = Demonstrations(
         states=states,

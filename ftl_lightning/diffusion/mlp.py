@@ -68,11 +68,12 @@ class MLPDenoiser(nn.Module):
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
             initial_state: ``(batch, initial state)``, normalised, or ``None``.
         """
-        by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim)))
-        film = (by_time + self.concept_film(self.concept(concepts))[index]).chunk(2 * len(self.layers), dim=-1)
+        by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(2 * len(self.layers), dim=-1)
+        by_concept = self.concept_film(self.concept(concepts)).chunk(2 * len(self.layers), dim=-1)
         hidden = x.flatten(1) if initial_state is None else torch.cat((x.flatten(1), initial_state), dim=-1)
         for depth, layer in enumerate(self.layers):
-            scale, shift = film[2 * depth], film[2 * depth + 1]
+            # Summed layer by layer: all layers at once would not fit into the processor's cache.
+            scale, shift = (by_time[i] + by_concept[i][index] for i in (2 * depth, 2 * depth + 1))
             update = self.dropout(functional.silu(layer(hidden) * (1 + scale) + shift))
             hidden = hidden + update if depth else update
         out: Tensor = self.head(hidden)

@@ -3,7 +3,8 @@
 ``epsilon(x, t)`` takes ``x (batch, horizon, state)`` and ``t (batch,)`` int64 and returns the estimated noise; usually it is
 the composed one (:func:`ftl_lightning.concepts.composition.composed_epsilon`). ``alpha_bar (T,)`` is the schedule of
 pretraining. ``steps <= T`` are spread evenly over it. ``temperature`` is the paper's alpha: the variance of the first noise and
-of every noise added later is scaled by it. ``generator`` alone decides the result.
+of every noise added later is scaled by it. ``noise()`` draws standard normal noise ``(batch, horizon, state)`` and alone decides
+the result.
 """
 
 import itertools
@@ -16,20 +17,13 @@ from torch import Tensor
 from ftl_lightning.diffusion.schedule import clean_from_epsilon
 
 Epsilon = Callable[[Tensor, Tensor], Tensor]
+Noise = Callable[[], Tensor]
 
 
 class Sampler(Protocol):
     """The common signature; returns ``(batch, horizon, state)`` in normalised units."""
 
-    def __call__(
-        self,
-        epsilon: Epsilon,
-        shape: tuple[int, ...],
-        alpha_bar: Tensor,
-        steps: int,
-        temperature: float,
-        generator: torch.Generator,
-    ) -> Tensor: ...
+    def __call__(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor: ...
 
 
 def timesteps(total: int, steps: int) -> list[int]:
@@ -43,22 +37,14 @@ def timesteps(total: int, steps: int) -> list[int]:
     return [round(float(t)) for t in torch.linspace(total - 1, 0, steps, dtype=torch.float64)]
 
 
-def _noise(shape: tuple[int, ...], alpha_bar: Tensor, temperature: float, generator: torch.Generator) -> Tensor:
-    # Drawn on the generator's device, so that a seed gives the same samples wherever the model runs.
-    drawn = torch.randn(shape, generator=generator, device=generator.device)
-    return temperature**0.5 * drawn.to(alpha_bar.device)
-
-
 def _clean(epsilon: Epsilon, x: Tensor, t: int, alpha_bar: Tensor) -> Tensor:
     return clean_from_epsilon(x, epsilon(x, torch.full((len(x),), t, device=x.device)), alpha_bar[t])
 
 
 @torch.no_grad()
-def ddpm(
-    epsilon: Epsilon, shape: tuple[int, ...], alpha_bar: Tensor, steps: int, temperature: float, generator: torch.Generator
-) -> Tensor:
+def ddpm(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
     """Ancestral sampling (Ho et al., 2020) on a subset of the timesteps; the paper's sampler with ``steps = T``."""
-    x = _noise(shape, alpha_bar, temperature, generator)
+    x = temperature**0.5 * noise()
     visited = timesteps(len(alpha_bar), steps)
     for t, before in zip(visited, [*visited[1:], None], strict=True):
         clean = _clean(epsilon, x, t, alpha_bar)
@@ -68,16 +54,14 @@ def ddpm(
         spread = 1 - alpha_bar[t]
         mean = (alpha_bar[before].sqrt() * (1 - ratio) * clean + ratio.sqrt() * (1 - alpha_bar[before]) * x) / spread
         variance = (1 - ratio) * (1 - alpha_bar[before]) / spread
-        x = mean + variance.sqrt() * _noise(shape, alpha_bar, temperature, generator)
+        x = mean + (temperature * variance).sqrt() * noise()
     raise AssertionError("timesteps is never empty")
 
 
 @torch.no_grad()
-def ddim(
-    epsilon: Epsilon, shape: tuple[int, ...], alpha_bar: Tensor, steps: int, temperature: float, generator: torch.Generator
-) -> Tensor:
+def ddim(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
     """Deterministic after the first noise (Song et al., 2021, eta = 0)."""
-    x = _noise(shape, alpha_bar, temperature, generator)
+    x = temperature**0.5 * noise()
     visited = timesteps(len(alpha_bar), steps)
     for t, before in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
@@ -87,11 +71,9 @@ def ddim(
 
 
 @torch.no_grad()
-def dpm_solver(
-    epsilon: Epsilon, shape: tuple[int, ...], alpha_bar: Tensor, steps: int, temperature: float, generator: torch.Generator
-) -> Tensor:
+def dpm_solver(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
     """DPM-Solver++ (2M) (Lu et al., 2022): second order, data prediction, deterministic after the first noise."""
-    x = _noise(shape, alpha_bar, temperature, generator)
+    x = temperature**0.5 * noise()
     visited = timesteps(len(alpha_bar), steps)
     scale, sigma = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
     half_log_snr = scale.log() - sigma.log()

@@ -4,6 +4,7 @@ It works the same while fitting, in ``validate``, in ``test`` and after ``invert
 model and :class:`Generates`.
 """
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +104,7 @@ class Evaluator(pl.Callback):
         if sampler not in SAMPLERS:
             raise UserError(f"sampler: expected one of {', '.join(SAMPLERS)}, found {sampler!r}")
         self.suites = tuple(suites)
-        # The suites too: all tasks are drawn as one batch from one generator.
+        # The suites too: the size of a batch decides how its numbers are rounded.
         self.settings = {
             "suites": ", ".join(suites),
             "samples": samples,
@@ -144,7 +145,7 @@ class Evaluator(pl.Callback):
             self.sampler,
             self.steps,
             self.temperature,
-            generator(model.alpha_bar.device, self.seed),
+            [generator("cpu", self.seed, zlib.crc32(task.name.encode())) for task in tasks],
         ).cpu()
         return [Judged.of(task, own, domain) for task, own in zip(tasks, states, strict=True)]
 

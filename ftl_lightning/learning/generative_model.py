@@ -151,7 +151,7 @@ class GenerativeModel(nn.Module):
         sampler: Sampler,
         steps: int,
         temperature: float,
-        generator: torch.Generator,
+        generators: Sequence[torch.Generator],
         initial_states: Tensor | None = None,
     ) -> Tensor:
         """Generate behaviour of several compositions in one batch.
@@ -160,7 +160,8 @@ class GenerativeModel(nn.Module):
             concepts: for each composition ``(K, n)``; K may differ between them.
             weights: for each composition ``(K,)``.
             count: samples of each.
-            sampler, steps, temperature, generator: see :mod:`ftl_lightning.diffusion.samplers`.
+            sampler, steps, temperature: see :mod:`ftl_lightning.diffusion.samplers`.
+            generators: of the noise, one for each composition, so that its samples do not depend on what is sampled beside it.
             initial_states: ``(composition * count, initial state)`` in the domain's units, or ``None``.
 
         Returns:
@@ -176,8 +177,14 @@ class GenerativeModel(nn.Module):
         def epsilon(x: Tensor, t: Tensor) -> Tensor:
             return composed_epsilon(self.denoiser, x, t, embeddings, omega, self.empty, s0)
 
-        shape = (len(embeddings) * count, self.config.horizon, self.config.state_dim)
-        plans = sampler(epsilon, shape, self.alpha_bar, steps, temperature, generator)
+        shape = (count, self.config.horizon, self.config.state_dim)
+
+        def noise() -> Tensor:
+            # Drawn on the generators' device, so that a seed gives the same samples wherever the model runs.
+            drawn = [torch.randn(shape, generator=one, device=one.device) for one in generators]
+            return torch.cat(drawn).to(self.alpha_bar.device)
+
+        plans = sampler(epsilon, noise, self.alpha_bar, steps, temperature)
         return self.normalization.decode(plans).unflatten(0, (len(concepts), count))
 
     @property

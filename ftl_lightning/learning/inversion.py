@@ -94,7 +94,8 @@ class InversionModule(pl.LightningModule):
     def method(self) -> str:
         """The method's name in tables."""
         form = {1.0: "free", 0.0: "span"}.get(self.off_span, f"near span {self.off_span:g}")
-        return f"FTL-IGM ({form})"
+        weight = self.hparams["training_omega"]
+        return f"FTL-IGM ({form})" if weight is None else f"FTL-IGM ({form}, training weight {weight:g})"
 
     def _emphasis(self, power: float) -> Tensor:
         """Weights of the timesteps ``(T,)`` with mean 1."""

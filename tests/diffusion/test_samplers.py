@@ -1,6 +1,8 @@
 """The samplers against diffusers' schedulers, on an epsilon that is known in closed form."""
 
+import functools
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -27,6 +29,10 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+def noise() -> Callable[[], Tensor]:
+    return functools.partial(torch.randn, SHAPE, generator=generator())
+
+
 def theirs(scheduler: Any, steps: list[int], noises: torch.Generator) -> Tensor:
     x = torch.randn(SHAPE, generator=noises)
     for t in steps:
@@ -47,7 +53,7 @@ def test_the_schedule_is_the_cosine_one() -> None:
 def test_ddpm_equals_diffusers() -> None:
     scheduler = DDPMScheduler(num_train_timesteps=100, trained_betas=betas(), variance_type="fixed_small", clip_sample_range=1.0)
     scheduler.set_timesteps(100)
-    ours = ddpm(exact, SHAPE, ALPHA_BAR, 100, 1.0, generator())
+    ours = ddpm(exact, noise(), ALPHA_BAR, 100, 1.0)
     assert torch.allclose(ours, theirs(scheduler, list(range(99, -1, -1)), generator()), atol=1e-4)
 
 
@@ -62,7 +68,7 @@ def test_ddim_equals_diffusers(steps: int) -> None:
         scheduler.alphas_cumprod = ALPHA_BAR[[before, t]]
         x = scheduler.step(exact(x, torch.full((len(x),), t)), 1, x).prev_sample
     x = clean_from_epsilon(x, exact(x, torch.full((len(x),), 0)), ALPHA_BAR[0])
-    assert torch.allclose(ddim(exact, SHAPE, ALPHA_BAR, steps, 1.0, generator()), x, atol=1e-4)
+    assert torch.allclose(ddim(exact, noise(), ALPHA_BAR, steps, 1.0), x, atol=1e-4)
 
 
 @pytest.mark.parametrize("steps", [10, 20])
@@ -77,19 +83,19 @@ def test_dpm_solver_equals_diffusers(steps: int) -> None:
     x = torch.randn(SHAPE, generator=generator())
     for t in visited:
         x = scheduler.step(exact(x, t.expand(len(x))), t, x).prev_sample
-    assert torch.allclose(dpm_solver(exact, SHAPE, ALPHA_BAR, steps, 1.0, generator()), x, atol=1e-3)
+    assert torch.allclose(dpm_solver(exact, noise(), ALPHA_BAR, steps, 1.0), x, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_every_sampler_finds_the_distribution(name: str) -> None:
-    samples = SAMPLERS[name](exact, SHAPE, ALPHA_BAR, 50, 1.0, generator())
+    samples = SAMPLERS[name](exact, noise(), ALPHA_BAR, 50, 1.0)
     assert samples.mean().item() == pytest.approx(MEAN, abs=0.02)
     assert samples.std().item() == pytest.approx(DEVIATION, abs=0.02)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_a_seed_repeats_and_a_low_temperature_narrows(name: str) -> None:
-    first, again, cold = (SAMPLERS[name](exact, SHAPE, ALPHA_BAR, 20, alpha, generator()) for alpha in (1.0, 1.0, 0.1))
+    first, again, cold = (SAMPLERS[name](exact, noise(), ALPHA_BAR, 20, alpha) for alpha in (1.0, 1.0, 0.1))
     assert torch.equal(first, again)
     assert cold.std() < 0.6 * first.std()
 
