@@ -163,8 +163,8 @@ def _grid(
 
 def _count(domain: Domain, rows: pd.DataFrame) -> Table:
     """The ablation on the number of learned concepts, with learned weights."""
-    learned, _ = _columns(rows)
     own = _select(rows, omega="learned")
+    learned, _ = _columns(own)
     lines = [
         (
             setting,
@@ -181,8 +181,8 @@ def _count(domain: Domain, rows: pd.DataFrame) -> Table:
 
 def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
     """The effect of the guidance weight, K = 2."""
-    learned, _ = _columns(rows)
     own = _select(rows, K=2)
+    learned, _ = _columns(own)
     settings = domain.suites["paper"].settings
     lines = [
         (
@@ -199,8 +199,8 @@ def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
 
 def _components(domain: Domain, rows: pd.DataFrame) -> Table:
     """What each learned component generates alone, with learned weights."""
-    learned, _ = _columns(rows)
     own = _select(rows, K=2, omega="learned")
+    learned, _ = _columns(own)
     suite = domain.suites.get("components")
     lines = [
         (

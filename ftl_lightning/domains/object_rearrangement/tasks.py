@@ -6,12 +6,14 @@ from ftl_lightning.domains.object_rearrangement.relations import SHAPES, TRAININ
 TRAINING_CONCEPTS = tuple(str(relation) for relation in TRAINING_RELATIONS)
 
 
-def _suite(compositions: tuple[str, ...], new_concepts: tuple[str, ...], composed: str, with_training: tuple[str, ...]) -> Suite:
+def _suite(compositions: tuple[str, ...], new_concepts: tuple[str, ...], with_training: dict[str, tuple[str, ...]]) -> Suite:
     return Suite(
         tuple(EvaluationTask("training composition", task, learned=task) for task in compositions)
         + tuple(EvaluationTask("new concept", task, learned=task) for task in new_concepts)
         + tuple(
-            EvaluationTask("new + training", f"{composed} and {text}", learned=composed, texts=(text,)) for text in with_training
+            EvaluationTask("new + training", f"{new} and {text}", learned=new, texts=(text,))
+            for new, texts in with_training.items()
+            for text in texts
         )
     )
 
@@ -33,14 +35,15 @@ PAPER = _suite(
         "circle diagonal to triangle",
         "triangle diagonal to circle",
     ),
-    composed="square diagonal to triangle",
-    with_training=(
-        "circle right of square",
-        "circle above square",
-        "circle above triangle",
-        "circle right of triangle",
-        "triangle above circle",
-    ),
+    with_training={
+        "square diagonal to triangle": (
+            "circle right of square",
+            "circle above square",
+            "circle above triangle",
+            "circle right of triangle",
+            "triangle above circle",
+        )
+    },
 )
 
 VALIDATION = _suite(
@@ -53,21 +56,22 @@ VALIDATION = _suite(
         "triangle right of circle and triangle above square",
     ),
     new_concepts=(
-        str(Relation("ring", SHAPES, 1.25)),
-        str(Relation("ring", SHAPES, 2.1)),
+        *(str(Relation("ring", SHAPES, radius)) for radius in (1.0, 1.25, 1.45, 1.9, 2.1)),
         "circle antidiagonal to triangle",
         "triangle antidiagonal to square",
         "square antidiagonal to circle",
         "circle next to square",
     ),
-    composed="circle antidiagonal to triangle",
-    with_training=(
-        "square right of circle",
-        "square above circle",
-        "square above triangle",
-        "square right of triangle",
-        "triangle right of square",
-    ),
+    with_training={
+        f"{a} antidiagonal to {b}": (
+            f"{c} right of {a}",
+            f"{c} above {a}",
+            f"{c} above {b}",
+            f"{c} right of {b}",
+            f"{b} right of {c}",
+        )
+        for a, b, c in (("circle", "triangle", "square"), ("triangle", "square", "circle"), ("square", "circle", "triangle"))
+    },
 )
 
 COMPONENTS = Suite(
