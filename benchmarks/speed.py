@@ -1,9 +1,10 @@
 """Speed, each ratio measured in one run on this machine: inversion and sampling in batches against the published procedure.
 
-    python benchmarks/speed.py [--pretrained pretrained/object_rearrangement] [--out results/speed.json]
+    python benchmarks/speed.py [--pretrained pretrained/object_rearrangement] [--out results/speed.json] [--full]
 
 The published inversion takes one noised demonstration at a time, accumulates two, and evaluates the K + 1 branches one after
-another, for 5 x 10,000 optimiser steps a concept; a slice of its steps is timed and scaled up.
+another, for 5 x 10,000 optimiser steps a concept; a slice of its steps is timed and scaled up. ``--full`` runs it to its end
+and judges what both have learned from the same demonstrations.
 """
 
 import argparse
@@ -13,10 +14,12 @@ import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.datamodule import InversionData
 from ftl_lightning.diffusion.samplers import ddpm
 from ftl_lightning.diffusion.schedule import denoising_loss
@@ -31,11 +34,14 @@ PUBLISHED_STEPS = 50_000
 OMEGA = 1.2
 TEMPERATURE = 0.1
 
+Result = TypeVar("Result")
 
-def seconds(work: Callable[[], object]) -> float:
+
+def timed(work: Callable[[], Result]) -> tuple[Result, float]:
+    """A result, and the seconds it took."""
     start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
+    result = work()
+    return result, time.perf_counter() - start
 
 
 def branch_by_branch(model: GenerativeModel, x: Tensor, t: Tensor, concepts: Tensor, weights: Tensor) -> Tensor:
@@ -47,8 +53,8 @@ def branch_by_branch(model: GenerativeModel, x: Tensor, t: Tensor, concepts: Ten
     return total
 
 
-def published_inversion(model: GenerativeModel, demonstrations: Tensor, steps: int) -> None:
-    """So many optimiser steps of the published procedure for one concept."""
+def published_inversion(model: GenerativeModel, demonstrations: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Embeddings and weights after so many optimiser steps of the published procedure for one concept."""
     states = model.normalization.encode(demonstrations)
     concepts = torch.randn(2, model.config.concept_dim, requires_grad=True)
     weights = torch.full((2,), OMEGA)
@@ -62,12 +68,13 @@ def published_inversion(model: GenerativeModel, demonstrations: Tensor, steps: i
             loss = denoising_loss(lambda x, t: branch_by_branch(model, x, t, concepts, weights), clean, noise, t, model.alpha_bar)
             (loss.mean() / 2).backward()
         optimiser.step()
+    return concepts.detach(), weights
 
 
-def our_inversion(pretrained: str, concepts: int, steps: int) -> None:
-    """What ``invert`` does with the shipped configuration, for the first so many concepts of the validation suite."""
+def our_inversion(pretrained: str, concepts: list[str], steps: int) -> list[Concept]:
+    """What ``invert`` does with the shipped configuration, for some concepts of the validation suite."""
     data = InversionData("object_rearrangement", suite="validation", steps=steps)
-    data.concepts = data.concepts[:concepts]
+    data.concepts = tuple(concepts)
     module = InversionModule(pretrained, omega=OMEGA)
     trainer = Trainer(
         max_epochs=1,
@@ -79,6 +86,13 @@ def our_inversion(pretrained: str, concepts: int, steps: int) -> None:
         default_root_dir="logs/benchmark",
     )
     trainer.fit(module, datamodule=data)
+    return [module.learned()[name] for name in concepts]
+
+
+def accuracy(model: GenerativeModel, task: str, concepts: Tensor, weights: Tensor) -> float:
+    """Share of 50 samples that show the task."""
+    states = model.sample([concepts], [weights], 50, ddpm, 100, TEMPERATURE, [generator("cpu", 0)])[0]
+    return float(load_domain(model.config.domain).succeeded(task, states).float().mean())
 
 
 def main() -> None:
@@ -87,17 +101,22 @@ def main() -> None:
     parser.add_argument("--out", default="results/speed.json")
     parser.add_argument("--steps", type=int, default=400, help="of our inversion")
     parser.add_argument("--slice", type=int, default=300, help="timed steps of the published inversion")
+    parser.add_argument("--task", default="circle antidiagonal to triangle", help="the one concept, of the validation suite")
+    parser.add_argument("--full", action="store_true", help="run the published inversion to its end and judge both")
     options = parser.parse_args()
     torch.manual_seed(0)
     model = GenerativeModel.load(options.pretrained)
     domain = load_domain(model.config.domain)
-    task = domain.suites["validation"].learned[0]
-    demonstrations = domain.generate(task, 5, 0).states
+    task = options.task
+    others = [name for name in domain.suites["validation"].learned if name != task]
+    demonstrations = InversionData(domain.name, suite="validation").demonstrations.select(task).states
+    slice_steps = PUBLISHED_STEPS if options.full else options.slice
 
     published_inversion(model, demonstrations, 20)  # warm-up
-    published_step = seconds(lambda: published_inversion(model, demonstrations, options.slice)) / options.slice
-    one = seconds(lambda: our_inversion(options.pretrained, 1, options.steps))
-    ten = seconds(lambda: our_inversion(options.pretrained, 10, options.steps))
+    (theirs, their_weights), duration = timed(lambda: published_inversion(model, demonstrations, slice_steps))
+    published = duration / slice_steps * PUBLISHED_STEPS
+    (ours,), one = timed(lambda: our_inversion(options.pretrained, [task], options.steps))
+    _, ten = timed(lambda: our_inversion(options.pretrained, [task, *others[:9]], options.steps))
 
     concepts, weights = model.training_embeddings[:2], torch.full((2,), OMEGA)
     shape = (1, model.config.horizon, model.config.state_dim)
@@ -108,12 +127,12 @@ def main() -> None:
             noise = functools.partial(torch.randn, shape, generator=generator("cpu", seed))
             ddpm(lambda x, t: branch_by_branch(model, x, t, concepts, weights), noise, model.alpha_bar, 100, TEMPERATURE)
 
-    single = seconds(one_at_a_time) / singles * 500
+    single = timed(one_at_a_time)[1] / singles * 500
     draws = [generator("cpu", task) for task in range(10)]
-    batch = seconds(lambda: model.sample([concepts] * 10, [weights] * 10, 50, ddpm, 100, TEMPERATURE, draws))
-    generation = seconds(lambda: domain.training_set(920, 0))
+    _, batch = timed(lambda: model.sample([concepts] * 10, [weights] * 10, 50, ddpm, 100, TEMPERATURE, draws))
+    _, generation = timed(lambda: domain.training_set(920, 0))
 
-    found = {
+    found: dict[str, dict[str, object]] = {
         "machine": {
             "processor": platform.processor() or platform.machine(),
             "capability": torch.backends.cpu.get_cpu_capability(),
@@ -121,7 +140,7 @@ def main() -> None:
             "torch": torch.__version__,
         },
         "seconds": {
-            "published inversion, one concept (scaled from a slice)": round(published_step * PUBLISHED_STEPS, 1),
+            f"published inversion, one concept{'' if options.full else ' (scaled from a slice)'}": round(published, 1),
             "our inversion, one concept": round(one, 1),
             "our inversion, ten concepts": round(ten, 1),
             "sampling 500 states one at a time (scaled)": round(single, 1),
@@ -129,11 +148,17 @@ def main() -> None:
             "drawing the training set": round(generation, 2),
         },
         "ratio": {
-            "inversion, one concept": round(published_step * PUBLISHED_STEPS / one, 1),
-            "inversion, ten concepts": round(10 * published_step * PUBLISHED_STEPS / ten, 1),
+            "inversion, one concept": round(published / one, 1),
+            "inversion, ten concepts": round(10 * published / ten, 1),
             "sampling": round(single / batch, 1),
         },
     }
+    if options.full:
+        found["accuracy"] = {
+            "task": task,
+            "published inversion": accuracy(model, task, theirs, their_weights),
+            "our inversion": accuracy(model, task, ours.embeddings, ours.weights),
+        }
     write_text(Path(options.out), json.dumps(found, indent=2) + "\n")
     print(json.dumps(found, indent=2))
 
