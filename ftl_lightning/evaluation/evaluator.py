@@ -5,7 +5,7 @@ model and :class:`Generates`.
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
@@ -69,6 +69,11 @@ class Judged:
         return float(metric.compute())
 
 
+def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Hyper-parameters without those that Lightning's command line adds for itself."""
+    return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
+
+
 def standard_error(values: Sequence[float]) -> float:
     """Standard error of the mean over tasks; 0 for a single one."""
     count = len(values)
@@ -102,7 +107,11 @@ class Evaluator(pl.Callback):
         seed: int = 0,
     ) -> None:
         if sampler not in SAMPLERS:
-            raise UserError(f"sampler: expected one of {', '.join(SAMPLERS)}, found {sampler!r}")
+            raise UserError(f"evaluation.sampler: expected one of {', '.join(SAMPLERS)}, found {sampler!r}")
+        if samples < 1:
+            raise UserError(f"evaluation.samples: expected 1 or more, found {samples}")
+        if temperature < 0:
+            raise UserError(f"evaluation.temperature: expected 0 or more, found {temperature}")
         self.suites = tuple(suites)
         # The suites too: the size of a batch decides how its numbers are rounded.
         self.settings = {
@@ -120,40 +129,49 @@ class Evaluator(pl.Callback):
         self.judged: list[Judged] = []
         self._projected = False
 
-    def _tasks(self, domain: Domain, module: Generates) -> Suite:
+    def _tasks(self, domain: Domain, learned: Sequence[str]) -> list[EvaluationTask]:
         for name in self.suites:
             if name not in domain.suites:
-                raise UserError(f"suites: expected some of {', '.join(domain.suites)}, found {name!r}")
+                raise UserError(f"evaluation.suites: expected some of {', '.join(domain.suites)}, found {name!r}")
         tasks = [task for name in self.suites for task in domain.suites[name].tasks]
         asked = {task.learned for task in tasks}
-        tasks += [EvaluationTask(OWN, name, learned=name) for name in module.concepts if name not in asked and domain.reads(name)]
-        return Suite(tuple(task for task in tasks if module.composition(task)))
+        return tasks + [EvaluationTask(OWN, name, learned=name) for name in learned if name not in asked and domain.reads(name)]
 
     @torch.no_grad()
     def evaluate(self, module: Generates) -> list[Judged]:
         """Generate and judge every task in one batch of the network."""
         model = module.model
         domain = load_domain(model.config.domain)
-        tasks = self._tasks(domain, module).tasks
-        compositions = [composition for task in tasks if (composition := module.composition(task))]
-        if not compositions:
+        asked = self._tasks(domain, module.concepts)
+        composed = {task: composition for task in asked if (composition := module.composition(task))}
+        if not composed:
             return []
         states = model.sample(
-            [embeddings for embeddings, _ in compositions],
-            [weights for _, weights in compositions],
+            [embeddings for embeddings, _ in composed.values()],
+            [weights for _, weights in composed.values()],
             self.samples,
             self.sampler,
             self.steps,
             self.temperature,
-            [generator("cpu", self.seed, zlib.crc32(task.name.encode())) for task in tasks],
+            [generator("cpu", self.seed, zlib.crc32(task.name.encode())) for task in composed],
         ).cpu()
-        return [Judged.of(task, own, domain) for task, own in zip(tasks, states, strict=True)]
+        return [Judged.of(task, own, domain) for task, own in zip(composed, states, strict=True)]
+
+    def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Tell mistakes before hours of training, not after."""
+        if not isinstance(pl_module, Generates):
+            raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(pl_module).__name__}")
+        total = len(pl_module.model.alpha_bar)
+        if not 1 <= self.steps <= total:
+            raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.steps}")
+        self._tasks(load_domain(pl_module.model.config.domain), pl_module.concepts)
+
+    on_fit_start = on_validation_start = on_test_start = _check
 
     def _run(self, trainer: pl.Trainer, module: pl.LightningModule, stage: str) -> None:
         if trainer.sanity_checking:
             return
-        if not isinstance(module, Generates):
-            raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(module).__name__}")
+        assert isinstance(module, Generates)
         self.judged = self.evaluate(module)
         domain = load_domain(module.model.config.domain)
         metrics: dict[str, float] = {}
@@ -166,7 +184,7 @@ class Evaluator(pl.Callback):
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 self._draw(logger, domain, trainer.global_step)
-                if not self._projected:  # training embeddings do not change while fitting
+                if stage == "test" or not self._projected:  # training embeddings do not change while fitting
                     log_projector(logger, module.concept_embeddings(), trainer.global_step)
                     self._projected = True
                 if stage == "test":
@@ -188,42 +206,39 @@ class Evaluator(pl.Callback):
     def _configuration(self, module: Generates, data: pl.LightningDataModule) -> dict[str, Any]:
         own = data.hparams.get("demonstrations")
         return {
-            **{f"model/{key}": value for key, value in dict(module.hparams).items() if key not in ("pretrained", "output")},
-            **{f"data/{key}": value for key, value in dict(data.hparams).items() if key != "demonstrations"},
+            **{f"model/{key}": value for key, value in _public(module.hparams) if key not in ("pretrained", "output")},
+            **{f"data/{key}": value for key, value in _public(data.hparams) if key != "demonstrations"},
             **{f"evaluation/{key}": value for key, value in self.settings.items()},
             "model/pretrained": module.model.hash,
             **({"data/demonstrations": file_hash(own)} if own else {}),
         }
 
     def _rows(self, module: Generates, data: pl.LightningDataModule) -> list[Row]:
-        hparams = module.hparams
-        model_hash, config_hash = module.model.hash, self.config_hash(module, data)
         domain = load_domain(module.model.config.domain)
+        hparams = module.hparams
+        ours = {
+            "method": module.method,
+            "K": hparams.get("components", 0),
+            "omega": str(hparams.get("omega", hparams.get("guidance"))),
+            "model_hash": module.model.hash,
+            "config_hash": self.config_hash(module, data),
+        }
+        nobody = {"K": 0, "omega": "", "model_hash": "", "config_hash": content_hash([__version__, self.samples, self.seed])}
 
-        def row(task: EvaluationTask, method: str, components: int, omega: str, value: float) -> Row:
-            return Row(
-                domain=domain.name,
-                setting=task.setting,
-                task=task.name,
-                method=method,
-                K=components,
-                omega=omega,
-                seed=hparams["seed"],
-                n=self.samples,
-                metric="accuracy",
-                value=round(value, 6),
-                model_hash=model_hash,
-                config_hash=config_hash,
-            )
+        def row(task: EvaluationTask, accuracy: float, what: dict[str, Any]) -> Row:
+            subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
+            return Row(**subject, **what, n=self.samples, metric="accuracy", value=round(accuracy, 6))
 
-        omega = str(hparams.get("omega", hparams.get("guidance")))
-        ours = [row(one.task, module.method, hparams.get("components", 0), omega, one.accuracy) for one in self.judged]
         references = [
-            row(one.task, name, 0, "", Judged.of(one.task, policy(one.task.goal, self.samples, self.seed), domain).accuracy)
-            for name, policy in domain.references.items()
+            row(
+                one.task,
+                Judged.of(one.task, draw(one.task.goal, self.samples, self.seed), domain).accuracy,
+                nobody | {"method": name},
+            )
+            for name, draw in domain.references.items()
             for one in self.judged
         ]
-        return ours + references
+        return [row(one.task, one.accuracy, ours) for one in self.judged] + references
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

@@ -44,17 +44,23 @@ class Row:
 
 COLUMNS = [field.name for field in fields(Row)]
 _TEXT = {"omega": str, "model_hash": str, "config_hash": str, "version": str}
-_KEY = ["domain", "setting", "task", "method", "K", "omega", "seed", "n", "metric"]
-"""What a row says something about; a new measurement of the same replaces the old one, whatever it was configured with."""
+_SUBJECT = ["domain", "setting", "task", "method", "K", "omega", "seed", "metric"]
+_KEY = [*_SUBJECT, "n", "config_hash"]
+"""What makes a row the same measurement as another, which it then replaces."""
 
 
 def append_rows(path: str | Path, rows: list[Row]) -> None:
-    """Add rows to a results file, made if missing; rows about the same are replaced. Whole or not at all."""
+    """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all."""
     table = pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS)
     if Path(path).is_file():
         table = pd.concat([read_rows(path), table])
     with atomic(path) as temporary:
         table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
+
+
+def latest(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of rows about the same that differ only in how they were configured, the one that was measured last."""
+    return rows.drop_duplicates(_SUBJECT, keep="last")
 
 
 def read_rows(path: str | Path) -> pd.DataFrame:

@@ -10,11 +10,7 @@ from torch.utils.tensorboard.summary import hparams
 
 def log_hparams(logger: TensorBoardLogger, configuration: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
     """Put one run into the HPARAMS tab, with its results as the run's metrics."""
-    plain = {
-        key: value if isinstance(value, bool | int | float) else str(value)
-        for key, value in configuration.items()
-        if "/_" not in key
-    }
+    plain = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in configuration.items()}
     writer = logger.experiment.file_writer
     for summary in hparams(plain, dict(metrics)):
         writer.add_summary(summary)
@@ -28,6 +24,5 @@ def log_projector(logger: TensorBoardLogger, embeddings: Mapping[str, torch.Tens
         step: the trainer's.
     """
     if embeddings:
-        logger.experiment.add_embedding(
-            torch.stack(list(embeddings.values())).cpu(), metadata=list(embeddings), global_step=step, tag="concepts"
-        )
+        stacked = torch.stack([embedding.cpu() for embedding in embeddings.values()])
+        logger.experiment.add_embedding(stacked, metadata=list(embeddings), global_step=step, tag="concepts")

@@ -1,25 +1,32 @@
 """A checkpoint names the module class it belongs to, so that one module never continues another's."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import lightning.pytorch as pl
 
 from ftl_lightning.errors import UserError
 
-_KEY = "module_class"
+_KEY = "belongs_to"
 
 
-def sign(module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
-    """Write the module's class into its checkpoint."""
-    checkpoint[_KEY] = type(module).__name__
+def _signature(module: pl.LightningModule, more: Mapping[str, Any]) -> dict[str, Any]:
+    return {"module_class": type(module).__name__, **more}
 
 
-def check_signature(module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
-    """Refuse a checkpoint of another class.
+def sign(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Write the module's class, and what else its parameters mean nothing without, into its checkpoint."""
+    checkpoint[_KEY] = _signature(module, more)
+
+
+def check_signature(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Refuse a checkpoint with another signature.
 
     Raises:
-        UserError: if the classes differ.
+        UserError: naming the first key that differs.
     """
-    expected, found = type(module).__name__, checkpoint.get(_KEY)
-    if found != expected:
-        raise UserError(f"ckpt_path: key {_KEY!r}: expected {expected}, found {found}; it is the checkpoint of another module")
+    signature = checkpoint.get(_KEY, {})
+    for key, expected in _signature(module, more).items():
+        if (found := signature.get(key)) != expected:
+            raise UserError(f"ckpt_path: key {key!r}: expected {expected}, found {found}; it is the checkpoint of something else")

@@ -1,5 +1,6 @@
 """Inversion: learning concepts from a few demonstrations through the frozen model (Eq. 2 of the paper)."""
 
+import zlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -73,6 +74,9 @@ class InversionModule(pl.LightningModule):
             raise UserError(f"model.components: expected 1 or more, found {components}")
         if not 0 <= off_span <= 1:
             raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {off_span}")
+        for name, value in (("restarts", restarts), ("samples", samples)):
+            if value < 1:
+                raise UserError(f"model.{name}: expected 1 or more, found {value}")
         self.model = GenerativeModel.load(pretrained)
         self.restarts = restarts
         self.off_span = off_span
@@ -117,13 +121,15 @@ class InversionModule(pl.LightningModule):
         self.demonstrations: Demonstrations = data.demonstrations
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
-        draw = generator("cpu", self.seed, 0)
-        start = torch.randn((runs, components, self.model.config.concept_dim), generator=draw)
+        # A generator for each concept, so that its start does not depend on what is learned beside it.
+        shape = (self.restarts, components, self.model.config.concept_dim)
+        draws = [generator("cpu", self.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
+        start = torch.cat([torch.randn(shape, generator=draw) for draw in draws])
         self.embeddings = nn.Parameter(self.hparams["initial_spread"] * start)
         if omega == "learned":
             self.weights = nn.Parameter(torch.full((runs, components), float(self.hparams["initial_omega"])))
         else:
-            self.register_buffer("weights", torch.full((runs, components), float(omega)))
+            self.register_buffer("weights", torch.full((runs, components), float(omega)), persistent=False)
         normalised = self.model.normalization.encode(data.demonstrations.states)
         initial = data.demonstrations.initial_states
         encoder = self.model.initial_normalization
@@ -174,12 +180,17 @@ class InversionModule(pl.LightningModule):
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         return losses.mean(dim=1).sum()
 
-    @torch.no_grad()
-    def test_step(self, step: int) -> None:
-        # The loss on common noise; behaviour is judged by the evaluator.
-        self.log("test/loss", self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(), batch_size=1)
+    # Validation and test log the loss on common noise; behaviour is judged by the evaluator.
+    def validation_step(self, step: int) -> None:
+        self.log("val/loss", self._common_losses().mean(), batch_size=1)
 
-    validation_step = test_step
+    def test_step(self, step: int) -> None:
+        self.log("test/loss", self._common_losses().mean(), batch_size=1)
+
+    @torch.no_grad()
+    def _common_losses(self) -> Tensor:
+        """The loss of every run ``(run,)`` on noise that is common to all and always the same."""
+        return self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(dim=1)
 
     def train(self, mode: bool = True) -> "InversionModule":
         """Switch modes; the pretrained model stays in evaluation mode."""
@@ -199,18 +210,28 @@ class InversionModule(pl.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Sign the checkpoint and leave the frozen model out; its folder is a hyper-parameter."""
-        sign(self, checkpoint)
+        sign(self, checkpoint, self._signature())
         own = {"embeddings", "weights"}
         checkpoint["state_dict"] = {key: value for key, value in checkpoint["state_dict"].items() if key in own}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse another module's checkpoint."""
-        check_signature(self, checkpoint)
+        """Refuse the checkpoint of another module, model, concepts or kind of weights."""
+        check_signature(self, checkpoint, self._signature())
+
+    def _signature(self) -> dict[str, Any]:
+        """What a checkpoint's parameters mean nothing without."""
+        return {
+            "pretrained": self.model.hash,
+            "demonstrations": self.demonstrations.hash,
+            "components": self.hparams["components"],
+            "restarts": self.restarts,
+            "omega": self.hparams["omega"],
+        }
 
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
         """The concepts by name: of each, the restart with the lowest loss on common noise."""
-        losses = self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(dim=1).unflatten(0, (-1, self.restarts))
+        losses = self._common_losses().unflatten(0, (-1, self.restarts))
         best = losses.argmin(dim=1)
         embeddings = self.parametrised.detach().unflatten(0, (-1, self.restarts))
         weights = self.weights.detach().unflatten(0, (-1, self.restarts))
@@ -230,20 +251,25 @@ class InversionModule(pl.LightningModule):
             found[name] = Concept(embeddings[index, best[index]].cpu(), weights[index, best[index]].cpu(), origin)
         return found
 
-    def on_fit_end(self) -> None:
-        """Write every concept to a file of its own."""
-        folder = self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts"
-        for name, concept in self.learned().items():
-            concept.save(Path(folder) / f"{file_name(name)}.safetensors")
+    @property
+    def folder(self) -> Path:
+        """Where the learned concepts are written."""
+        return Path(self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
 
-    def on_test_start(self) -> None:
+    def on_train_end(self) -> None:
+        """Write every concept to a file of its own."""
+        self._found = self.learned()
+        for name, concept in self._found.items():
+            concept.save(self.folder / f"{file_name(name)}.safetensors")
+
+    def on_validation_start(self) -> None:
         self._found = self.learned()
 
-    on_validation_start = on_test_start
+    on_test_start = on_validation_start
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
         """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
-        omega = self.hparams["training_omega"]
+        omega = self.hparams["training_omega"] if task.learned else None
         if omega is None:
             omega = 1.0 if self.hparams["omega"] == "learned" else self.hparams["omega"]
         embeddings = [self.model.concept(text) for text in task.texts]

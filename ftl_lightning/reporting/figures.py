@@ -4,6 +4,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.results import latest
 from ftl_lightning.reporting.tables import summarise
 
 PAPER_COLOUR = "#9a9a9a"
@@ -17,7 +18,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
         domain: the domain.
         results: rows of the results file.
     """
-    rows = results[(results["domain"] == domain.name) & (results["metric"] == "accuracy")]
+    rows = latest(results[(results["domain"] == domain.name) & (results["metric"] == "accuracy")])
     ours = rows[(rows["K"] == 2) & (rows["omega"] == domain.omega)]
     names = ("training", "paper")
     settings = [s for name in names for s in domain.suites[name].settings if s in set(ours["setting"])]
@@ -27,18 +28,24 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
     width = 0.8 / (len(methods) + 1)
     published = {found.setting: found for found in domain.published if not found.task and found.omega == domain.omega}
     chance = rows[rows["K"] == 0]
+    drawn = False
     for place, setting in enumerate(settings):
         found = published.get(setting)
         if found:
-            axes.bar(
-                place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label="paper" if place == 1 else None
-            )
+            axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label=None if drawn else "paper")
+            drawn = True
         for index, method in enumerate(methods, start=1):
             number = summarise(ours[(ours["setting"] == setting) & (ours["method"] == method)])
             if number:
-                label = method if place == 0 else None
+                label, colour = method if place == 0 else None, COLOURS[(index - 1) % len(COLOURS)]
                 axes.bar(
-                    place + index * width, number.mean, width, yerr=number.error, color=COLOURS[index - 1], capsize=2, label=label
+                    place + index * width,
+                    number.mean,
+                    width,
+                    yerr=number.error,
+                    color=colour,
+                    capsize=2,
+                    label=label,
                 )
         trivial = summarise(chance[(chance["setting"] == setting) & chance["method"].str.startswith("random")])
         if trivial:

@@ -7,6 +7,7 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import Domain, Published
 from ftl_lightning.evaluation.evaluator import standard_error
+from ftl_lightning.evaluation.results import latest
 
 MISSING = "-"
 
@@ -100,14 +101,13 @@ def _text(number: Number | None) -> str:
 
 
 def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
-    """Learned methods and reference policies among the results, each sorted."""
-    learned = sorted(set(rows.loc[rows["K"] > 0, "method"]))
-    return learned, sorted(set(rows.loc[rows["K"] == 0, "method"]) - set(learned))
+    """Methods that learn concepts and reference policies among the results, each sorted."""
+    return sorted(set(rows.loc[rows["K"] > 0, "method"])), sorted(set(rows.loc[rows["omega"] == "", "method"]))
 
 
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     """Every table of a domain for which there are results."""
-    rows = _select(results, domain=domain.name, metric="accuracy")
+    rows = latest(_select(results, domain=domain.name, metric="accuracy"))
     candidates = (_accuracy(domain, rows), _count(domain, rows), _omega(domain, rows), _components(domain, rows))
     return [table for table in candidates if not table.cells.empty]
 

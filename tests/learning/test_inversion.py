@@ -90,7 +90,7 @@ def test_the_span_form_stays_in_the_span(tiny: Path, off_span: float, inside: bo
 def test_a_concept_file_names_where_it_comes_from(invert: Callable[..., Path], tiny: Path) -> None:
     folder = invert("--data.suite=validation", "--evaluation.suites=[validation]") / "concepts"
     files = sorted(folder.iterdir())
-    assert len(files) == 15
+    assert len(files) == 14
     concept = Concept.load(files[0])
     model = GenerativeModel.load(tiny)
     assert concept.origin.pretrained == model.hash
