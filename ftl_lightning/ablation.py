@@ -3,6 +3,7 @@
 import itertools
 import json
 import time
+from argparse import ArgumentError
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,8 @@ class Stage:
         config: its configuration file.
         options: that all cells share, by their names on the command line.
         grid: options with a list of values each; the cells are their product.
-        done: a file whose presence means that the stage need not run, such as a pretrained model; empty for never.
+        done: a file whose presence means that the stage need not run, such as a pretrained model; empty for never. It is the
+            file alone that counts: remove it after a change of the stage's configuration.
     """
 
     verb: Literal["fit", "invert"]
@@ -63,7 +65,7 @@ def run_ablation(stages: Sequence[Stage], seeds: Sequence[int], results: str) ->
         print(f"[{number}/{len(plan)}{ahead}] {stage.verb} {' '.join(cell)}", flush=True)
         try:
             _run(stage, seed, cell, results)
-        except UserError as error:
+        except (UserError, ArgumentError) as error:
             failed.append(f"{stage.verb} {' '.join(cell)}: {error}")
     if failed:
         raise UserError(f"ablation: {len(failed)} of {len(plan)} cells failed: " + "; ".join(failed))

@@ -2,8 +2,11 @@
 
 import importlib
 import os
+import re
 import sys
+from argparse import ArgumentError
 from collections.abc import Sequence
+from pathlib import Path
 
 from ftl_lightning import __version__
 from ftl_lightning.errors import UserError
@@ -42,9 +45,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except SystemExit as stop:  # jsonargparse has told what is wrong
+    except ArgumentError as error:
+        print(f"error: {_one_line(str(error), arguments)}", file=sys.stderr)
+        return 2
+    except SystemExit as stop:  # after --help and --print_config
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     return 0
+
+
+def _one_line(message: str, arguments: list[str]) -> str:
+    """What jsonargparse tells in many lines, in one, with the configuration file that holds the mistaken key."""
+    noise = ("Does not validate", "Subtypes:", "Errors:", "Expected a <class 'NoneType'>", "Given value")
+    lines = [line.strip(" -") for line in message.splitlines()]
+    told = " ".join(line for line in lines if line and not line.startswith(noise))
+    named = {key.split(".")[-1] for key in re.findall(r"""['"]([\w.]+)['"]""", told)} - _EVERYWHERE
+    options = {argument.lstrip("-").split("=")[0].split(".")[-1] for argument in arguments}
+    if not named & options:
+        candidates = [Path(argument.removeprefix("--config=")) for argument in arguments]
+        for path in filter(Path.is_file, candidates):
+            if named & set(re.findall(r"([\w.]+)\s*:", path.read_text(encoding="utf-8", errors="replace"))):
+                return f"{path}: {told}"
+    return f"{told}; see --help"
+
+
+_EVERYWHERE = {"model", "data", "trainer", "evaluation", "stages", "init_args", "class_path"}
+"""Keys that every configuration file has; they do not tell which file a mistake is in."""
 
 
 def _dispatch(arguments: list[str]) -> None:
@@ -57,7 +82,8 @@ def _dispatch(arguments: list[str]) -> None:
         from jsonargparse import auto_cli
 
         function = getattr(importlib.import_module("ftl_lightning.commands"), verb)
-        auto_cli(function, args=arguments[1:], as_positional=verb in POSITIONAL, prog=f"python -m ftl_lightning {verb}")
+        program = f"python -m ftl_lightning {verb}"
+        auto_cli(function, args=arguments[1:], as_positional=verb in POSITIONAL, prog=program, exit_on_error=False)
     elif verb in TRAINER_VERBS:
         from ftl_lightning.lightning_cli import run
 

@@ -21,6 +21,8 @@ def generate(domain: str, task: str = "", count: int = 100, seed: int = 0, out: 
 
     if count < 1:
         raise UserError(f"count: expected 1 or more, found {count}")
+    if seed < 0:
+        raise UserError(f"seed: expected 0 or more, found {seed}")
     source = load_domain(domain)
     demonstrations = source.generate(task, count, seed) if task else source.training_set(count, seed)
     demonstrations.save(out)
@@ -63,8 +65,8 @@ def sample(
     Args:
         pretrained: folder of the pretrained model.
         concept: file of a learned concept; empty for training concepts alone.
-        compose: training concepts with guidance weights, "circle right of square:1.2 + triangle above circle:1"; the weight may be
-            left out and is 1 then.
+        compose: what is composed with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9". Training
+            concepts, or files of learned concepts, whose own weights are multiplied. A weight may be left out and is 1 then.
         count: samples.
         seed: of the samples.
         sampler: see ftl_lightning.diffusion.samplers.
@@ -92,14 +94,22 @@ def sample(
         raise UserError(f"count: expected 1 or more, found {count}")
     if not 1 <= steps <= model.config.diffusion_steps:
         raise UserError(f"steps: expected 1 to {model.config.diffusion_steps} (the model's T), found {steps}")
-    texts = parse_composition(compose)
-    embeddings = [model.concept(text) for text, _ in texts]
-    weights = [weight for _, weight in texts]
-    if concept:
-        learned = Concept.load(concept)
-        model.check(learned, concept)
-        embeddings += list(learned.embeddings)
-        weights += learned.weights.tolist()
+    if seed < 0 or temperature < 0:
+        raise UserError(f"seed, temperature: expected 0 or more, found {min(seed, temperature)}")
+    if goal and not domain.reads(goal):
+        raise UserError(f"goal: expected a task of {domain.name}, found {goal!r}")
+    if figure and Path(figure).suffix not in (".png", ".svg", ".pdf"):
+        raise UserError(f"figure: expected a name that ends in .png, .svg or .pdf, found {figure!r}")
+    embeddings, weights = [], []
+    for name, weight in [*parse_composition(compose), *([(concept, 1.0)] if concept else [])]:
+        if name == concept or name.endswith(".safetensors"):
+            learned = Concept.load(name)
+            model.check(learned, name)
+            embeddings += list(learned.embeddings)
+            weights += (weight * learned.weights).tolist()
+        else:
+            embeddings.append(model.concept(name))
+            weights.append(weight)
     if not embeddings:
         raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
     states = model.sample(
@@ -116,12 +126,12 @@ def sample(
     )
     result.save(out)
     print(f"{out}: {count} samples")
-    right = domain.succeeded(goal, states) if goal else torch.ones(count, dtype=torch.bool)
-    if goal:
+    right = domain.succeeded(goal, states) if goal else None
+    if right is not None:
         print(f"accuracy on '{goal}': {right.float().mean():.2f}")
     if figure:
         with atomic(figure) as temporary:
-            domain.render(states, right.tolist(), goal or "samples").savefig(temporary, dpi=110)
+            domain.render(states, None if right is None else right.tolist(), goal or "samples").savefig(temporary, dpi=110)
         print(figure)
 
 

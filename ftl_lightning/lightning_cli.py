@@ -29,6 +29,18 @@ class CommandLine(LightningCLI):
         parser.add_lightning_class_args(Evaluator, "evaluation")
         parser.set_defaults({"seed_everything": 0})
 
+    def before_validate(self) -> None:
+        """A checkpoint is needed; Lightning would evaluate random weights."""
+        self._need_checkpoint()
+
+    def before_test(self) -> None:
+        """The same."""
+        self._need_checkpoint()
+
+    def _need_checkpoint(self) -> None:
+        if not self.config[self.config.subcommand].get("ckpt_path"):
+            raise UserError(f"ckpt_path: {self.config.subcommand} expected a checkpoint file, found none; give --ckpt_path FILE")
+
     def _parse_ckpt_path(self) -> None:
         # Lightning would let the checkpoint's hyper-parameters, class included, override configuration and command line.
         # Here the configuration rules, and a checkpoint of another class is refused.
@@ -72,10 +84,14 @@ def _command_line(arguments: list[str], run: bool) -> CommandLine:
             subclass_mode_model=True,
             subclass_mode_data=True,
             save_config_kwargs={"overwrite": True},
-            parser_kwargs={"parser_mode": "omegaconf+"},
+            parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
             args=arguments,
         )
+    except OSError as error:
+        raise UserError(
+            f"{error.filename or 'output'}: {error.strerror or error}; choose a place that exists, is writable and has room"
+        ) from error
     except Exception as error:
         if mistake := mistake_behind(error):
             raise mistake from None

@@ -82,6 +82,8 @@ def test_configuration_keys_can_be_read_back(capsys: pytest.CaptureFixture[str])
         (["sample", "--pretrained=nowhere"], "nowhere/config.json: expected a pretrained model"),
         (["generate", "chess"], "domain: expected one of"),
         (["generate", "object_rearrangement", "--task=circle on square"], "expected 'A <relation> B'"),
+        (["generate", "object_rearrangement", "--task=circle above squaretriangle above square"], "found 'triangle above square'"),
+        (["generate", "object_rearrangement", "--seed=-1"], "0 or more"),
         (["generate", "object_rearrangement", "--count=0"], "count: expected 1 or more"),
         (["generate", "object_rearrangement", "--count=5", "--out=/proc/d.safetensors"], "cannot be written"),
         (["report", "--results=nothing"], "expected"),
@@ -102,10 +104,16 @@ def test_mistakes_are_one_clear_line(arguments: list[str], expected: str, capsys
         (["--compose=circle right of square", "--steps=1000"], "steps: expected 1 to 100"),
         (["--compose=circle right of square", "--count=0"], "count: expected 1 or more"),
         (["--concept=no.safetensors"], "no.safetensors: expected a concept file, found nothing"),
+        (["--compose=circle right of square + no.safetensors:1"], "no.safetensors: expected a concept file, found nothing"),
+        (["--compose=circle right of square:"], "expected 'concept:weight"),
+        (["--compose=circle right of square", "--temperature=-1"], "temperature: expected 0 or more"),
+        (["--compose=circle right of square", "--goal=chaos"], "goal: expected a task"),
+        (["--compose=circle right of square", "--figure=a.foo"], "figure: expected a name"),
     ],
 )
 def test_mistakes_in_sampling(tiny: Path, options: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert expected in error(capsys, "sample", f"--pretrained={tiny}", *options)
+    assert not list(Path().iterdir())  # nothing half-written
 
 
 def test_a_concept_of_another_model_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str], invert: Callable[..., Path]) -> None:
@@ -135,6 +143,12 @@ def test_demonstrations_that_do_not_fit(tiny: Path, capsys: pytest.CaptureFixtur
     np.savez("nan.npz", states=np.full((1, 1, 21), np.nan))
     np.savez("none.npz", states=np.zeros((0, 1, 21)))
     np.savez("keys.npz", state=np.zeros((1, 1, 21)))
+    Path("empty.npz").touch()
+    np.save("array.npy", np.zeros((1, 1, 21)))
+    Path("array.npy").rename("array.npz")
+    Path("empty.npz").touch()
+    np.save("array.npy", np.zeros((1, 1, 21)))
+    Path("array.npy").rename("array.npz")
     for file, expected in {
         "missing.safetensors": "found nothing",
         "other.safetensors": "key 'domain': expected 'object_rearrangement', found 'driving'",
@@ -143,6 +157,8 @@ def test_demonstrations_that_do_not_fit(tiny: Path, capsys: pytest.CaptureFixtur
         "nan.npz": "expected finite numbers, found nan",
         "none.npz": "expected at least one demonstration, found none",
         "keys.npz": "key 'states': expected (demo, time, state)",
+        "empty.npz": "damaged",
+        "array.npz": "damaged",
     }.items():
         told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", f"--data.demonstrations={file}")
         assert file in told
@@ -173,3 +189,44 @@ def test_the_model_card_and_config_of_the_shipped_model(shipped: Path) -> None:
     assert (shipped / "model.safetensors").stat().st_size <= 8e6
     assert config["hash"] in (shipped / "README.md").read_text()
     assert main(["sample", f"--pretrained={shipped}", "--compose=circle right of square:1.2", "--count=5", "--steps=10"]) == 0
+
+
+def test_a_mistaken_key_is_told_in_one_line_with_its_file(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("bad.yaml").write_text("model: {init_args: {depht: 3}}\n")
+    told = error(capsys, "fit", "--config", PRETRAINING, "--config", "bad.yaml")
+    assert told.startswith("error: bad.yaml: ")
+    assert "'depht' is not accepted" in told
+    assert told.count("\n") == 1
+    told = error(capsys, "fit", "--config", PRETRAINING, "--model.depht=3")
+    assert "'depht' is not accepted" in told
+    assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize("verb", ["test", "validate"])
+def test_evaluation_needs_a_checkpoint(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"ckpt_path: {verb} expected a checkpoint" in error(capsys, verb, "--config", PRETRAINING, *TINY)
+
+
+def test_a_checkpoint_of_another_form_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = f"--ckpt_path={tiny.parent / 'checkpoints' / 'last.ckpt'}"
+    wider = "--model.denoiser_args={hidden_dim: 96, depth: 2, condition_dim: 32}"
+    told = error(capsys, "test", "--config", PRETRAINING, *TINY, wider, checkpoint)
+    assert "key 'denoiser_args': expected {'hidden_dim': 96" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--evaluation.suites=[trainig]"], "evaluation.suites: expected some of training"),
+        (["--evaluation.steps=1000"], "evaluation.steps: expected 1 to 100"),
+        (["--model.restarts=0"], "model.restarts: expected 1 or more"),
+        (["--data.steps=0"], "data.steps, data.demonstrations_per_concept: expected 1 or more"),
+        (["--trainer.logger.init_args.save_dir=/proc/logs"], "choose a place"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_learned(
+    tiny: Path, options: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", *options)
+    assert expected in told
+    assert not list(Path().rglob("concepts"))

@@ -60,16 +60,16 @@ def composed_epsilon(
 
 
 def parse_composition(text: str) -> list[tuple[str, float]]:
-    """Training concepts and weights from ``'circle right of square:1.2 + triangle above circle'``; a missing weight is 1.
+    """Concepts and weights from ``'circle right of square:1.2 + triangle above circle'``; a missing weight is 1.
 
     Raises:
         UserError: for a weight that is no finite number, or an empty concept.
     """
     parts = []
     for part in text.split(" + ") if text.strip() else ():
-        concept, _, weight = part.partition(":")
+        concept, colon, weight = part.partition(":")
         try:
-            omega = float(weight) if weight else 1.0
+            omega = float(weight) if colon else 1.0
         except ValueError:
             omega = math.nan
         if not concept.strip() or not math.isfinite(omega):

@@ -91,7 +91,10 @@ class TransformerEncoder:
         from transformers import AutoTokenizer  # seconds of import that the table does not need
 
         model = self._load()
-        tokenizer = AutoTokenizer.from_pretrained(self.name, revision=self.revision)
+        try:
+            tokenizer = AutoTokenizer.from_pretrained(self.name, revision=self.revision)
+        except (OSError, ValueError) as error:
+            raise UserError(f"encoder: {self.name}: expected a tokenizer, found none ({str(error).splitlines()[0]})") from error
         tokens = tokenizer(list(texts), padding=True, return_tensors="pt")
         hidden = model(input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]).last_hidden_state
         mask = tokens["attention_mask"][..., None].to(hidden.dtype)

@@ -1,6 +1,7 @@
 """The container of demonstrations and its file."""
 
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -156,12 +157,16 @@ def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({error})") from error
     numeric = {name: array for name, array in arrays.items() if array.dtype.kind in "fiu"}
     tensors = {
         name: torch.from_numpy(np.ascontiguousarray(array, dtype=np.int64 if name == "lengths" else np.float32))
         for name, array in numeric.items()
     }
-    header = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
+    texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
+    # One text stands for all demonstrations.
+    if isinstance(texts.get("concepts"), str) and "states" in tensors:
+        texts["concepts"] = [texts["concepts"]] * len(tensors["states"])
+    header: dict[str, Any] = texts
     return tensors, header

@@ -66,6 +66,9 @@ class PretrainingData(pl.LightningDataModule):
 
     def __init__(self, domain: Domain, seed: int, batch_size: int, steps_per_epoch: int, encoder: str, revision: str) -> None:
         super().__init__()
+        for name, value in (("batch_size", batch_size), ("steps_per_epoch", steps_per_epoch)):
+            if value < 1:
+                raise UserError(f"data.{name}: expected 1 or more, found {value}")
         self.domain = domain
         self.seed = seed
         self.batch_size = batch_size
@@ -130,6 +133,9 @@ class InversionData(pl.LightningDataModule):
         super().__init__()
         self.save_hyperparameters()
         self.domain = load_domain(domain)
+        if steps < 1 or demonstrations_per_concept < 1:
+            found = f"{steps} and {demonstrations_per_concept}"
+            raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {found}")
         if suite not in self.domain.suites:
             raise UserError(f"data.suite: expected one of {', '.join(self.domain.suites)}, found {suite!r}")
         self.seed = seed

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.errors import UserError
+
 
 def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) -> Tensor:
     """``(batch, dimension)`` features of the timestep ``t (batch,)`` (Vaswani et al., 2017); ``dimension`` is even."""
@@ -46,6 +48,8 @@ class MLPDenoiser(nn.Module):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
+        if time_dim < 4 or time_dim % 2:
+            raise UserError(f"denoiser_args.time_dim: expected an even number from 4 up, found {time_dim}")
         self.time_dim = time_dim
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(concept_dim, condition_dim), nn.SiLU())

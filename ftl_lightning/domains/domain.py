@@ -86,12 +86,12 @@ class Domain:
         training_concepts: descriptions of the behaviours of pretraining.
         suites: by name: ``'training'`` (training concepts), ``'paper'`` (final evaluation only), ``'validation'`` (for tuning)
             and any other, such as ``'components'`` (what each learned component generates alone).
-        descriptions: every text that the shipped table of embeddings holds, the empty one included.
+        descriptions: every text that the shipped table of embeddings holds besides the empty one.
         training_set: ``(samples per concept, seed) -> demonstrations`` of every training concept.
         generate: ``(task, count, seed) -> demonstrations`` of any task of the domain's grammar.
         reads: whether a text is a goal that :attr:`succeeded` can judge.
         succeeded: ``(goal, states (sample, horizon, state)) -> (sample,)`` of bool, the paper's metric.
-        render: ``(states (sample, horizon, state), right (sample,) of bool, title) -> figure``.
+        render: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title) -> figure``.
         references: trivial policies to print beside every rate: name to ``(goal, count, seed) -> states``.
         published: the paper's numbers for this domain.
         omega: the fixed guidance weight of the paper's main figures, as text.
@@ -108,7 +108,7 @@ class Domain:
     generate: Callable[[str, int, int], Demonstrations]
     reads: Callable[[str], bool]
     succeeded: Callable[[str, Tensor], Tensor]
-    render: Callable[[Tensor, Sequence[bool], str], Figure]
+    render: Callable[[Tensor, Sequence[bool] | None, str], Figure]
     references: Mapping[str, Callable[[str, int, int], Tensor]] = field(default_factory=dict)
     published: tuple[Published, ...] = ()
     omega: str = "1.2"

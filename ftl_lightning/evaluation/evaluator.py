@@ -192,6 +192,9 @@ class Evaluator(pl.Callback):
         if stage == "test" and self.judged:
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
             append_rows(path, self._rows(module, trainer.datamodule))  # type: ignore[attr-defined]
+            for name, value in metrics.items():
+                print(f"{name.removeprefix('test/')}: {value:.2f}")
+            print(f"rows written to {path}")
 
     def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
         for one in self.judged if self.figures else ():

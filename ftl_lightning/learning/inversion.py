@@ -118,6 +118,8 @@ class InversionModule(pl.LightningModule):
                 f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain.name!r}"
             )
         self.concepts = data.concepts
+        if len({file_name(name) for name in self.concepts}) < len(self.concepts):
+            raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
         self.demonstrations: Demonstrations = data.demonstrations
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
@@ -260,7 +262,10 @@ class InversionModule(pl.LightningModule):
         """Write every concept to a file of its own."""
         self._found = self.learned()
         for name, concept in self._found.items():
-            concept.save(self.folder / f"{file_name(name)}.safetensors")
+            path = self.folder / f"{file_name(name)}.safetensors"
+            concept.save(path)
+            weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
+            print(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
 
     def on_validation_start(self) -> None:
         self._found = self.learned()

@@ -150,12 +150,16 @@ class PretrainingModule(pl.LightningModule):
         with torch.no_grad():
             torch._foreach_lerp_(list(self.model.denoiser.parameters()), list(self.denoiser.parameters()), 1 - decay)
 
-    def validation_step(self, batch: Batch) -> None:
+    def _evaluation_step(self, batch: Batch, name: str) -> None:
         # The same noise every time, so that the curve shows the model and not the draw.
         draw = generator(self.device, self.seed)
-        self.log("val/loss", self._loss(self.model.denoiser, batch, draw, 0.0).mean(), prog_bar=True, batch_size=len(batch.states))
+        self.log(name, self._loss(self.model.denoiser, batch, draw, 0.0).mean(), prog_bar=True, batch_size=len(batch.states))
 
-    test_step = validation_step
+    def validation_step(self, batch: Batch) -> None:
+        self._evaluation_step(batch, "val/loss")
+
+    def test_step(self, batch: Batch) -> None:
+        self._evaluation_step(batch, "test/loss")
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with warm-up and cosine decay."""
@@ -191,8 +195,13 @@ class PretrainingModule(pl.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Sign the checkpoint."""
-        sign(self, checkpoint)
+        sign(self, checkpoint, self._signature())
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse another module's checkpoint."""
-        check_signature(self, checkpoint)
+        """Refuse the checkpoint of another module or of a model of another form."""
+        check_signature(self, checkpoint, self._signature())
+
+    def _signature(self) -> dict[str, Any]:
+        """What decides the form of a checkpoint's parameters, and what they mean."""
+        keys = ("domain", "horizon", "state_dim", "initial_state_dim", "encoder", "denoiser", "denoiser_args", "diffusion_steps")
+        return {key: getattr(self.model.config, key) for key in keys}

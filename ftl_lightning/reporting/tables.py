@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain, Published
-from ftl_lightning.evaluation.evaluator import standard_error
+from ftl_lightning.evaluation.evaluator import OWN, standard_error
 from ftl_lightning.evaluation.results import latest
 
 MISSING = "-"
@@ -141,9 +141,9 @@ def _accuracy(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def _settings(domain: Domain) -> list[str]:
-    """Settings of the paper's suites, without the analysis of components."""
+    """Settings of the paper's suites, without the analysis of components, and the user's own demonstrations."""
     names = [setting for suite in ("training", "paper") for setting in domain.suites[suite].settings]
-    return list(dict.fromkeys(names))
+    return [*dict.fromkeys(names), OWN]
 
 
 def _grid(

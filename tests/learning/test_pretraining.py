@@ -88,7 +88,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(capsys: p
 
 
 def test_condition_dropout_is_drawn_per_sample() -> None:
-    from ftl_lightning.domains.object_rearrangement import ObjectRearrangementData
+    from ftl_lightning.domains.object_rearrangement.datamodule import ObjectRearrangementData
     from ftl_lightning.learning import PretrainingModule
     from ftl_lightning.trainer import Trainer
 

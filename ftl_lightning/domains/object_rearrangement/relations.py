@@ -21,6 +21,8 @@ PER_SHAPE = 4 + len(SHAPES)
 """Columns of one shape: x, y, size, angle, one-hot type."""
 
 ORDERED_PAIRS = tuple(itertools.permutations(SHAPES, 2))
+AND = " and "
+"""Joins the relations of a task."""
 PAIRWISE = ("right of", "above", "diagonal to", "antidiagonal to", "next to")
 RADIUS_TOLERANCE = 0.3
 """A ring's circumradius may differ from its nominal value by this much in evaluation."""
@@ -52,8 +54,10 @@ class Relation:
 
 TRAINING_RELATIONS = tuple(Relation(kind, pair) for kind in ("right of", "above") for pair in ORDERED_PAIRS)
 
-_PAIR = re.compile(rf"({'|'.join(SHAPES)}) ({'|'.join(PAIRWISE)}) ({'|'.join(SHAPES)})")
-_RING = re.compile(r"circle,? triangle and square in a circle of radius (\d+(?:\.\d+)?)")
+_SHAPE, _KIND = "|".join(SHAPES), "|".join(PAIRWISE)
+_PAIR = rf"(?P<a>{_SHAPE}) (?P<kind>{_KIND}) (?!(?P=a))(?P<b>{_SHAPE})"
+_RING = r"circle,? triangle and square in a circle of radius (?P<radius>\d+(?:\.\d+)?)"
+_RELATION = re.compile(f"{_PAIR}|{_RING}")
 
 
 def parse(task: str) -> tuple[Relation, ...]:
@@ -68,22 +72,22 @@ def parse(task: str) -> tuple[Relation, ...]:
     Raises:
         UserError: where a part is not a relation.
     """
-    relations, rest = [], task
-    while True:
-        if pair := _PAIR.match(rest):
-            relations.append(Relation(pair[2], (pair[1], pair[3])))
-        elif ring := _RING.match(rest):
-            relations.append(Relation("ring", SHAPES, float(ring[1])))
-        if not (match := pair or ring) or (pair and pair[1] == pair[3]):
+    relations = []
+    end = -len(AND)
+    while end < len(task):
+        found = _RELATION.match(task, end + len(AND)) if end < 0 or task.startswith(AND, end) else None
+        if found is None:
             raise UserError(
-                f"object_rearrangement task {task!r}: found {rest!r}, expected 'A <relation> B' with A, B different among "
-                f"{', '.join(SHAPES)} and <relation> among {', '.join(PAIRWISE)}, or "
-                f"'{Relation('ring', SHAPES, 1.67)}', joined by ' and '"
+                f"object_rearrangement task {task!r}: found {task[max(end, 0) :]!r}, expected 'A <relation> B' with A, B different "
+                f"among {', '.join(SHAPES)} and <relation> among {', '.join(PAIRWISE)}, or "
+                f"'{Relation('ring', SHAPES, 1.67)}', joined by '{AND}'"
             )
-        rest = rest[match.end() :]
-        if not rest:
-            return tuple(relations)
-        rest = rest.removeprefix(" and ")
+        if found["radius"]:
+            relations.append(Relation("ring", SHAPES, float(found["radius"])))
+        else:
+            relations.append(Relation(found["kind"], (found["a"], found["b"])))
+        end = found.end()
+    return tuple(relations)
 
 
 def columns(states: Tensor) -> tuple[Tensor, Tensor, Tensor]:

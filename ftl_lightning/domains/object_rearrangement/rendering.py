@@ -14,20 +14,21 @@ CORNERS = {"triangle": 3, "square": 4}
 MAX_COLUMNS = 8
 
 
-def render(states: Tensor, right: Sequence[bool], title: str) -> Figure:
+def render(states: Tensor, right: Sequence[bool] | None, title: str) -> Figure:
     """A grid of scenes.
 
     Args:
         states: ``(scene, 1, 21)`` in the domain's units.
-        right: whether the task holds, one entry a scene.
+        right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
         title: above the grid.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(1.5 * columns, 1.5 * rows + 0.4), layout="constrained")
     figure.suptitle(title, fontsize=9)
-    for axes, state, good in zip(figure.subplots(rows, columns, squeeze=False).flat, states[:, 0], right, strict=False):
-        _scene(axes, state, "#2e9e46" if good else "#d03a3a")
+    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
+    for axes, state, frame in zip(figure.subplots(rows, columns, squeeze=False).flat, states[:, 0], frames, strict=False):
+        _scene(axes, state, frame)
     for axes in figure.axes[len(states) :]:
         axes.set_axis_off()
     return figure
