@@ -37,6 +37,16 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+def test_several_threads_give_the_same_bytes_too() -> None:
+    torch.set_num_threads(2)
+    wide = ["--data.batch_size=512", "--model.denoiser_args={hidden_dim: 256, depth: 2, condition_dim: 32}"]
+    hashes = []
+    for index in range(3):
+        assert fit("--trainer.max_steps=12", *wide, f"--model.output=out{index}") == 0
+        hashes.append(GenerativeModel.load(f"out{index}").hash)
+    assert len(set(hashes)) == 1
+
+
 def test_training_lowers_the_loss(tiny: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
