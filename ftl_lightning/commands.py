@@ -57,8 +57,12 @@ def sample(
     steps: int = 100,
     temperature: float = 0.1,
     goal: str = "",
+    initial: str = "",
     out: str = "states.safetensors",
     figure: str = "",
+    execute: bool = False,
+    replan: int = 8,
+    animation: str = "",
 ) -> None:
     """Generate behaviour from a learned concept, composed with training concepts.
 
@@ -72,9 +76,15 @@ def sample(
         sampler: see ftl_lightning.diffusion.samplers.
         steps: of the sampler.
         temperature: the paper's alpha; lower is less diverse and more accurate.
-        goal: judge the samples by this task and print their accuracy.
+        goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
+            drawn from the seed.
+        initial: demonstrations file whose initial states are used instead; one sample of each.
         out: demonstrations file to write.
         figure: picture to write, .png or .svg.
+        execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
+            episodes ended.
+        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
+        animation: .gif to write of the first executed episode.
     """
     import torch
 
@@ -84,6 +94,8 @@ def sample(
     from ftl_lightning.diffusion.samplers import SAMPLERS
     from ftl_lightning.domains.domain import load_domain
     from ftl_lightning.errors import UserError
+    from ftl_lightning.evaluation.closed_loop import roll_out, sampled_plans
+    from ftl_lightning.evaluation.tensorboard import gif
     from ftl_lightning.learning.generative_model import GenerativeModel
     from ftl_lightning.seeding import generator
     from ftl_lightning.tensor_file import atomic
@@ -98,8 +110,28 @@ def sample(
         raise UserError(f"seed, temperature: expected 0 or more, found {min(seed, temperature)}")
     if goal and not domain.reads(goal):
         raise UserError(f"goal: expected a task of {domain.name}, found {goal!r}")
+    if replan < 1:
+        raise UserError(f"replan: expected 1 or more, found {replan}")
+    if animation and not (execute and animation.endswith(".gif")):
+        raise UserError(f"animation: expected a name that ends in .gif, and --execute true, found {animation!r}")
+    if execute and domain.closed_loop is None:
+        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     if figure and Path(figure).suffix not in (".png", ".svg", ".pdf"):
         raise UserError(f"figure: expected a name that ends in .png, .svg or .pdf, found {figure!r}")
+    if initial:
+        given = Demonstrations.load(initial)
+        rows = torch.arange(len(given))
+        _, starts = given.windows(rows, torch.zeros_like(rows), 1)
+        count = len(given)
+    elif domain.initial_states is None:
+        starts = None
+    elif goal:
+        starts = domain.initial_states(goal, count, seed)
+    else:
+        raise UserError(
+            f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
+        )
+    model.encode_initial(starts)
     embeddings, weights = [], []
     for name, weight in [*parse_composition(compose), *([(concept, 1.0)] if concept else [])]:
         if name == concept or name.endswith(".safetensors"):
@@ -113,7 +145,14 @@ def sample(
     if not embeddings:
         raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
     states = model.sample(
-        [torch.stack(embeddings)], [torch.tensor(weights)], count, SAMPLERS[sampler], steps, temperature, [generator("cpu", seed)]
+        [torch.stack(embeddings)],
+        [torch.tensor(weights)],
+        count,
+        SAMPLERS[sampler],
+        steps,
+        temperature,
+        [generator("cpu", seed)],
+        starts,
     )[0]
     result = Demonstrations(
         states=states,
@@ -122,17 +161,36 @@ def sample(
         state_names=domain.state_names,
         state_units=domain.state_units,
         concepts=(goal,) * count,
+        initial_states=starts,
         provenance={"pretrained": model.hash, "concept": concept, "compose": compose, "seed": seed, "temperature": temperature},
     )
     result.save(out)
     print(f"{out}: {count} samples")
-    right = domain.succeeded(goal, states) if goal else None
+    right = domain.succeeded(goal, states, starts) if goal else None
     if right is not None:
         print(f"accuracy on '{goal}': {right.float().mean():.2f}")
     if figure:
         with atomic(figure) as temporary:
-            domain.render(states, None if right is None else right.tolist(), goal or "samples").savefig(temporary, dpi=110)
+            domain.render(states, None if right is None else right.tolist(), goal or "samples", starts).savefig(temporary, dpi=110)
         print(figure)
+    if execute and domain.closed_loop is not None and starts is not None:
+        plan = sampled_plans(
+            model,
+            [torch.stack(embeddings)] * count,
+            [torch.tensor(weights)] * count,
+            SAMPLERS[sampler],
+            steps,
+            temperature,
+            [generator("cpu", seed, 1, episode) for episode in range(count)],
+        )
+        rollout = roll_out(domain.closed_loop, starts, plan, replan)
+        if goal:
+            for name, values in domain.closed_loop.judge(goal, rollout.observations).items():
+                print(f"closed loop, {name}: {values.float().mean():.2f} of {count} episodes")
+        if animation:
+            with atomic(animation) as temporary:
+                temporary.write_bytes(gif(domain.closed_loop.frames(rollout.observations[0])))
+            print(animation)
 
 
 def ablate(stages: list[Stage], results: str, seeds: list[int] = [0]) -> None:  # noqa: B006 (never changed)

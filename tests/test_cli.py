@@ -152,7 +152,7 @@ def test_demonstrations_that_do_not_fit(tiny: Path, capsys: pytest.CaptureFixtur
     for file, expected in {
         "missing.safetensors": "found nothing",
         "other.safetensors": "key 'domain': expected 'object_rearrangement', found 'driving'",
-        "size.safetensors": "key 'states': expected shape (demo, 1, 21), found (2, 1, 20)",
+        "size.safetensors": "key 'states': expected shape (demo, time, 21), found (2, 1, 20)",
         "cut.safetensors": "damaged or foreign",
         "nan.npz": "expected finite numbers, found nan",
         "none.npz": "expected at least one demonstration, found none",

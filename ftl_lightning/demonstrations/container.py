@@ -27,7 +27,8 @@ class Demonstrations:
         domain: name of the domain, or ``''`` where the file did not say.
         state_names, state_units: one entry a column of ``states``.
         concepts: one text a demonstration; ``''`` where it is not known.
-        initial_states: ``(demo, initial state)`` float32, or ``None`` where the domain has none.
+        initial_states: ``(demo, time, initial state)`` float32, what a plan that starts at that time is conditioned on;
+            ``(demo, initial state)`` if it is known for the first time alone; or ``None`` where the domain has none.
         provenance: how they came about (generator, seed, ...), anything JSON can hold.
 
     Raises:
@@ -64,9 +65,11 @@ class Demonstrations:
             if tensor is not None and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
                 raise UserError(f"key {key!r}: expected finite numbers, found {tensor[tuple(where)].item()} at index {where}")
-        if self.initial_states is not None and (self.initial_states.dim() != 2 or len(self.initial_states) != count):
+        initial = self.initial_states
+        if initial is not None and (initial.dim() not in (2, 3) or initial.shape[:-1] != (count, time)[: initial.dim() - 1]):
             raise UserError(
-                f"key 'initial_states': expected shape ({count}, initial state), found {tuple(self.initial_states.shape)}"
+                f"key 'initial_states': expected shape ({count}, initial state) or ({count}, {time}, initial state), "
+                f"found {tuple(initial.shape)}"
             )
 
     def __len__(self) -> int:
@@ -82,6 +85,30 @@ class Demonstrations:
             concepts=(concept,) * len(chosen),
             initial_states=None if self.initial_states is None else self.initial_states[chosen],
         )
+
+    @property
+    def starts(self) -> Tensor:
+        """How many times of each demonstration a window can start at ``(demo,)``: those whose initial state is known."""
+        known = self.initial_states is None or self.initial_states.dim() == 3
+        return self.lengths if known else torch.ones_like(self.lengths)
+
+    def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, Tensor | None]:
+        """Stretches of demonstrations, padded with the last state.
+
+        Args:
+            rows: ``(window,)`` int64, which demonstration.
+            starts: ``(window,)`` int64, the first time of each.
+            horizon: their length.
+
+        Returns:
+            States ``(window, horizon, state)`` and what a plan that starts there is conditioned on, ``(window, initial state)``
+            or ``None``.
+        """
+        times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
+        initial = self.initial_states
+        if initial is not None:
+            initial = initial[rows, starts] if initial.dim() == 3 else initial[rows]
+        return self.states[rows[:, None], times], initial
 
     def named(self, concept: str) -> Self:
         """The same, with a name for the concept of those that have none."""

@@ -62,11 +62,22 @@ class PretrainingData(pl.LightningDataModule):
         batch_size: demonstrations a step.
         steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
         encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`.
+        horizon: states in a plan; ``None`` for the domain's.
     """
 
-    def __init__(self, domain: Domain, seed: int, batch_size: int, steps_per_epoch: int, encoder: str, revision: str) -> None:
+    def __init__(
+        self,
+        domain: Domain,
+        seed: int,
+        batch_size: int,
+        steps_per_epoch: int,
+        encoder: str,
+        revision: str,
+        horizon: int | None = None,
+    ) -> None:
         super().__init__()
-        for name, value in (("batch_size", batch_size), ("steps_per_epoch", steps_per_epoch)):
+        self.horizon = domain.horizon if horizon is None else horizon
+        for name, value in (("batch_size", batch_size), ("steps_per_epoch", steps_per_epoch), ("horizon", self.horizon)):
             if value < 1:
                 raise UserError(f"data.{name}: expected 1 or more, found {value}")
         self.domain = domain
@@ -88,14 +99,16 @@ class PretrainingData(pl.LightningDataModule):
         self.validation = self.validation_set()
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step, drawn with replacement."""
-        rows = torch.randint(len(self.training), (self.batch_size,), generator=generator("cpu", self.seed, step))
-        return self._rows(self.training, rows)
+        """The batch of a step: demonstrations drawn with replacement, and of each a window that starts anywhere in it."""
+        draw = generator("cpu", self.seed, step)
+        rows = torch.randint(len(self.training), (self.batch_size,), generator=draw)
+        return self._windows(self.training, rows, draw)
 
-    def _rows(self, demonstrations: Demonstrations, rows: Tensor) -> Batch:
+    def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
         concepts = torch.tensor([self.domain.training_concepts.index(demonstrations.concepts[row]) for row in rows.tolist()])
-        initial = demonstrations.initial_states
-        return Batch(demonstrations.states[rows], concepts, None if initial is None else initial[rows])
+        starts = (torch.rand(len(rows), generator=draw) * demonstrations.starts[rows]).long()
+        states, initial = demonstrations.windows(rows, starts, self.horizon)
+        return Batch(states, concepts, initial)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         steps = Steps(self, self.steps_per_epoch)
@@ -103,7 +116,8 @@ class PretrainingData(pl.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[Batch]:
         whole = torch.arange(len(self.validation))
-        return DataLoader([self._rows(self.validation, whole)], batch_size=None)  # type: ignore[arg-type]
+        batch = self._windows(self.validation, whole, generator("cpu", self.seed))
+        return DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
 
     test_dataloader = val_dataloader
 
@@ -153,13 +167,11 @@ class InversionData(pl.LightningDataModule):
 
     def _read(self, path: Path) -> Demonstrations:
         found = Demonstrations.load(path)
-        expected = (self.domain.horizon, len(self.domain.state_names))
+        columns = len(self.domain.state_names)
         if found.domain not in ("", self.domain.name):
             raise UserError(f"{path}: key 'domain': expected {self.domain.name!r}, found {found.domain!r}")
-        if found.states.shape[1:] != expected:
-            raise UserError(
-                f"{path}: key 'states': expected shape (demo, {expected[0]}, {expected[1]}), found {tuple(found.states.shape)}"
-            )
+        if found.states.shape[2] != columns:
+            raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(found.states.shape)}")
         return found.named(path.stem)
 
     def train_dataloader(self) -> DataLoader[int]:

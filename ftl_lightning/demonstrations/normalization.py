@@ -1,9 +1,13 @@
 """Normalisation of states to [-1, 1], kept with the model."""
 
+from collections.abc import Sequence
 from typing import Self
 
 import torch
 from torch import Tensor, nn
+
+RESOLUTION = 1e-3
+"""In the domain's units: what varies less is the simulator's rounding, which scaling to [-1, 1] would blow up."""
 
 
 class Normalization(nn.Module):
@@ -22,10 +26,21 @@ class Normalization(nn.Module):
         self.register_buffer("high", high.float().clone())
 
     @classmethod
-    def fit(cls, states: Tensor) -> Self:
-        """From states ``(..., state)``."""
+    def fit(cls, states: Tensor, alike: Sequence[Sequence[int]] = ()) -> Self:
+        """From states ``(..., state)``.
+
+        Args:
+            states: in the domain's units. A column that varies by less than :data:`RESOLUTION` counts as constant.
+            alike: columns of each exchangeable entity, in the same order: what is a position for one is a position for all, so
+                they share their extremes.
+        """
         flat = states.flatten(0, -2)
-        return cls(flat.amin(dim=0), flat.amax(dim=0))
+        low, high = flat.amin(dim=0), flat.amax(dim=0)
+        if alike:
+            columns = torch.tensor([list(entity) for entity in alike])
+            low[columns] = low[columns].amin(dim=0).expand(columns.shape)
+            high[columns] = high[columns].amax(dim=0).expand(columns.shape)
+        return cls(low, torch.where(high - low < RESOLUTION, low, high))
 
     @property
     def _half_width(self) -> Tensor:

@@ -1,11 +1,13 @@
 """The MLP denoiser of the paper's object rearrangement domain."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.diffusion.initial_state import initial_state_encoder
 from ftl_lightning.errors import UserError
 
 
@@ -28,11 +30,14 @@ class MLPDenoiser(nn.Module):
         state_dim: columns of a state.
         concept_dim: columns of a concept embedding.
         initial_state_dim: columns of the initial state; 0 where the domain has none.
+        entities: columns of the initial state for each exchangeable entity.
         hidden_dim: width.
         depth: hidden layers.
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
         time_dim: features of the timestep; even.
         dropout: of the hidden layers, in training.
+        initial_encoder: ``'flat'`` (the paper's) or ``'entities'``.
+        initial_dim: features of the initial state.
     """
 
     def __init__(
@@ -41,11 +46,14 @@ class MLPDenoiser(nn.Module):
         state_dim: int,
         concept_dim: int,
         initial_state_dim: int = 0,
+        entities: Sequence[Sequence[int]] = (),
         hidden_dim: int = 512,
         depth: int = 4,
         condition_dim: int = 384,
         time_dim: int = 64,
         dropout: float = 0.0,
+        initial_encoder: str = "flat",
+        initial_dim: int = 64,
     ) -> None:
         super().__init__()
         if time_dim < 4 or time_dim % 2:
@@ -53,7 +61,12 @@ class MLPDenoiser(nn.Module):
         self.time_dim = time_dim
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(concept_dim, condition_dim), nn.SiLU())
-        inputs = [horizon * state_dim + initial_state_dim] + [hidden_dim] * (depth - 1)
+        self.initial = (
+            initial_state_encoder(initial_encoder, initial_state_dim, entities, concept_dim, initial_dim)
+            if initial_state_dim
+            else None
+        )
+        inputs = [horizon * state_dim + (initial_dim if initial_state_dim else 0)] + [hidden_dim] * (depth - 1)
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
         self.time_film = nn.Linear(time_dim, 2 * hidden_dim * depth)
         self.concept_film = nn.Linear(condition_dim, 2 * hidden_dim * depth, bias=False)
@@ -74,7 +87,10 @@ class MLPDenoiser(nn.Module):
         """
         by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(2 * len(self.layers), dim=-1)
         by_concept = self.concept_film(self.concept(concepts)).chunk(2 * len(self.layers), dim=-1)
-        hidden = x.flatten(1) if initial_state is None else torch.cat((x.flatten(1), initial_state), dim=-1)
+        hidden = x.flatten(1)
+        if self.initial is not None:
+            assert initial_state is not None
+            hidden = torch.cat((hidden, self.initial(initial_state, concepts[index])), dim=-1)
         for depth, layer in enumerate(self.layers):
             # Summed layer by layer: all layers at once would not fit into the processor's cache.
             scale, shift = (by_time[i] + by_concept[i][index] for i in (2 * depth, 2 * depth + 1))

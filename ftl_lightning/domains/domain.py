@@ -5,8 +5,12 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
+import gymnasium
+import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -23,6 +27,8 @@ class EvaluationTask:
         learned: name of the learned concept that is used, or ``None``.
         texts: training concepts that are composed in.
         component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
+        initial: where behaviour starts, in domains with initial states: in new ones, or in those of the demonstrations that the
+            concept was learned from.
     """
 
     setting: str
@@ -30,6 +36,7 @@ class EvaluationTask:
     learned: str | None = None
     texts: tuple[str, ...] = ()
     component: int | None = None
+    initial: Literal["new", "demonstrated"] = "new"
 
     @property
     def name(self) -> str:
@@ -65,6 +72,7 @@ class Published:
         components: K.
         omega: the fixed weight as text, or ``'learned'``.
         task: name of the evaluation task; ``''`` for the mean of the setting.
+        metric: as in a row of the results.
     """
 
     setting: str
@@ -73,6 +81,29 @@ class Published:
     components: int = 2
     omega: str = "learned"
     task: str = ""
+    metric: str = "accuracy"
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """How a domain executes plans.
+
+    Attributes:
+        environment: makes an environment whose observation is an initial state ``(m,)`` and whose ``reset`` takes one as
+            ``options={'initial_state': ...}``.
+        act: the planner, ``(plans (episode, horizon, state), steps since they were made, observations (episode, m)) ->
+            actions (episode, action)``.
+        steps: at most, of an episode.
+        judge: ``(goal, observations (episode, time, m)) -> what happened``, by name ``(episode,)`` of bool; ``'success'`` is the
+            paper's metric. Observations are padded with the last one.
+        frames: ``observations (time, m) -> pictures (height, width, 3)`` of an episode.
+    """
+
+    environment: Callable[[], gymnasium.Env[Any, Any]]
+    act: Callable[[Tensor, int, Tensor], Tensor]
+    steps: int
+    judge: Callable[[str, Tensor], dict[str, Tensor]]
+    frames: Callable[[Tensor], list[NDArray[np.uint8]]]
 
 
 @dataclass(frozen=True)
@@ -90,9 +121,16 @@ class Domain:
         training_set: ``(samples per concept, seed) -> demonstrations`` of every training concept.
         generate: ``(task, count, seed) -> demonstrations`` of any task of the domain's grammar.
         reads: whether a text is a goal that :attr:`succeeded` can judge.
-        succeeded: ``(goal, states (sample, horizon, state)) -> (sample,)`` of bool, the paper's metric.
-        render: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title) -> figure``.
-        references: trivial policies to print beside every rate: name to ``(goal, count, seed) -> states``.
+        succeeded: ``(goal, states (sample, horizon, state), initial states (sample, m) or None) -> (sample,)`` of bool, the paper's
+            metric of plans.
+        render: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title, initial states
+            (sample, m) or None) -> figure``.
+        references: trivial policies to print beside every rate: name to ``(goal, samples, initial states (sample, m) or None, seed)
+            -> states (sample, horizon, state)``.
+        initial_states: ``(task, count, seed) -> (count, m)``, new initial states of a task; ``None`` where behaviour has none.
+        entities: columns of an initial state for each of its exchangeable entities, in the same order for each; the other columns
+            say nothing about a single entity.
+        closed_loop: how plans are executed; ``None`` where they cannot be.
         published: the paper's numbers for this domain.
         omega: the fixed guidance weight of the paper's main figures, as text.
     """
@@ -107,9 +145,12 @@ class Domain:
     training_set: Callable[[int, int], Demonstrations]
     generate: Callable[[str, int, int], Demonstrations]
     reads: Callable[[str], bool]
-    succeeded: Callable[[str, Tensor], Tensor]
-    render: Callable[[Tensor, Sequence[bool] | None, str], Figure]
-    references: Mapping[str, Callable[[str, int, int], Tensor]] = field(default_factory=dict)
+    succeeded: Callable[[str, Tensor, Tensor | None], Tensor]
+    render: Callable[[Tensor, Sequence[bool] | None, str, Tensor | None], Figure]
+    references: Mapping[str, Callable[[str, int, Tensor | None, int], Tensor]] = field(default_factory=dict)
+    initial_states: Callable[[str, int, int], Tensor] | None = None
+    entities: tuple[tuple[int, ...], ...] = ()
+    closed_loop: ClosedLoop | None = None
     published: tuple[Published, ...] = ()
     omega: str = "1.2"
 

@@ -6,7 +6,7 @@ model and :class:`Generates`.
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -20,12 +20,17 @@ from ftl_lightning import __version__
 from ftl_lightning.diffusion.samplers import SAMPLERS
 from ftl_lightning.domains.domain import Domain, EvaluationTask, Suite, load_domain
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.closed_loop import Plan, Rollout, fixed_plans, roll_out, sampled_plans
 from ftl_lightning.evaluation.results import Row, append_rows
-from ftl_lightning.evaluation.tensorboard import log_hparams, log_projector
+from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import content_hash, file_hash
 
+SUCCESS = "success"
+CLOSED = "closed loop"
+EVALUATION_SEED = 3_000_000
+"""Added to the seed of new initial states, so that they share no random stream with demonstrations."""
 OWN = "own demonstrations"
 """The setting of learned concepts that no suite asks for."""
 
@@ -45,28 +50,58 @@ class Generates(Protocol):
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None: ...
 
+    def demonstrated(self, concept: str) -> Tensor | None: ...
+
     def concept_embeddings(self) -> dict[str, Tensor]: ...
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Generated behaviour of one task: states ``(sample, horizon, state)`` and whether each is right ``(sample,)``."""
+    """Generated behaviour of one task.
+
+    Attributes:
+        task: what was asked.
+        states: plans ``(sample, horizon, state)``.
+        right: whether each is right ``(sample,)``.
+        initial_states: that they start from ``(sample, m)``, or ``None``.
+        rollout: what happened when they were executed, if they were.
+        outcomes: the domain's judgement of that, by name ``(sample,)`` of bool.
+    """
 
     task: EvaluationTask
     states: Tensor
     right: Tensor
+    initial_states: Tensor | None = None
+    rollout: Rollout | None = None
+    outcomes: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: EvaluationTask, states: Tensor, domain: Domain) -> Self:
+    def of(cls, task: EvaluationTask, states: Tensor, initial_states: Tensor | None, domain: Domain) -> Self:
         """Judge states by the task's goal."""
-        return cls(task, states, domain.succeeded(task.goal, states))
+        return cls(task, states, domain.succeeded(task.goal, states, initial_states), initial_states)
+
+    def executed(self, rollout: Rollout, domain: Domain) -> Self:
+        """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
+        assert domain.closed_loop is not None
+        outcomes = domain.closed_loop.judge(self.task.goal, rollout.observations)
+        return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
 
     @property
     def accuracy(self) -> float:
         """Share of right samples."""
-        metric = MeanMetric()
-        metric.update(self.right.float())
-        return float(metric.compute())
+        return share(self.right)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Every metric's value: ``accuracy`` of plans and, after ``closed loop``, what happened when they were executed."""
+        return {"accuracy": self.accuracy} | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
+
+
+def share(values: Tensor) -> float:
+    """Share of true values."""
+    metric = MeanMetric()
+    metric.update(values.float())
+    return float(metric.compute())
 
 
 def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -74,10 +109,25 @@ def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
 
 
+def _key(task: EvaluationTask) -> tuple[int, ...]:
+    """What a task adds to a seed."""
+    return (zlib.crc32(task.name.encode()), *((1,) if task.initial == "demonstrated" else ()))
+
+
 def standard_error(values: Sequence[float]) -> float:
     """Standard error of the mean over tasks; 0 for a single one."""
     count = len(values)
     return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
+
+
+def _executed(judged: Sequence[Judged], plan: Plan, replan: int, domain: Domain) -> list[Judged]:
+    """The same tasks with their episodes, which run all side by side."""
+    assert domain.closed_loop is not None
+    initial = torch.cat([one.initial_states for one in judged if one.initial_states is not None])
+    whole = roll_out(domain.closed_loop, initial, plan, replan)
+    counts = [len(one.states) for one in judged]
+    parts = zip(whole.observations.split(counts), whole.failed.split(counts), strict=True)
+    return [one.executed(Rollout(*part), domain) for one, part in zip(judged, parts, strict=True)]
 
 
 class Evaluator(pl.Callback):
@@ -90,6 +140,8 @@ class Evaluator(pl.Callback):
         sampler: ``'ddpm'`` (the paper's), ``'ddim'`` or ``'dpm_solver'``.
         steps: of the sampler, at most the model's T.
         temperature: the paper's alpha.
+        closed_loop: also execute plans, in domains that can, when testing (``test``, ``invert``).
+        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
         figures: how many samples of a task a TensorBoard figure shows; 0 for no figures.
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
         seed: of the samples.
@@ -102,6 +154,8 @@ class Evaluator(pl.Callback):
         sampler: str = "ddpm",
         steps: int = 100,
         temperature: float = 0.1,
+        closed_loop: bool = False,
+        replan: int = 8,
         figures: int = 16,
         results: str | None = None,
         seed: int = 0,
@@ -112,16 +166,19 @@ class Evaluator(pl.Callback):
             raise UserError(f"evaluation.samples: expected 1 or more, found {samples}")
         if temperature < 0:
             raise UserError(f"evaluation.temperature: expected 0 or more, found {temperature}")
+        if replan < 1:
+            raise UserError(f"evaluation.replan: expected 1 or more, found {replan}")
         self.suites = tuple(suites)
         # The suites too: the size of a batch decides how its numbers are rounded.
-        self.settings = {
+        self.settings: dict[str, Any] = {
             "suites": ", ".join(suites),
             "samples": samples,
             "sampler": sampler,
             "steps": steps,
             "temperature": temperature,
             "sample_seed": seed,
-        }
+        } | ({"replan": replan} if closed_loop else {})
+        self.closed_loop, self.replan = closed_loop, replan
         self.samples, self.sampler, self.steps, self.temperature = samples, SAMPLERS[sampler], steps, temperature
         self.figures = figures
         self.results = results
@@ -137,25 +194,67 @@ class Evaluator(pl.Callback):
         asked = {task.learned for task in tasks}
         return tasks + [EvaluationTask(OWN, name, learned=name) for name in learned if name not in asked and domain.reads(name)]
 
+    def _start(self, task: EvaluationTask, module: Generates, domain: Domain) -> Tensor | None:
+        """Initial states ``(sample, m)`` of a task, or ``None`` where the domain has none."""
+        if domain.initial_states is None:
+            return None
+        if task.initial == "demonstrated":
+            assert task.learned is not None
+            return module.demonstrated(task.learned)
+        return domain.initial_states(task.goal, self.samples, EVALUATION_SEED + self.seed)
+
     @torch.no_grad()
-    def evaluate(self, module: Generates) -> list[Judged]:
-        """Generate and judge every task in one batch of the network."""
+    def evaluate(self, module: Generates, execute: bool = False) -> list[Judged]:
+        """Generate and judge every task, those with equally many samples in one batch of the network.
+
+        Args:
+            module: what generates.
+            execute: also execute plans in the domain's environment.
+        """
         model = module.model
         domain = load_domain(model.config.domain)
-        asked = self._tasks(domain, module.concepts)
-        composed = {task: composition for task in asked if (composition := module.composition(task))}
-        if not composed:
-            return []
-        states = model.sample(
-            [embeddings for embeddings, _ in composed.values()],
-            [weights for _, weights in composed.values()],
-            self.samples,
+        composed = {task: composition for task in self._tasks(domain, module.concepts) if (composition := module.composition(task))}
+        starts = {task: self._start(task, module, domain) for task in composed}
+        counts = {task: self.samples if start is None else len(start) for task, start in starts.items()}
+        judged: dict[EvaluationTask, Judged] = {}
+        for count in dict.fromkeys(counts.values()):
+            tasks = [task for task in composed if counts[task] == count]
+            given = [start for task in tasks if (start := starts[task]) is not None]
+            states = model.sample(
+                [composed[task][0] for task in tasks],
+                [composed[task][1] for task in tasks],
+                count,
+                self.sampler,
+                self.steps,
+                self.temperature,
+                [generator("cpu", self.seed, *_key(task)) for task in tasks],
+                torch.cat(given).to(model.alpha_bar.device) if given else None,
+            ).cpu()
+            for task, own in zip(tasks, states, strict=True):
+                judged[task] = Judged.of(task, own, starts[task], domain)
+        found = [judged[task] for task in composed]
+        return self._execute(found, composed, model, domain) if execute and domain.closed_loop else found
+
+    def _execute(
+        self,
+        judged: Sequence[Judged],
+        composed: Mapping[EvaluationTask, tuple[Tensor, Tensor]],
+        model: GenerativeModel,
+        domain: Domain,
+    ) -> list[Judged]:
+        """With the plans that the model makes on the way."""
+        tasks = [one.task for one in judged for _ in one.states]
+        draws = [generator("cpu", self.seed, *_key(one.task), episode) for one in judged for episode in range(len(one.states))]
+        plan = sampled_plans(
+            model,
+            [composed[task][0] for task in tasks],
+            [composed[task][1] for task in tasks],
             self.sampler,
             self.steps,
             self.temperature,
-            [generator("cpu", self.seed, zlib.crc32(task.name.encode())) for task in composed],
-        ).cpu()
-        return [Judged.of(task, own, domain) for task, own in zip(composed, states, strict=True)]
+            draws,
+        )
+        return _executed(judged, plan, self.replan, domain)
 
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Tell mistakes before hours of training, not after."""
@@ -172,14 +271,18 @@ class Evaluator(pl.Callback):
         if trainer.sanity_checking:
             return
         assert isinstance(module, Generates)
-        self.judged = self.evaluate(module)
+        self.judged = self.evaluate(module, execute=self.closed_loop and stage == "test")
         domain = load_domain(module.model.config.domain)
         metrics: dict[str, float] = {}
         for setting in Suite(tuple(one.task for one in self.judged)).settings:
-            values = [one.accuracy for one in self.judged if one.task.setting == setting]
-            metrics[f"{stage}/accuracy/{setting}"] = sum(values) / len(values)
-            metrics[f"{stage}/standard error/{setting}"] = standard_error(values)
-        each = {f"{stage}/accuracy/{one.task.setting}/{one.task.name}": one.accuracy for one in self.judged}
+            own = [one.values for one in self.judged if one.task.setting == setting]
+            for name in own[0]:
+                values = [each[name] for each in own]
+                metrics[f"{stage}/{name}/{setting}"] = sum(values) / len(values)
+                metrics[f"{stage}/standard error{'' if name == 'accuracy' else f' of {name}'}/{setting}"] = standard_error(values)
+        each = {
+            f"{stage}/{name}/{one.task.setting}/{one.task.name}": value for one in self.judged for name, value in one.values.items()
+        }
         module.log_dict(metrics | each, batch_size=1)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
@@ -199,8 +302,12 @@ class Evaluator(pl.Callback):
     def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
         for one in self.judged if self.figures else ():
             shown = slice(0, self.figures)
-            figure = domain.render(one.states[shown], one.right[shown].tolist(), f"{one.task.name}: {one.accuracy:.2f}")
+            start = None if one.initial_states is None else one.initial_states[shown]
+            figure = domain.render(one.states[shown], one.right[shown].tolist(), f"{one.task.name}: {one.accuracy:.2f}", start)
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
+            if one.rollout is not None and domain.closed_loop is not None:
+                pictures = domain.closed_loop.frames(one.rollout.observations[0])
+                log_animation(logger, f"{CLOSED}/{one.task.setting}/{one.task.name}", pictures, step)
 
     def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:
         """16 hexadecimal digits that everything configured decides: model, data, evaluation and the pretrained weights."""
@@ -228,20 +335,28 @@ class Evaluator(pl.Callback):
         }
         nobody = {"K": 0, "omega": "", "model_hash": "", "config_hash": content_hash([__version__, self.samples, self.seed])}
 
-        def row(task: EvaluationTask, accuracy: float, what: dict[str, Any]) -> Row:
-            subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
-            return Row(**subject, **what, n=self.samples, metric="accuracy", value=round(accuracy, 6))
+        def rows(one: Judged, what: dict[str, Any]) -> list[Row]:
+            subject = {"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]}
+            return [
+                Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in one.values.items()
+            ]
 
         references = [
-            row(
-                one.task,
-                Judged.of(one.task, draw(one.task.goal, self.samples, self.seed), domain).accuracy,
-                nobody | {"method": name},
-            )
-            for name, draw in domain.references.items()
-            for one in self.judged
+            row
+            for name in domain.references
+            for one in self._referees(name, domain)
+            for row in rows(one, nobody | {"method": name})
         ]
-        return [row(one.task, one.accuracy, ours) for one in self.judged] + references
+        return [row for one in self.judged for row in rows(one, ours)] + references
+
+    def _referees(self, name: str, domain: Domain) -> list[Judged]:
+        """What a reference policy does on the tasks that were judged, from the same initial states."""
+        draw = domain.references[name]
+        plans = [draw(one.task.goal, len(one.states), one.initial_states, self.seed) for one in self.judged]
+        found = [Judged.of(one.task, states, one.initial_states, domain) for one, states in zip(self.judged, plans, strict=True)]
+        if domain.closed_loop is None or all(one.rollout is None for one in self.judged):
+            return found
+        return _executed(found, fixed_plans(torch.cat(plans)), domain.closed_loop.steps, domain)
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

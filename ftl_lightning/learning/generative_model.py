@@ -13,6 +13,7 @@ from ftl_lightning import diffusion
 from ftl_lightning.concepts.composition import composed_epsilon
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction
 from ftl_lightning.diffusion.samplers import Sampler
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
 from ftl_lightning.errors import UserError
@@ -34,6 +35,8 @@ class ModelConfig:
         denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
         denoiser_args: its arguments other than the sizes.
         diffusion_steps: T.
+        prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'`` or ``'clean'``.
+        entities: columns of the initial state for each exchangeable entity.
         training: how it was trained, for the record.
     """
 
@@ -47,6 +50,8 @@ class ModelConfig:
     denoiser: str = "MLPDenoiser"
     denoiser_args: Mapping[str, Any] = field(default_factory=dict)
     diffusion_steps: int = 100
+    prediction: str = "epsilon"
+    entities: tuple[tuple[int, ...], ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -58,17 +63,21 @@ def build_denoiser(config: ModelConfig) -> nn.Module:
     """
     if config.denoiser not in diffusion.__all__:
         raise UserError(f"denoiser: expected one of {', '.join(diffusion.__all__)}, found {config.denoiser!r}")
+    if config.prediction not in PREDICTIONS:
+        raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {config.prediction!r}")
     kind: type[nn.Module] = getattr(diffusion, config.denoiser)
     try:
-        return kind(
+        denoiser = kind(
             horizon=config.horizon,
             state_dim=config.state_dim,
             initial_state_dim=config.initial_state_dim,
             concept_dim=config.concept_dim,
+            entities=config.entities,
             **config.denoiser_args,
         )
     except TypeError as error:
         raise UserError(f"denoiser_args: {config.denoiser} does not take them ({error})") from error
+    return denoiser if config.prediction == "epsilon" else Prediction(denoiser, config.prediction, config.diffusion_steps)
 
 
 class GenerativeModel(nn.Module):
@@ -142,6 +151,20 @@ class GenerativeModel(nn.Module):
                     f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
                 )
 
+    def encode_initial(self, initial_states: Tensor | None) -> Tensor | None:
+        """Initial states ``(batch, m)`` normalised, or ``None`` for a model that is not conditioned on any.
+
+        Raises:
+            UserError: if the model needs them and there are none, or their size is another.
+        """
+        if self.initial_normalization is None:
+            return None
+        expected = self.config.initial_state_dim
+        if initial_states is None or initial_states.shape[-1] != expected:
+            found = "none" if initial_states is None else str(initial_states.shape[-1])
+            raise UserError(f"key 'initial_states': expected {expected} numbers each (the pretrained model's), found {found}")
+        return self.initial_normalization.encode(initial_states)
+
     @torch.no_grad()
     def sample(
         self,
@@ -170,9 +193,7 @@ class GenerativeModel(nn.Module):
         # Compositions with fewer components are padded with empty ones of weight zero, which add nothing.
         embeddings = nn.utils.rnn.pad_sequence(list(concepts), batch_first=True)
         omega = nn.utils.rnn.pad_sequence(list(weights), batch_first=True)
-        s0 = None
-        if initial_states is not None and self.initial_normalization is not None:
-            s0 = self.initial_normalization.encode(initial_states)
+        s0 = self.encode_initial(initial_states)
 
         def epsilon(x: Tensor, t: Tensor) -> Tensor:
             return composed_epsilon(self.denoiser, x, t, embeddings, omega, self.empty, s0)
@@ -215,7 +236,9 @@ class GenerativeModel(nn.Module):
             expected_hash = content.pop("hash")
             if content.pop("format") != FORMAT:
                 raise ValueError(f"format is not {FORMAT}")
-            config = ModelConfig(**content | {"training_concepts": tuple(content["training_concepts"])})
+            for key in ("training_concepts", "entities"):
+                content[key] = tuple(tuple(one) if isinstance(one, list) else one for one in content.get(key, ()))
+            config = ModelConfig(**content)
         except OSError as error:
             raise UserError(
                 f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit"

@@ -13,6 +13,7 @@ from ftl_lightning.concepts.composition import composed_epsilon
 from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.datamodule import InversionData
+from ftl_lightning.diffusion.prediction import loss_weights
 from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.domain import EvaluationTask
 from ftl_lightning.errors import UserError
@@ -20,7 +21,7 @@ from ftl_lightning.learning.checkpoint import check_signature, sign
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
 
-FINAL_SAMPLES = 640
+FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
 
 
@@ -42,7 +43,8 @@ class InversionModule(pl.LightningModule):
         learning_rate: of the embeddings (Adam, cosine decay to 0).
         weight_learning_rate: of the weights; with the embeddings' rate they collapse.
         samples: noised demonstrations a step and run, spread over demonstrations and timesteps.
-        high_noise: emphasis on noisy timesteps: the loss at t is weighted by ``1 / max(abar_t, 0.05)`` to this power (0 is Eq. 2).
+        loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
+            at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -63,7 +65,7 @@ class InversionModule(pl.LightningModule):
         learning_rate: float = 0.1,
         weight_learning_rate: float = 3e-3,
         samples: int = 32,
-        high_noise: float = 0.0,
+        loss: str = "epsilon",
         training_omega: float | None = None,
         output: str | None = None,
         seed: int = 0,
@@ -85,26 +87,22 @@ class InversionModule(pl.LightningModule):
         # Rows span the training embeddings, whose mean is the origin of the concept space.
         basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
         self.register_buffer("basis", basis, persistent=False)
-        self.register_buffer("emphasis", self._emphasis(high_noise), persistent=False)
+        self.register_buffer("loss_weights", loss_weights(loss, self.model.alpha_bar), persistent=False)
         self.basis: Tensor
-        self.emphasis: Tensor
+        self.loss_weights: Tensor
         self.embeddings: nn.Parameter
         self.weights: nn.Parameter | Tensor
-        self._states: Tensor
-        self._initial: Tensor | None
         self.concepts: tuple[str, ...] = ()
+        self._found: dict[str, Concept] = {}
 
     @property
     def method(self) -> str:
         """The method's name in tables."""
+        encoder = self.model.config.denoiser_args.get("initial_encoder")
         form = {1.0: "free", 0.0: "span"}.get(self.off_span, f"near span {self.off_span:g}")
         weight = self.hparams["training_omega"]
-        return f"FTL-IGM ({form})" if weight is None else f"FTL-IGM ({form}, training weight {weight:g})"
-
-    def _emphasis(self, power: float) -> Tensor:
-        """Weights of the timesteps ``(T,)`` with mean 1."""
-        weight = self.model.alpha_bar.clamp(min=0.05) ** -power
-        return weight / weight.mean()
+        parts = [*([encoder] if encoder else []), form, *([] if weight is None else [f"training weight {weight:g}"])]
+        return f"FTL-IGM ({', '.join(parts)})"
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
@@ -121,6 +119,7 @@ class InversionModule(pl.LightningModule):
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
             raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
         self.demonstrations: Demonstrations = data.demonstrations
+        self.model.encode_initial(self.demonstrations.initial_states)  # a wrong size is told before anything is learned
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
         # A generator for each concept, so that its start does not depend on what is learned beside it.
@@ -132,11 +131,6 @@ class InversionModule(pl.LightningModule):
             self.weights = nn.Parameter(torch.full((runs, components), float(self.hparams["initial_omega"])))
         else:
             self.register_buffer("weights", torch.full((runs, components), float(omega)), persistent=False)
-        normalised = self.model.normalization.encode(data.demonstrations.states)
-        initial = data.demonstrations.initial_states
-        encoder = self.model.initial_normalization
-        self.register_buffer("_states", normalised, persistent=False)
-        self.register_buffer("_initial", encoder.encode(initial) if encoder and initial is not None else None, persistent=False)
 
     def _rows(self, samples: int) -> Tensor:
         """Which demonstration each sample of each run uses, evenly: ``(run, samples)``."""
@@ -154,24 +148,30 @@ class InversionModule(pl.LightningModule):
         return inside + self.off_span * (self.embeddings - inside)
 
     def _losses(self, samples: int, draw: torch.Generator) -> Tensor:
-        """Eq. 2 for every run and sample, ``(run, samples)``. Timesteps are stratified; noise is shared between the runs."""
+        """Eq. 2 for every run and sample, ``(run, samples)``. Timesteps are stratified; runs share timesteps, noise and, as a
+        share of a demonstration's length, the windows' starts.
+        """
         runs = len(self.embeddings)
+        horizon = self.model.config.horizon
         total = len(self.model.alpha_bar)
         jitter = torch.rand(samples, generator=draw, device=self.device)
         t = ((torch.arange(samples, device=self.device) + jitter) / samples * total).long()
         t = t[torch.randperm(samples, generator=draw, device=self.device)]
-        noise = torch.randn((samples, *self._states.shape[1:]), generator=draw, device=self.device)
-        rows = self._rows(samples).flatten().to(self.device)
+        noise = torch.randn((samples, horizon, self.model.config.state_dim), generator=draw, device=self.device)
+        rows = self._rows(samples).flatten()
+        share = torch.rand(samples, generator=draw, device=self.device).cpu().repeat(runs)
+        starts = (share * self.demonstrations.starts[rows]).long()
+        states, initial = self.demonstrations.windows(rows, starts, horizon)
+        s0 = self.model.encode_initial(None if initial is None else initial.to(self.device))
         embeddings = self.parametrised
-        initial = None if self._initial is None else self._initial[rows]
         losses = denoising_loss(
-            lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, self.weights, self.model.empty, initial),
-            self._states[rows],
+            lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, self.weights, self.model.empty, s0),
+            self.model.normalization.encode(states.to(self.device)),
             noise.repeat(runs, 1, 1),
             t.repeat(runs),
             self.model.alpha_bar,
         )
-        return losses.unflatten(0, (runs, samples)) * self.emphasis[t]
+        return losses.unflatten(0, (runs, samples)) * self.loss_weights[t]
 
     def training_step(self, step: int) -> Tensor:
         losses = self._losses(self.hparams["samples"], generator(self.device, self.seed, 1, self.global_step))
@@ -182,17 +182,15 @@ class InversionModule(pl.LightningModule):
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         return losses.mean(dim=1).sum()
 
-    # Validation and test log the loss on common noise; behaviour is judged by the evaluator.
+    # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
     def validation_step(self, step: int) -> None:
-        self.log("val/loss", self._common_losses().mean(), batch_size=1)
+        self._log_loss("val/loss")
 
     def test_step(self, step: int) -> None:
-        self.log("test/loss", self._common_losses().mean(), batch_size=1)
+        self._log_loss("test/loss")
 
-    @torch.no_grad()
-    def _common_losses(self) -> Tensor:
-        """The loss of every run ``(run,)`` on noise that is common to all and always the same."""
-        return self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(dim=1)
+    def _log_loss(self, name: str) -> None:
+        self.log(name, sum(concept.origin.loss for concept in self._found.values()) / len(self._found), batch_size=1)
 
     def train(self, mode: bool = True) -> "InversionModule":
         """Switch modes; the pretrained model stays in evaluation mode."""
@@ -219,6 +217,7 @@ class InversionModule(pl.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module, model, concepts or kind of weights."""
         check_signature(self, checkpoint, self._signature())
+        self._found = {}
 
     def _signature(self) -> dict[str, Any]:
         """What a checkpoint's parameters mean nothing without."""
@@ -233,7 +232,8 @@ class InversionModule(pl.LightningModule):
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
         """The concepts by name: of each, the restart with the lowest loss on common noise."""
-        losses = self._common_losses().unflatten(0, (-1, self.restarts))
+        # Noise that is common to all runs and always the same.
+        losses = self._losses(FINAL_SAMPLES, generator(self.device, self.seed, 2)).mean(dim=1).unflatten(0, (-1, self.restarts))
         best = losses.argmin(dim=1)
         embeddings = self.parametrised.detach().unflatten(0, (-1, self.restarts))
         weights = self.weights.detach().unflatten(0, (-1, self.restarts))
@@ -270,7 +270,9 @@ class InversionModule(pl.LightningModule):
     def on_validation_start(self) -> None:
         self._found = self.learned()
 
-    on_test_start = on_validation_start
+    def on_test_start(self) -> None:
+        if not self._found:  # else training in the same process has just ended
+            self._found = self.learned()
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
         """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
@@ -287,6 +289,12 @@ class InversionModule(pl.LightningModule):
             embeddings += concept.embeddings[chosen].to(self.device)
             weights += concept.weights[chosen].tolist()
         return torch.stack(embeddings), torch.tensor(weights, device=self.device)
+
+    def demonstrated(self, concept: str) -> Tensor | None:
+        """Initial states ``(demo, m)`` that a concept was learned from, or ``None`` where the domain has none."""
+        own = self.demonstrations.select(concept)
+        rows = torch.arange(len(own))
+        return own.windows(rows, torch.zeros_like(rows), 1)[1]
 
     def concept_embeddings(self) -> dict[str, Tensor]:
         """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""

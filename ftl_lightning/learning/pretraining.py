@@ -15,6 +15,8 @@ from ftl_lightning.concepts.composition import Denoiser
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
 from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion import PAPER_SIZE
+from ftl_lightning.diffusion.prediction import loss_weights
 from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.domain import EvaluationTask
 from ftl_lightning.errors import UserError
@@ -32,6 +34,7 @@ class PretrainingModule(pl.LightningModule):
     Args:
         denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
         denoiser_args: its arguments other than the sizes.
+        paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
         diffusion_steps: T.
         condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
             (the published code draws once a batch).
@@ -40,6 +43,10 @@ class PretrainingModule(pl.LightningModule):
         weight_decay: of AdamW.
         ema_decay: of the running average; it starts lower.
         guidance: weight omega with which training concepts are generated in evaluation.
+        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'`` or ``'clean'``, from which the noise follows
+            (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+        loss: whose squared error is minimised, one of the same three; ``'epsilon'`` is Eq. 1. The others weigh noisy timesteps,
+            at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         compile: compile the denoiser for training (worth it on GPUs).
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and noise, timesteps and condition dropout as a function of the step.
@@ -53,6 +60,7 @@ class PretrainingModule(pl.LightningModule):
         self,
         denoiser: str = "MLPDenoiser",
         denoiser_args: Mapping[str, Any] | None = None,
+        paper_size: bool = False,
         diffusion_steps: int = 100,
         condition_dropout: float = 0.1,
         learning_rate: float = 1e-3,
@@ -60,13 +68,15 @@ class PretrainingModule(pl.LightningModule):
         weight_decay: float = 0.01,
         ema_decay: float = 0.999,
         guidance: float = 1.2,
+        prediction: str = "epsilon",
+        loss: str = "epsilon",
         compile: bool = False,
         output: str | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
-        self.denoiser_args = dict(denoiser_args or {})
+        self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         self.seed = seed
         self.guidance = guidance
         self.model: GenerativeModel
@@ -83,7 +93,7 @@ class PretrainingModule(pl.LightningModule):
         initial = data.training.initial_states
         config = ModelConfig(
             domain=data.domain.name,
-            horizon=data.domain.horizon,
+            horizon=data.horizon,
             state_dim=len(data.domain.state_names),
             initial_state_dim=0 if initial is None else initial.shape[-1],
             concept_dim=embeddings.shape[-1],
@@ -92,6 +102,8 @@ class PretrainingModule(pl.LightningModule):
             denoiser=self.hparams["denoiser"],
             denoiser_args=self.denoiser_args,
             diffusion_steps=self.hparams["diffusion_steps"],
+            prediction=self.hparams["prediction"],
+            entities=data.domain.entities,
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
                 "data": {key: value for key, value in data.hparams.items() if not key.startswith("_")},
@@ -105,7 +117,7 @@ class PretrainingModule(pl.LightningModule):
                 config,
                 Normalization.fit(data.training.states),
                 embeddings,
-                None if initial is None else Normalization.fit(initial),
+                None if initial is None else Normalization.fit(initial, data.domain.entities),
             )
         self.denoiser = copy.deepcopy(self.model.denoiser)
         self.model.requires_grad_(False).eval()
@@ -121,16 +133,15 @@ class PretrainingModule(pl.LightningModule):
     def _loss(self, denoiser: Denoiser, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
         """Eq. 1 on a batch, ``(batch,)``."""
         clean = self.model.normalization.encode(batch.states)
-        initial = None
-        if batch.initial_states is not None and self.model.initial_normalization is not None:
-            initial = self.model.initial_normalization.encode(batch.initial_states)
+        initial = self.model.encode_initial(batch.initial_states)
         count = len(clean)
         removed = torch.rand(count, generator=draw, device=self.device) < dropout
         concepts = torch.cat((self.model.empty[None], self.model.training_embeddings))
         index = torch.where(removed, 0, batch.concepts + 1)
         t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
         noise = torch.randn(clean.shape, generator=draw, device=self.device)
-        return denoising_loss(lambda x, t: denoiser(x, t, concepts, index, initial), clean, noise, t, self.model.alpha_bar)
+        losses = denoising_loss(lambda x, t: denoiser(x, t, concepts, index, initial), clean, noise, t, self.model.alpha_bar)
+        return losses * loss_weights(self.hparams["loss"], self.model.alpha_bar)[t]
 
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
@@ -188,6 +199,10 @@ class PretrainingModule(pl.LightningModule):
             return None
         embeddings = torch.stack([self.model.concept(text) for text in task.texts])
         return embeddings, embeddings.new_full((len(embeddings),), self.guidance)
+
+    def demonstrated(self, concept: str) -> Tensor | None:
+        """Initial states that a concept was learned from: none."""
+        return None
 
     def concept_embeddings(self) -> dict[str, Tensor]:
         """Every embedding ``(n,)`` by name, for the projector."""

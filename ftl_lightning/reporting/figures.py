@@ -11,14 +11,15 @@ PAPER_COLOUR = "#9a9a9a"
 COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3")
 
 
-def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
-    """Accuracy of every setting beside the paper's, K = 2 and the paper's fixed omega; bars show standard errors over tasks.
+def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
+    """A metric of every setting beside the paper's, K = 2 and the paper's fixed omega; bars show standard errors over tasks.
 
     Args:
         domain: the domain.
         results: rows of the results file.
+        metric: as in a row of the results.
     """
-    rows = latest(results[(results["domain"] == domain.name) & (results["metric"] == "accuracy")])
+    rows = latest(results[(results["domain"] == domain.name) & (results["metric"] == metric)])
     ours = rows[(rows["K"] == 2) & (rows["omega"] == domain.omega)]
     names = ("training", "paper")
     settings = [s for name in names for s in domain.suites[name].settings if s in set(ours["setting"])]
@@ -26,7 +27,11 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(1.9 * max(len(settings), 2) + 1.5, 3.4), layout="constrained")
     axes = figure.subplots()
     width = 0.8 / (len(methods) + 1)
-    published = {found.setting: found for found in domain.published if not found.task and found.omega == domain.omega}
+    published = {
+        found.setting: found
+        for found in domain.published
+        if not found.task and found.omega == domain.omega and found.metric == metric
+    }
     chance = rows[rows["K"] == 0]
     drawn = False
     for place, setting in enumerate(settings):
@@ -52,6 +57,6 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame) -> Figure:
             span = (place - width / 2, place + (len(methods) + 0.5) * width)
             axes.hlines(trivial.mean, *span, colors="black", linestyles="dotted", label="chance" if place == 0 else "")
     axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
-    axes.set(ylim=(0, 1.05), ylabel="accuracy", title=f"{domain.name}, K = 2, omega = {domain.omega}")
+    axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, K = 2, omega = {domain.omega}")
     axes.legend(fontsize=8, loc="lower left")
     return figure

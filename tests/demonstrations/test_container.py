@@ -126,3 +126,24 @@ def test_an_unwritable_folder_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"file/d\.safetensors: cannot be written"):
         demonstrations(torch.zeros(1, 1, 1)).save(tmp_path / "file" / "d.safetensors")
+
+
+def test_windows_are_padded_with_the_last_state() -> None:
+    states = torch.arange(10.0).reshape(2, 5, 1)
+    whole = Demonstrations(states, torch.tensor([5, 3]), "", ("x",), ("m",), ("a", "b"), initial_states=states + 100)
+    assert whole.starts.tolist() == [5, 3]
+    found, initial = whole.windows(torch.tensor([0, 1]), torch.tensor([3, 0]), 4)
+    assert found[..., 0].tolist() == [[3, 4, 4, 4], [5, 6, 7, 8]]
+    assert initial is not None
+    assert initial[:, 0].tolist() == [103, 105]
+
+
+def test_windows_start_at_the_beginning_where_only_the_first_initial_state_is_known() -> None:
+    whole = Demonstrations(torch.zeros(2, 5, 1), torch.tensor([5, 3]), "", ("x",), ("m",), ("a", "b"), torch.eye(2))
+    assert whole.starts.tolist() == [1, 1]
+    assert torch.equal(whole.windows(torch.tensor([1]), torch.tensor([0]), 2)[1], torch.eye(2)[1:])
+
+
+def test_initial_states_of_another_number_of_times_are_refused() -> None:
+    with pytest.raises(UserError, match=r"key 'initial_states': expected shape \(2, initial state\) or \(2, 5, initial state\)"):
+        Demonstrations(torch.zeros(2, 5, 1), torch.tensor([5, 3]), "", ("x",), ("m",), ("a", "b"), torch.zeros(2, 4, 3))

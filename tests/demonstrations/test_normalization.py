@@ -1,3 +1,4 @@
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,3 +30,16 @@ def test_it_is_kept_with_a_model() -> None:
     other = Normalization(torch.zeros(2), torch.zeros(2))
     other.load_state_dict(fitted.state_dict())
     assert torch.equal(other.encode(torch.tensor([[1.0, 1.0]])), torch.tensor([[0.0, 0.0]]))
+
+
+def test_exchangeable_entities_share_their_extremes() -> None:
+    states = torch.tensor([[0.0, 5.0, -2.0, 7.0], [1.0, 6.0, 0.0, 7.5]])
+    found = Normalization.fit(states, alike=((0, 1), (2, 3)))
+    assert found.low.tolist() == [-2, 5, -2, 5]
+    assert found.high.tolist() == [1, 7.5, 1, 7.5]
+
+
+def test_what_varies_by_rounding_alone_is_constant() -> None:
+    found = Normalization.fit(torch.tensor([[0.1020, 1.0], [0.1021, 2.0]]))
+    assert found.encode(torch.tensor([0.1021, 1.5])).tolist() == [0, 0]
+    assert found.decode(torch.zeros(2)).tolist() == pytest.approx([0.102, 1.5])

@@ -118,7 +118,7 @@ def test_ring_by_hand() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**31))
 def test_relaxed_contains_exact_and_right_of_excludes_its_reverse(seed: int) -> None:
-    states = DOMAIN.references["random scenes"]("", 200, seed)[:, 0]
+    states = DOMAIN.references["random scenes"]("", 200, None, seed)[:, 0]
     for kind, pair in itertools.product(("right of", "above", "next to"), itertools.permutations(SHAPES, 2)):
         relation, reverse = Relation(kind, pair), Relation(kind, pair[::-1])
         exact = holds(relation, states, relaxed=False)
@@ -158,5 +158,5 @@ def test_domains_are_the_folders() -> None:
 
 def test_the_oracle_is_right_and_chance_is_not() -> None:
     for task in TASKS[::7]:
-        assert DOMAIN.succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, 0)).all()
-        assert DOMAIN.succeeded(task, DOMAIN.references["random scenes"](task, 500, 0)).float().mean() < 0.5
+        assert DOMAIN.succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, None, 0)).all()
+        assert DOMAIN.succeeded(task, DOMAIN.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5

@@ -43,12 +43,13 @@ def reads(task: str) -> bool:
         return False
 
 
-def succeeded(goal: str, states: Tensor) -> Tensor:
+def succeeded(goal: str, states: Tensor, initial_states: Tensor | None = None) -> Tensor:
     """Whether every relation of a goal holds in its relaxed form (paper, 'Evaluation data and metrics').
 
     Args:
         goal: relations in words.
         states: ``(sample, 1, 21)`` in the domain's units.
+        initial_states: there are none.
 
     Returns:
         ``(sample,)`` of bool.
@@ -72,8 +73,8 @@ DOMAIN = Domain(
     succeeded=succeeded,
     render=render,
     references={
-        "random scenes": lambda goal, count, seed: random_scenes(count, seed)[:, None],
-        "generator (oracle)": lambda goal, count, seed: generate(goal, count, seed)[:, None],
+        "random scenes": lambda goal, count, initial_states, seed: random_scenes(count, seed)[:, None],
+        "generator (oracle)": lambda goal, count, initial_states, seed: generate(goal, count, seed)[:, None],
     },
     published=PUBLISHED,
 )

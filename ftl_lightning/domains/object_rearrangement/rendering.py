@@ -14,13 +14,14 @@ CORNERS = {"triangle": 3, "square": 4}
 MAX_COLUMNS = 8
 
 
-def render(states: Tensor, right: Sequence[bool] | None, title: str) -> Figure:
+def render(states: Tensor, right: Sequence[bool] | None, title: str, initial_states: Tensor | None = None) -> Figure:
     """A grid of scenes.
 
     Args:
         states: ``(scene, 1, 21)`` in the domain's units.
         right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
         title: above the grid.
+        initial_states: there are none.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)

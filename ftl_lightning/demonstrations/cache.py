@@ -1,0 +1,44 @@
+"""A cache of demonstrations that take long to make, in the user's cache folder."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import content_hash
+
+Tell = Callable[[], None]
+
+
+def cache_folder() -> Path:
+    """``$XDG_CACHE_HOME/ftl-lightning``, or ``~/.cache/ftl-lightning``."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ftl-lightning"
+
+
+def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demonstrations]) -> Demonstrations:
+    """Read demonstrations from the cache, or make them, with a progress bar, and keep them there.
+
+    Args:
+        settings: everything that decides them; a file is named by its hash.
+        total: how many are made.
+        make: makes them; calls its argument after each.
+    """
+    path = cache_folder() / f"{settings['domain']}-{content_hash(settings)}.safetensors"
+    if path.is_file():
+        try:
+            return Demonstrations.load(path)
+        except UserError:
+            path.unlink()  # of another version of this package, or damaged from outside: made again
+    with Progress(transient=True, disable=total < SLOW) as bar:
+        task = bar.add_task(f"{settings['domain']}: demonstrations", total=total)
+        made = make(lambda: bar.advance(task))
+    made.save(path)
+    return made
+
+
+SLOW = 20
+"""So many and more get a progress bar."""

@@ -1,0 +1,96 @@
+"""Encoders of the initial state: the paper's, which takes it as one vector, and one that treats exchangeable entities alike."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ftl_lightning.errors import UserError
+
+
+class FlatEncoder(nn.Module):
+    """The whole initial state through one network, as in the paper; it does not see the concept.
+
+    Args:
+        initial_state_dim: columns of the initial state.
+        width: of the features.
+    """
+
+    def __init__(self, initial_state_dim: int, width: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(initial_state_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+
+    def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
+        """Features ``(batch, width)`` of ``initial_state (batch, m)``; ``concept (batch, n)`` is not used."""
+        features: Tensor = self.net(initial_state)
+        return features
+
+
+class EntityEncoder(nn.Module):
+    """Every entity through the same network; the concept attends to them, so that it is a matter of looks and not of places.
+
+    Exchanging two entities changes nothing. What belongs to no entity goes to each of them, and into the features.
+
+    Args:
+        initial_state_dim: columns of the initial state.
+        entities: columns of each entity, in the same order for each.
+        concept_dim: columns of a concept embedding.
+        width: of the features.
+        heads: of the attention.
+    """
+
+    columns: Tensor
+    shared: Tensor
+
+    def __init__(
+        self, initial_state_dim: int, entities: Sequence[Sequence[int]], concept_dim: int, width: int, heads: int = 4
+    ) -> None:
+        super().__init__()
+        if not entities:
+            raise UserError("denoiser_args.initial_encoder: expected flat, found entities, which this domain does not name")
+        self.heads = heads
+        columns = torch.tensor([list(entity) for entity in entities])
+        own = set(columns.flatten().tolist())
+        # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
+        # columns are 0 after normalisation.
+        shared = [column for column in range(initial_state_dim) if column not in own]
+        self.register_buffer("columns", columns, persistent=False)
+        self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
+        inner = 2 * width
+        self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
+        # Keys are linear in an entity's columns: what makes red and what makes a bowl add up in a red bowl that was never seen.
+        self.key, self.value = nn.Linear(columns.shape[1], inner), nn.Linear(inner, inner)
+        self.query = nn.Linear(concept_dim, inner)
+        self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
+
+    def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
+        """Features ``(batch, width)`` of ``initial_state (batch, m)``, normalised, for ``concept (batch, n)``."""
+        shared = initial_state[:, self.shared]
+        each = initial_state[:, self.columns]  # (batch, entity, columns)
+        hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
+        query, key, value = (
+            part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for part in (self.query(concept)[:, None], self.key(each), self.value(hidden))
+        )
+        attended = functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(1)
+        features: Tensor = self.out(torch.cat((attended, shared), dim=-1))
+        return features
+
+
+ENCODERS = ("flat", "entities")
+
+
+def initial_state_encoder(
+    name: str, initial_state_dim: int, entities: Sequence[Sequence[int]], concept_dim: int, width: int
+) -> FlatEncoder | EntityEncoder:
+    """An encoder by its name in a configuration.
+
+    Raises:
+        UserError: for a name that is none, or ``entities`` in a domain without them.
+    """
+    if name not in ENCODERS:
+        raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")
+    if name == "flat":
+        return FlatEncoder(initial_state_dim, width)
+    return EntityEncoder(initial_state_dim, entities, concept_dim, width)

@@ -1,0 +1,162 @@
+"""The temporal U-Net of the paper's trajectory domains, after Decision Diffuser (Ajay et al., 2023)."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ftl_lightning.diffusion.initial_state import initial_state_encoder
+from ftl_lightning.diffusion.mlp import sinusoidal_embedding
+from ftl_lightning.errors import UserError
+
+KERNEL, GROUPS = 5, 8
+
+
+def _convolution(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv1d(inputs, outputs, KERNEL, padding=KERNEL // 2), nn.GroupNorm(GROUPS, outputs), nn.Mish())
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions over time; the condition acts between them.
+
+    Args:
+        inputs, outputs: channels.
+        condition_dim: columns of the condition.
+        film: the condition scales and shifts (FiLM, Perez et al., 2018); else it is added, as in Decision Diffuser.
+    """
+
+    def __init__(self, inputs: int, outputs: int, condition_dim: int, film: bool) -> None:
+        super().__init__()
+        self.film = film
+        self.first, self.second = _convolution(inputs, outputs), _convolution(outputs, outputs)
+        self.condition = nn.Linear(condition_dim, 2 * outputs if film else outputs)
+        self.skip = nn.Conv1d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """``x (batch, inputs, time)`` and ``condition (batch, condition)`` to ``(batch, outputs, time)``."""
+        hidden, own = self.first(x), self.condition(condition)[..., None]
+        if self.film:
+            scale, shift = own.chunk(2, dim=1)
+            hidden = hidden * (1 + scale) + shift
+        else:
+            hidden = hidden + own
+        hidden = self.second(hidden)
+        out: Tensor = hidden + self.skip(x)
+        return out
+
+
+class Level(nn.Module):
+    """Two residual blocks at one resolution; arguments as of :class:`ResidualBlock`."""
+
+    def __init__(self, inputs: int, outputs: int, condition_dim: int, film: bool) -> None:
+        super().__init__()
+        self.first = ResidualBlock(inputs, outputs, condition_dim, film)
+        self.second = ResidualBlock(outputs, outputs, condition_dim, film)
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """As of :class:`ResidualBlock`."""
+        out: Tensor = self.second(self.first(x, condition), condition)
+        return out
+
+
+class TemporalUNet(nn.Module):
+    """Estimates noise from the noisy plan, the timestep, the concept and the initial state.
+
+    Args:
+        horizon: states in a plan; a multiple of 2 to the number of levels less one.
+        state_dim: columns of a state.
+        concept_dim: columns of a concept embedding.
+        initial_state_dim: columns of the initial state; 0 where the domain has none.
+        entities: columns of the initial state for each exchangeable entity.
+        width: channels of the first level, and columns of each of the condition's three parts; the paper's size is 128.
+        multipliers: channels of the levels, in widths.
+        initial_encoder: ``'flat'`` (the paper's) or ``'entities'``.
+        film: the condition scales and shifts channels; false for the paper's form, which adds it.
+        broadcast: the initial state's features are also channels of the input at every time; false for the paper's form.
+        clock: channels that tell a state's place in the plan, in addition to the states; even, 0 for the paper's form, whose
+            convolutions see it by the padding at the ends alone.
+
+    Raises:
+        UserError: for a horizon that cannot be halved once a level.
+    """
+
+    clock: Tensor
+
+    def __init__(
+        self,
+        horizon: int,
+        state_dim: int,
+        concept_dim: int,
+        initial_state_dim: int = 0,
+        entities: Sequence[Sequence[int]] = (),
+        width: int = 32,
+        multipliers: Sequence[int] = (1, 2, 4, 8),
+        initial_encoder: str = "flat",
+        film: bool = False,
+        broadcast: bool = False,
+        clock: int = 0,
+    ) -> None:
+        super().__init__()
+        factor = 2 ** (len(multipliers) - 1)
+        if horizon % factor:
+            halvings = len(multipliers) - 1
+            raise UserError(
+                f"horizon: expected a multiple of {factor} (the temporal U-Net halves it {halvings} times), found {horizon}"
+            )
+        if width < GROUPS or width % GROUPS:
+            raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
+        if clock % 2:
+            raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
+        self.width, self.broadcast = width, broadcast and initial_state_dim > 0
+        angle = torch.linspace(0, math.pi, horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
+        self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
+        self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.concept = nn.Sequential(nn.Linear(concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.initial = (
+            initial_state_encoder(initial_encoder, initial_state_dim, entities, concept_dim, width) if initial_state_dim else None
+        )
+        condition = width * (3 if initial_state_dim else 2)
+        channels = [width * multiplier for multiplier in multipliers]
+        self.down = nn.ModuleList(
+            Level(inputs, outputs, condition, film)
+            for inputs, outputs in itertools.pairwise([state_dim + clock + (width if self.broadcast else 0), *channels])
+        )
+        self.shrink = nn.ModuleList(nn.Conv1d(width, width, 3, stride=2, padding=1) for width in channels[:-1])
+        self.middle = Level(channels[-1], channels[-1], condition, film)
+        self.up = nn.ModuleList(
+            Level(2 * inputs, outputs, condition, film) for inputs, outputs in itertools.pairwise(reversed(channels))
+        )
+        self.grow = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, stride=2, padding=1) for width in channels[-2::-1])
+        self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, state_dim, 1))
+
+    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
+        """Estimated noise ``(batch, horizon, state)``.
+
+        Args:
+            x: noisy plan ``(batch, horizon, state)``, normalised.
+            t: ``(batch,)`` int64.
+            concepts: ``(concept, n)``, the different concepts in the batch, in the model's concept space.
+            index: ``(batch,)`` int64, each sample's row of ``concepts``.
+            initial_state: ``(batch, initial state)``, normalised, or ``None``.
+        """
+        parts = [self.time(sinusoidal_embedding(t, self.width)), self.concept(concepts)[index]]
+        if self.initial is not None:
+            assert initial_state is not None
+            parts.append(self.initial(initial_state, concepts[index]))
+        condition = functional.mish(torch.cat(parts, dim=-1))
+        inputs = [x.transpose(1, 2), self.clock.expand(len(x), -1, -1)]
+        if self.broadcast:
+            inputs.append(parts[-1][..., None].expand(-1, -1, x.shape[1]))
+        hidden = torch.cat(inputs, dim=1)
+        kept = []
+        for level, shrink in zip(self.down, [*self.shrink, nn.Identity()], strict=True):
+            kept.append(level(hidden, condition))
+            hidden = shrink(kept[-1])
+        hidden = self.middle(hidden, condition)
+        for level, grow, across in zip(self.up, self.grow, kept[:0:-1], strict=True):
+            hidden = grow(level(torch.cat((hidden, across), dim=1), condition))
+        out: Tensor = self.out(hidden).transpose(1, 2)
+        return out

@@ -1,0 +1,48 @@
+"""Pretraining data of navigation."""
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.datamodule import PretrainingData
+from ftl_lightning.domains.agent.domain import DOMAIN
+
+
+class AgentData(PretrainingData):
+    """The expert's drives of the four training concepts, kept in a cache once they are made (a minute).
+
+    Args:
+        samples_per_concept: drives of each training concept; 225 gives the paper's ~900.
+        validation_per_concept: other drives of each, for the validation loss.
+        seed: decides the drives and the order they are seen in.
+        batch_size: windows a step.
+        steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
+        encoder: ``'table'``, ``'minilm'``, or the name or path of a language model.
+        revision: of a Hugging Face model.
+        horizon: states in a plan; ``None`` for the paper's 128.
+    """
+
+    def __init__(
+        self,
+        samples_per_concept: int = 225,
+        validation_per_concept: int = 15,
+        seed: int = 0,
+        batch_size: int = 64,
+        steps_per_epoch: int = 500,
+        encoder: str = "table",
+        revision: str = "main",
+        horizon: int | None = None,
+    ) -> None:
+        super().__init__(DOMAIN, seed, batch_size, steps_per_epoch, encoder, revision, horizon)
+        self.save_hyperparameters()
+        self.samples_per_concept = samples_per_concept
+        self.validation_per_concept = validation_per_concept
+
+    def training_set(self) -> Demonstrations:
+        """Drives for training."""
+        return DOMAIN.training_set(self.samples_per_concept, self.seed)
+
+    def validation_set(self) -> Demonstrations:
+        """Others, from a seed that no training run uses."""
+        return DOMAIN.training_set(self.validation_per_concept, VALIDATION_SEED + self.seed)
+
+
+VALIDATION_SEED = 1_000_000
+"""Added to the seed of held-out drives."""

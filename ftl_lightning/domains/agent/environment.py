@@ -1,0 +1,212 @@
+"""The physics: a cone that is pushed over a plane with two standing objects, in pybullet, as a gymnasium environment."""
+
+import functools
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pybullet
+from numpy.typing import NDArray
+
+from ftl_lightning.domains.agent.bodies import Mesh, bowl, cone
+from ftl_lightning.domains.agent.scenes import (
+    AGENT_START,
+    COLOURS,
+    HEIGHT,
+    INITIAL,
+    OBJECT_COLUMNS,
+    PLANE,
+    REACH,
+    STATE,
+    Look,
+    check,
+    looks,
+    scenes,
+)
+from ftl_lightning.errors import UserError
+
+STEP = 0.05
+"""Seconds between two states."""
+SUBSTEPS = 6
+MAX_STEPS = 128
+LOOKAHEAD = 5
+"""An action is the way to where a plan is so many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
+DRAG = 16.0
+"""The rate per second at which the agent's speed decays: so fast that pulling towards a point does not overshoot it."""
+MASS = LOOKAHEAD * STEP / DRAG
+"""kg. A plan that moves steadily at speed v is LOOKAHEAD * STEP * v ahead, and drag takes MASS * DRAG * v: with this mass, that
+way in metres, applied as a force in newtons, keeps the agent's speed at the plan's."""
+MAX_FORCE = 0.2
+"""Newtons; a longer force is shortened."""
+RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
+"""Of the bodies' footprints, metres; half the edge of a cube."""
+BOWL_THICKNESS = 0.025
+FLOOR = [2.2, 0.01, 1.1]
+"""Half the size of the floor that is drawn."""
+IMAGE = (200, 320)
+"""Height and width of a rendered picture."""
+
+
+class Simulator:
+    """pybullet's functions, each for one simulator of its own without a display.
+
+    pybullet's own class for that prints a line for every simulator.
+    """
+
+    def __init__(self) -> None:
+        self._id = pybullet.connect(pybullet.DIRECT)
+        if self._id < 0:
+            raise pybullet.error("no connection")
+
+    def __getattr__(self, name: str) -> Any:
+        return functools.partial(getattr(pybullet, name), physicsClientId=self._id)
+
+
+class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One agent and two objects.
+
+    An observation is an initial state (52 numbers, :mod:`ftl_lightning.domains.agent.scenes`). An action is a force in newtons
+    along x and z, held for :data:`STEP` seconds. The agent glides without friction, is slowed by drag, and neither tips nor
+    turns. Reaching an object (centres within :data:`REACH`) terminates an episode, :data:`MAX_STEPS` steps truncate it; the
+    simulation can be stepped on. Every instance has a simulator of its own, without a display.
+
+    Raises:
+        UserError: if the simulator does not start.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP)}  # noqa: RUF012 (gymnasium's)
+    render_mode = "rgb_array"
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)
+    action_space = gymnasium.spaces.Box(-MAX_FORCE, MAX_FORCE, (len(PLANE),), np.float32)
+
+    def __init__(self) -> None:
+        try:
+            self.client = Simulator()
+        except pybullet.error as error:
+            raise UserError(f"agent: the physics simulator does not start ({error}); close some of its instances") from error
+        self._initial = np.zeros(INITIAL, dtype=np.float32)
+        self._agent = -1
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Build a scene.
+
+        Args:
+            seed: of the scene that is drawn if none is given.
+            options: ``initial_state``, 52 numbers; or ``task``, whose scene is drawn (default 'go to red object').
+
+        Raises:
+            UserError: for an initial state of another size, with overlapping bodies, or with numbers that are not finite.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        if (given := options.get("initial_state")) is None:
+            draw = int(self.np_random.integers(2**31))
+            given = scenes(options.get("task", "go to red object"), 1, draw)[0]
+        self._initial = check(np.asarray(given)).copy()
+        self._steps = 0
+        self._build()
+        return self._observation(), {}
+
+    def _build(self) -> None:
+        # From nothing every time: what a simulator did before leaves no trace in what it does next.
+        client = self.client
+        client.resetSimulation()
+        client.setGravity(0, -9.81, 0)
+        client.setPhysicsEngineParameter(fixedTimeStep=STEP / SUBSTEPS, deterministicOverlappingPairs=1)
+        ground = client.createMultiBody(0, client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[0, 1, 0]))
+        client.changeDynamics(ground, -1, lateralFriction=0)
+        floor = client.createVisualShape(pybullet.GEOM_BOX, halfExtents=FLOOR, rgbaColor=[0.93, 0.93, 0.93, 1])
+        client.createMultiBody(0, -1, floor, [AGENT_START[0], -FLOOR[1], AGENT_START[2]])  # planes are not drawn
+        self._agent = self._body(("yellow", "cone"), self._initial[:3], MASS)
+        client.changeDynamics(
+            self._agent,
+            -1,
+            lateralFriction=0,
+            linearDamping=0,  # drag is a force in `step`: the simulator's own cannot be as strong
+            localInertiaDiagonal=[0, 0, 0],  # a force through the centre of a body without inertia cannot turn it
+            activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+        )
+        client.resetBasePositionAndOrientation(self._agent, self._initial[:3].tolist(), self._initial[3:7].tolist())
+        client.resetBaseVelocity(self._agent, self._initial[7:10].tolist(), self._initial[10:13].tolist())
+        for look, columns in zip(looks(self._initial), OBJECT_COLUMNS, strict=True):
+            self._body(look, self._initial[columns][:3], 0)
+
+    def _body(self, look: Look, position: NDArray[np.float32], mass: float) -> int:
+        """Create a body; without mass it stands where it is."""
+        client, (colour, shape) = self.client, look
+        rgba = [*(value / 255 for value in COLOURS[colour]), 1.0]
+        if shape == "sphere":
+            form: dict[str, Any] = {"shapeType": pybullet.GEOM_SPHERE, "radius": RADIUS[shape]}
+            seen = form
+        elif shape == "cube":
+            form = {"shapeType": pybullet.GEOM_BOX, "halfExtents": [RADIUS[shape]] * 3}
+            seen = form
+        else:
+            vertices, triangles = _MESHES[shape]
+            form = {"shapeType": pybullet.GEOM_MESH, "vertices": vertices}
+            if shape == "bowl":  # with its triangles it stays concave; without, pybullet takes the convex hull
+                form |= {"indices": triangles, "flags": pybullet.GEOM_FORCE_CONCAVE_TRIMESH}
+            seen = {"shapeType": pybullet.GEOM_MESH, "vertices": vertices, "indices": triangles}
+        body: int = client.createMultiBody(
+            baseMass=mass,
+            baseCollisionShapeIndex=client.createCollisionShape(**form),
+            baseVisualShapeIndex=client.createVisualShape(**seen, rgbaColor=rgba),
+            basePosition=position.tolist(),
+        )
+        client.changeDynamics(body, -1, lateralFriction=0)
+        return body
+
+    def _observation(self) -> NDArray[np.float32]:
+        place, turn = self.client.getBasePositionAndOrientation(self._agent)
+        velocity, spin = self.client.getBaseVelocity(self._agent)
+        observation = self._initial.copy()
+        observation[:STATE] = (*place, *turn, *velocity, *spin)
+        return observation
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Push for :data:`STEP` seconds. The reward is 0: what is right depends on the task, which physics does not know.
+
+        Raises:
+            UserError: for an action of another size, or with numbers that are not finite.
+        """
+        force = np.asarray(action, dtype=np.float64)
+        if force.shape != (len(PLANE),) or not np.isfinite(force).all():
+            raise UserError(f"agent action: expected {len(PLANE)} finite numbers, found {force.tolist()}")
+        force = force * min(1.0, MAX_FORCE / max(float(np.linalg.norm(force)), 1e-12))
+        for _ in range(SUBSTEPS):  # pybullet forgets a force after each of its steps
+            here = self.client.getBasePositionAndOrientation(self._agent)[0]
+            velocity = self.client.getBaseVelocity(self._agent)[0]
+            drag = MASS * DRAG
+            net = [force[0] - drag * velocity[0], 0, force[1] - drag * velocity[2]]
+            self.client.applyExternalForce(self._agent, -1, net, here, pybullet.WORLD_FRAME)
+            self.client.stepSimulation()
+        self._steps += 1
+        observation = self._observation()
+        objects = np.stack([observation[columns][:3] for columns in OBJECT_COLUMNS])
+        reached = bool((np.linalg.norm(objects - observation[:3], axis=-1) < REACH).any())
+        return observation, 0.0, reached, self._steps >= MAX_STEPS, {}
+
+    def render(self) -> NDArray[np.uint8]:
+        """A picture ``(height, width, 3)`` by pybullet's software renderer."""
+        height, width = IMAGE
+        view = self.client.computeViewMatrix([0, 2.6, -6.2], [AGENT_START[0], 0, AGENT_START[2]], [0, 1, 0])
+        lens = self.client.computeProjectionMatrixFOV(38, width / height, 0.1, 20)
+        _, _, rgba, *_ = self.client.getCameraImage(
+            width, height, view, lens, lightDirection=[1, 4, -2], shadow=1, renderer=pybullet.ER_TINY_RENDERER
+        )
+        picture: NDArray[np.uint8] = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+        return picture[:, ::-1]  # with x right, y up and z forward our axes are left-handed, the simulator's are right-handed
+
+    def close(self) -> None:
+        """Stop the simulator."""
+        if self.client.isConnected():
+            self.client.disconnect()
+
+
+_MESHES: dict[str, Mesh] = {
+    "cone": cone(RADIUS["cone"], HEIGHT),
+    "bowl": bowl(RADIUS["bowl"], HEIGHT, BOWL_THICKNESS),
+}

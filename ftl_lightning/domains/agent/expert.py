@@ -1,0 +1,98 @@
+"""The expert: drives to the target through the same physics and keeps clear of the distractor."""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.domains.agent.environment import LOOKAHEAD, STEP, AgentEnvironment
+from ftl_lightning.domains.agent.scenes import INITIAL, PLANE, object_positions, scenes, target
+
+LENGTH = 150
+"""States of a demonstration, padded with its last one (paper)."""
+SPEED = 0.4
+"""m/s of the expert's reference point along its route."""
+KEEP_CLEAR = 0.5
+"""The route keeps at least so far from the distractor's centre, metres."""
+STOP = 0.26
+"""The route ends so far before the target's centre, metres: just before the bodies touch."""
+AT_REST = 0.02
+"""m/s below which the agent has stopped."""
+
+Plane = NDArray[np.float64]
+
+
+def route(start: Plane, target: Plane, distractor: Plane) -> Plane:
+    """Corners ``(2 or 3, 2)`` of the way from the start to just before the target, in x and z."""
+    way = target - start
+    end = target - STOP * way / np.linalg.norm(way)
+    share = np.clip((distractor - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    nearest = start + share * (end - start)
+    gap = nearest - distractor
+    if np.linalg.norm(gap) >= KEEP_CLEAR:
+        return np.stack((start, end))
+    # Around it on the side on which the straight line passes it.
+    detour = distractor + 1.1 * KEEP_CLEAR * gap / np.linalg.norm(gap)
+    last = target - detour
+    return np.stack((start, detour, target - STOP * last / np.linalg.norm(last)))
+
+
+def along(corners: Plane, distance: float) -> Plane:
+    """The point ``(2,)`` so many metres along a polyline; its end beyond that."""
+    for here, there in itertools.pairwise(corners):
+        length = float(np.linalg.norm(there - here))
+        if distance <= length:
+            return np.asarray(here + (there - here) * distance / length)
+        distance -= length
+    return np.asarray(corners[-1])
+
+
+def demonstrate(environment: AgentEnvironment, initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
+    """Observations ``(time, 52)`` of one drive, ``time`` at most :data:`LENGTH`.
+
+    Args:
+        environment: any; it is reset.
+        initial: ``(52,)``.
+        chosen: 0 or 1, the object to drive to.
+    """
+    objects = object_positions(torch.from_numpy(initial)[None])[0].double().numpy()[:, PLANE]
+    place = initial[list(PLANE)].astype(np.float64)
+    corners = route(place, objects[chosen], objects[1 - chosen])
+    observation, _ = environment.reset(options={"initial_state": initial})
+    seen = [observation]
+    for step in range(LENGTH - 1):
+        ahead = along(corners, (step + LOOKAHEAD) * STEP * SPEED)
+        observation, *_ = environment.step((ahead - observation[list(PLANE)]).astype(np.float32))
+        seen.append(observation)
+        near = np.linalg.norm(corners[-1] - observation[list(PLANE)]) < 0.02
+        if near and np.linalg.norm(observation[7:10]) < AT_REST:
+            break
+    return np.stack(seen)
+
+
+def demonstrations(task: str, count: int, seed: int, progress: Callable[[], None]) -> tuple[Tensor, Tensor]:
+    """Drives of a task.
+
+    Args:
+        task: see :func:`~ftl_lightning.domains.agent.scenes.parse`.
+        count, seed: of its scenes.
+        progress: called after each.
+
+    Returns:
+        Observations ``(count, 150, 52)``, padded with the last one, and lengths ``(count,)``.
+    """
+    initial = scenes(task, count, seed)
+    observations = torch.empty(count, LENGTH, INITIAL)
+    lengths = torch.empty(count, dtype=torch.int64)
+    environment = AgentEnvironment()
+    for row, (state, chosen) in enumerate(zip(initial.numpy(), target(task, initial).tolist(), strict=True)):
+        seen = torch.from_numpy(demonstrate(environment, state, chosen))
+        observations[row, : len(seen)] = seen
+        observations[row, len(seen) :] = seen[-1]
+        lengths[row] = len(seen)
+        progress()
+    environment.close()
+    return observations, lengths

@@ -1,0 +1,69 @@
+"""Pictures: plans drawn over their scenes from above, and frames of episodes from the simulator's own renderer."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.domains.agent.environment import AgentEnvironment
+from ftl_lightning.domains.agent.scenes import COLOURS, PLANE, REACH, looks, object_positions
+
+MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
+"""A bowl is an open triangle that points down."""
+MAX_COLUMNS = 4
+EVERY = 4
+"""Steps between two frames."""
+
+
+def render(states: Tensor, right: Sequence[bool] | None, title: str, initial_states: Tensor | None) -> Figure:
+    """A grid of scenes from above with the agent's way.
+
+    Args:
+        states: plans ``(scene, horizon, 13)``.
+        right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
+        title: above the grid.
+        initial_states: ``(scene, 52)``.
+    """
+    assert initial_states is not None
+    columns = min(len(states), MAX_COLUMNS)
+    rows = -(-len(states) // columns)
+    figure = Figure(figsize=(2.6 * columns, 1.3 * rows + 0.4), layout="constrained")
+    figure.suptitle(title, fontsize=9)
+    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
+    grid = figure.subplots(rows, columns, squeeze=False).flat
+    for axes, plan, initial, frame in zip(grid, states, initial_states, frames, strict=False):
+        _scene(axes, plan, initial, frame)
+    for axes in figure.axes[len(states) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
+    places = object_positions(initial[None])[0][:, list(PLANE)].tolist()
+    for (colour, shape), (x, z) in zip(looks(initial.tolist()), places, strict=True):
+        shade = [value / 255 for value in COLOURS[colour]]
+        axes.plot(x, z, MARKERS[shape], color=shade, fillstyle="none" if shape == "bowl" else "full", markersize=9, mew=2)
+        angle = np.linspace(0, 2 * np.pi, 48)
+        axes.plot(x + REACH * np.cos(angle), z + REACH * np.sin(angle), color="#c0c0c0", linewidth=0.6)
+    x, z = plan[:, list(PLANE)].T.tolist()
+    axes.plot(x, z, color="#303030", linewidth=1)
+    axes.plot(initial[0].item(), initial[2].item(), "^", color="#c79a2b", markersize=7)
+    axes.set(xlim=(-2.1, 2.1), ylim=(-4.8, -2.8), xticks=[], yticks=[], aspect="equal")
+    for spine in axes.spines.values():
+        spine.set(color=frame, linewidth=2.0)
+
+
+def frames(observations: Tensor) -> list[NDArray[np.uint8]]:
+    """Pictures ``(height, width, 3)`` of an episode ``(time, 52)``, every :data:`EVERY` steps, until nothing moves any more."""
+    moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
+    end = int(moving.nonzero().max()) + 2 if moving.any() else 1
+    environment = AgentEnvironment()
+    pictures = []
+    for observation in observations[:end:EVERY]:
+        environment.reset(options={"initial_state": observation.numpy()})
+        pictures.append(environment.render())
+    environment.close()
+    return pictures

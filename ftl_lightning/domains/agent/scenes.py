@@ -1,0 +1,218 @@
+"""Scenes: what an object is, how a goal reads, which pairs of objects a task shows, and the layout of an initial state.
+
+Axes: x right, y up, z forward; metres. The agent starts at :data:`AGENT_START`; object 1 stands to its right, object 2 to its left.
+"""
+
+import itertools
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.errors import UserError
+
+COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
+"""The paper's colours, 0 to 255."""
+SHAPES = ("cone", "sphere", "bowl", "cube")
+TYPES = ("agent", "object 1", "object 2")
+
+HEIGHT = 0.102
+"""Of every centre above the ground, and half the height of every body."""
+AGENT_START = (0.0, HEIGHT, -3.806)
+OBJECT_X, OBJECT_Z = (0.0, 1.66), (-4.355, -3.257)
+"""Where object 1 stands; object 2 stands in the mirror image."""
+REACH = 0.365
+"""A centre within this distance of another has reached it (paper)."""
+AGENT_CLEARANCE, OBJECT_CLEARANCE = 0.55, 0.8
+"""Least distance between centres in a drawn scene: nothing touches, and reaching one object is not reaching the other."""
+LEAST_DISTANCE = 0.2
+"""Least distance between centres in any scene; nearer bodies would overlap."""
+
+STATE = 13
+"""Columns of the agent's state: position 3, quaternion (x, y, z, w) 4, velocity 3, angular velocity 3."""
+_TAIL = len(TYPES) + 4 + len(SHAPES)
+_OBJECT = 3 + _TAIL
+INITIAL = STATE + _TAIL + 2 * _OBJECT
+"""52 columns of an initial state: the agent's state, type, rgba and shape, and for each object position, type, rgba and shape."""
+OBJECT_COLUMNS = tuple(slice(start, start + _OBJECT) for start in range(STATE + _TAIL, INITIAL, _OBJECT))
+PLANE = (0, 2)
+"""x and z within a position."""
+
+TRAINING_GROUPS = (
+    tuple(itertools.product(("red", "yellow"), ("cone", "sphere"))),
+    tuple(itertools.product(("purple", "green"), ("bowl", "cube"))),
+)
+"""Looks (colour, shape) of the objects of pretraining; the two objects of a training scene are of one group (paper)."""
+_TRAINING_LOOKS = tuple(itertools.chain(*TRAINING_GROUPS))
+
+Look = tuple[str, str]
+"""Colour and shape."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The look of the target; ``None`` for any.
+
+    Attributes:
+        colour: a key of :data:`COLOURS`.
+        shape: one of :data:`SHAPES`.
+    """
+
+    colour: str | None
+    shape: str | None
+
+    def matches(self, look: Look) -> bool:
+        """Whether an object of this look is a target."""
+        return self.colour in (None, look[0]) and self.shape in (None, look[1])
+
+
+_GRAMMAR = re.compile(rf"go to (?:({'|'.join(COLOURS)}) )?(object|{'|'.join(SHAPES)})")
+
+
+def parse(task: str) -> Goal:
+    """Read 'go to red object', 'go to bowl' or 'go to red bowl'.
+
+    Raises:
+        UserError: for anything else.
+    """
+    found = _GRAMMAR.fullmatch(task)
+    if not found or found.groups() == (None, "object"):
+        raise UserError(
+            f"agent task: expected 'go to [{'|'.join(COLOURS)}] [object|{'|'.join(SHAPES)}]' with a colour, a shape or both, "
+            f"found {task!r}"
+        )
+    colour, shape = found.groups()
+    return Goal(colour, None if shape == "object" else shape)
+
+
+def pairs(goal: Goal) -> list[tuple[Look, Look]]:
+    """The looks of target and distractor that a task shows (paper, appendix on data).
+
+    A goal of one attribute shows both objects from one group of pretraining. The target of a goal of two attributes meets
+    distractors from pretraining that share one of its attributes.
+    """
+    if goal.colour and goal.shape:
+        target = (goal.colour, goal.shape)
+        return [(target, look) for look in _TRAINING_LOOKS if look != target and (look[0] == target[0] or look[1] == target[1])]
+    return [
+        (target, distractor)
+        for group in TRAINING_GROUPS
+        for target, distractor in itertools.permutations(group, 2)
+        if goal.matches(target) and not goal.matches(distractor)
+    ]
+
+
+def scenes(task: str, count: int, seed: int) -> Tensor:
+    """Draw initial states of a task, its pairs of looks equally often, the target on either side.
+
+    Args:
+        task: see :func:`parse`.
+        count: number of scenes.
+        seed: the same task and seed give the same bytes, whatever else is drawn.
+
+    Returns:
+        ``(count, 52)`` float32.
+    """
+    goal = parse(task)
+    # Two streams, so that fewer scenes of the same seed are the first of more.
+    order, place = (np.random.default_rng([seed, zlib.crc32(task.encode()), stream]) for stream in range(2))
+    looks: list[tuple[Look, Look]] = []
+    while len(looks) < count:
+        both_sides = [pair[::side] for pair in pairs(goal) for side in (1, -1)]
+        looks += [both_sides[index] for index in order.permutation(len(both_sides))]
+    drawn = [initial_state(pair, _positions(place)) for pair in looks[:count]]
+    return torch.from_numpy(np.stack(drawn))
+
+
+def _positions(rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Places ``(x, z)`` of both objects, uniform where they keep clear of each other and of the agent."""
+    agent = np.array([AGENT_START[0], AGENT_START[2]])
+    while True:
+        place = np.stack((rng.uniform(*OBJECT_X, 2) * (1, -1), rng.uniform(*OBJECT_Z, 2)), axis=-1)
+        to_agent = np.linalg.norm(place - agent, axis=-1).min()
+        if to_agent >= AGENT_CLEARANCE and np.linalg.norm(place[0] - place[1]) >= OBJECT_CLEARANCE:
+            return [(float(x), float(z)) for x, z in place]
+
+
+def initial_state(looks: Sequence[Look], positions: Sequence[tuple[float, float]]) -> NDArray[np.float32]:
+    """The 52 numbers of a scene with a resting agent.
+
+    Args:
+        looks: of object 1 and 2.
+        positions: their ``(x, z)``.
+    """
+    state = np.zeros(INITIAL, dtype=np.float32)
+    state[:3] = AGENT_START
+    state[6] = 1  # no rotation
+    state[STATE : STATE + _TAIL] = _tail(0, ("yellow", "cone"))
+    for number, (look, (x, z)) in enumerate(zip(looks, positions, strict=True)):
+        state[OBJECT_COLUMNS[number]] = (x, HEIGHT, z, *_tail(1 + number, look))
+    return state
+
+
+def _tail(kind: int, look: Look) -> list[float]:
+    """One-hot type, rgba and one-hot shape."""
+    colour, shape = look
+    rgba = [*(value / 255 for value in COLOURS[colour]), 1.0]
+    return [*(float(kind == other) for other in range(len(TYPES))), *rgba, *(float(shape == other) for other in SHAPES)]
+
+
+def looks(initial: Sequence[float] | NDArray[np.float32]) -> list[Look]:
+    """Colour and shape of both objects of an initial state."""
+    values = np.asarray(initial, dtype=np.float32)
+    found = []
+    for columns in OBJECT_COLUMNS:
+        tail = values[columns][3:]
+        rgb = tail[len(TYPES) : len(TYPES) + 3] * 255
+        colour = min(COLOURS, key=lambda name: float(np.abs(rgb - COLOURS[name]).sum()))
+        found.append((colour, SHAPES[int(tail[-len(SHAPES) :].argmax())]))
+    return found
+
+
+def target(task: str, initial_states: Tensor) -> Tensor:
+    """Which object is the target, ``(scene,)`` int64 0 or 1.
+
+    Args:
+        task: see :func:`parse`.
+        initial_states: ``(scene, 52)``.
+
+    Raises:
+        UserError: if a scene does not hold exactly one target.
+    """
+    goal = parse(task)
+    found = []
+    for row, state in enumerate(initial_states.tolist()):
+        matching = [index for index, look in enumerate(looks(state)) if goal.matches(look)]
+        if len(matching) != 1:
+            both = " and ".join(" ".join(look) for look in looks(state))
+            raise UserError(f"agent task {task!r}: expected one target in initial state {row}, found {len(matching)} ({both})")
+        found.append(matching[0])
+    return torch.tensor(found)
+
+
+def object_positions(initial_states: Tensor) -> Tensor:
+    """``(scene, 2 objects, 3)`` of initial states ``(scene, 52)``."""
+    return torch.stack([initial_states[:, columns][:, :3] for columns in OBJECT_COLUMNS], dim=1)
+
+
+def check(initial: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
+    """An initial state as an array, checked.
+
+    Raises:
+        UserError: for another size, numbers that are not finite, or bodies that overlap.
+    """
+    state = np.asarray(initial, dtype=np.float32)
+    if state.shape != (INITIAL,):
+        raise UserError(f"initial state: expected {INITIAL} numbers, found shape {state.shape}")
+    if not np.isfinite(state).all():
+        raise UserError("initial state: expected finite numbers, found others")
+    centres = {"the agent": state[:3]} | {f"object {1 + i}": state[columns][:3] for i, columns in enumerate(OBJECT_COLUMNS)}
+    for (a, first), (b, second) in itertools.combinations(centres.items(), 2):
+        if (distance := float(np.linalg.norm(first - second))) < LEAST_DISTANCE:
+            raise UserError(f"initial state: {a} and {b} overlap: expected centres {LEAST_DISTANCE} m apart, found {distance:.3f}")
+    return state

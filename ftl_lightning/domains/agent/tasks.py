@@ -1,0 +1,46 @@
+"""The paper's settings for navigation, as data, and the validation suite on which everything is tuned."""
+
+from collections.abc import Sequence
+
+from ftl_lightning.domains.agent.scenes import parse
+from ftl_lightning.domains.domain import EvaluationTask, Suite
+
+TRAINING_CONCEPTS = ("go to red object", "go to yellow object", "go to bowl", "go to cube")
+COMPOSITIONS = ("go to red bowl", "go to yellow bowl", "go to red cube", "go to yellow cube", "go to purple cone")
+
+TRAINING = Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in TRAINING_CONCEPTS))
+
+
+def _suite(learned: Sequence[str]) -> Suite:
+    return Suite(
+        tuple(EvaluationTask("training composition", task, learned=task, initial="demonstrated") for task in learned)
+        + tuple(EvaluationTask("new initial state", task, learned=task) for task in learned)
+    )
+
+
+PAPER = _suite(COMPOSITIONS)
+
+VALIDATION = _suite(
+    ("go to green cone", "go to purple sphere", "go to green sphere", "go to red cone", "go to yellow sphere", "go to purple bowl")
+)
+"""Other targets by the paper's rule of distractors: three whose colour was never with their shape in pretraining (as in the paper's
+tasks), three that were, with one distractor they met in pretraining and two they did not."""
+
+
+def _parts(task: str) -> tuple[str, str]:
+    """The two concepts that a composition is made of, as the paper's analysis names them."""
+    goal = parse(task)
+    return f"go to {goal.colour} object", f"go to {goal.shape}"
+
+
+COMPONENTS = Suite(
+    tuple(
+        EvaluationTask(f"component {component}", part, learned=task, component=component)
+        for task in COMPOSITIONS
+        for part in _parts(task)
+        for component in (1, 2)
+    )
+)
+"""What each of two learned components generates alone (paper, table 'Analysis of learned concepts')."""
+
+SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION}

@@ -1,0 +1,121 @@
+"""The temporal U-Net and the encoders of the initial state."""
+
+import pytest
+import torch
+
+from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet
+from ftl_lightning.diffusion.initial_state import EntityEncoder
+from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
+from ftl_lightning.diffusion.schedule import add_noise, cosine_alpha_bar
+from ftl_lightning.errors import UserError
+
+ENTITIES = ((4, 5), (7, 8))
+"""Columns of two entities among ten; 6 and 9 tell which is which and are constant in use."""
+
+
+def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
+    draw = torch.Generator().manual_seed(0)
+    x = torch.randn(batch, horizon, 5, generator=draw)
+    initial = torch.randn(batch, 10, generator=draw)
+    initial[:, [6, 9]] = 0
+    t, index = torch.arange(batch), torch.tensor([0, 1, 0])[:batch]
+    return x, t, torch.randn(2, 7, generator=draw), index, initial
+
+
+def unet(**options: object) -> TemporalUNet:
+    torch.manual_seed(0)
+    return TemporalUNet(16, 5, 7, 10, ENTITIES, width=8, **options).eval()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"initial_encoder": "flat"}, {"initial_encoder": "entities"}, {"film": True}, {"clock": 4, "broadcast": True}],
+    ids=str,
+)
+def test_shape_and_every_part_of_the_condition_matters(options: dict[str, object]) -> None:
+    net = unet(**options)
+    x, t, concepts, index, initial = inputs()
+    out = net(x, t, concepts, index, initial)
+    assert out.shape == x.shape
+    for changed in (
+        net(x + 1, t, concepts, index, initial),
+        net(x, t + 50, concepts, index, initial),
+        net(x, t, concepts + 1, index, initial),
+        net(x, t, concepts, 1 - index, initial),
+        net(x, t, concepts, index, initial + 1),
+    ):
+        assert not torch.allclose(out, changed, atol=1e-5)
+
+
+def test_samples_do_not_see_each_other() -> None:
+    net = unet()
+    x, t, concepts, index, initial = inputs()
+    whole = net(x, t, concepts, index, initial)
+    alone = net(x[1:2], t[1:2], concepts, index[1:2], initial[1:2])
+    torch.testing.assert_close(whole[1:2], alone)
+
+
+def test_exchanging_entities_changes_nothing_unless_the_encoder_is_flat() -> None:
+    x, t, concepts, index, initial = inputs()
+    swapped = initial.clone()
+    swapped[:, [4, 5, 7, 8]] = initial[:, [7, 8, 4, 5]]
+    for encoder, same in (("entities", True), ("flat", False)):
+        net = unet(initial_encoder=encoder)
+        out = net(x, t, concepts, index, initial)
+        assert torch.allclose(out, net(x, t, concepts, index, swapped), atol=1e-6) == same
+    mlp = MLPDenoiser(16, 5, 7, 10, ENTITIES, initial_encoder="entities")
+    torch.testing.assert_close(mlp(x, t, concepts, index, initial), mlp(x, t, concepts, index, swapped))
+
+
+def test_a_gradient_reaches_the_concept_through_the_attention_alone() -> None:
+    encoder = EntityEncoder(10, ENTITIES, 7, 8)
+    concept = torch.randn(3, 7, requires_grad=True)
+    encoder(inputs()[-1], concept).sum().backward()
+    assert concept.grad is not None
+    assert concept.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"horizon": 12}, "horizon: expected a multiple of 8"),
+        ({"width": 12}, "width: expected a multiple of 8"),
+        ({"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities"),
+        ({"initial_encoder": "entities", "entities": ()}, "expected flat"),
+    ],
+)
+def test_sizes_that_do_not_fit(options: dict[str, object], expected: str) -> None:
+    with pytest.raises(UserError, match=expected):
+        TemporalUNet(**{"horizon": 16, "state_dim": 5, "concept_dim": 7, "initial_state_dim": 10} | options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["v", "clean"])
+def test_what_the_network_puts_out_is_turned_into_noise(kind: str) -> None:
+    alpha_bar = cosine_alpha_bar(100)
+    clean, noise, t = torch.randn(4, 16, 5), torch.randn(4, 16, 5), torch.tensor([0, 30, 70, 95])
+    signal, spread = alpha_bar[t].sqrt()[:, None, None], (1 - alpha_bar[t]).sqrt()[:, None, None]
+    net = torch.nn.Module()
+    net.forward = lambda *_: clean if kind == "clean" else signal * noise - spread * clean  # type: ignore[assignment]
+    found = Prediction(net, kind, 100)(add_noise(clean, noise, alpha_bar[t]), t, None, None)  # type: ignore[arg-type]
+    torch.testing.assert_close(found, noise, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", PREDICTIONS)
+def test_loss_weights_turn_the_error_of_the_noise_into_that_of_the_kind(kind: str) -> None:
+    alpha_bar = cosine_alpha_bar(100)[[5, 40, 90]].double()
+    clean, guess, noise = torch.randn(3, 3, 4, dtype=torch.float64)
+    signal, spread = alpha_bar.sqrt()[:, None], (1 - alpha_bar).sqrt()[:, None]
+    x = signal * clean + spread * noise
+    other = (x - signal * guess) / spread  # the noise that another clean plan would imply
+    error = {
+        "epsilon": other - noise,
+        "v": (signal * other - spread * guess) - (signal * noise - spread * clean),
+        "clean": guess - clean,
+    }[kind]
+    weighted = (other - noise).square() * loss_weights(kind, alpha_bar)[:, None]
+    torch.testing.assert_close(weighted, error.square())
+
+
+def test_an_unknown_prediction_is_refused() -> None:
+    with pytest.raises(UserError, match="expected one of epsilon, v, clean"):
+        loss_weights("x", torch.ones(1))

@@ -1,0 +1,314 @@
+"""Navigation: scenes, physics, expert, metrics."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.domains.agent import expert
+from ftl_lightning.domains.agent.bodies import bowl, cone
+from ftl_lightning.domains.agent.domain import DOMAIN, act
+from ftl_lightning.domains.agent.environment import MAX_FORCE, MAX_STEPS, STEP, AgentEnvironment
+from ftl_lightning.domains.agent.metrics import progressed, reached
+from ftl_lightning.domains.agent.scenes import (
+    AGENT_CLEARANCE,
+    COLOURS,
+    OBJECT_CLEARANCE,
+    REACH,
+    SHAPES,
+    initial_state,
+    looks,
+    object_positions,
+    pairs,
+    parse,
+    scenes,
+    target,
+)
+from ftl_lightning.domains.agent.tasks import COMPOSITIONS, TRAINING_CONCEPTS
+from ftl_lightning.errors import UserError
+
+
+def scene(right: tuple[float, float] = (1.0, -3.8), left: tuple[float, float] = (-1.0, -3.8)) -> Tensor:
+    """A red bowl to the right, a red sphere to the left."""
+    return torch.from_numpy(initial_state([("red", "bowl"), ("red", "sphere")], [right, left]))[None]
+
+
+# Scenes
+
+
+def test_the_grammar() -> None:
+    assert parse("go to red object").colour == "red"
+    assert parse("go to red object").shape is None
+    assert parse("go to bowl").shape == "bowl"
+    for wrong in ("go to object", "go to blue bowl", "go to bowl red", "red bowl", ""):
+        with pytest.raises(UserError, match="expected 'go to"):
+            parse(wrong)
+
+
+@pytest.mark.parametrize(
+    ("task", "distractors"),
+    [
+        ("go to red bowl", {("red", "cone"), ("red", "sphere"), ("purple", "bowl"), ("green", "bowl")}),
+        ("go to yellow cube", {("yellow", "cone"), ("yellow", "sphere"), ("purple", "cube"), ("green", "cube")}),
+        ("go to purple cone", {("purple", "bowl"), ("purple", "cube"), ("red", "cone"), ("yellow", "cone")}),
+    ],
+)
+def test_distractors_of_the_papers_tasks(task: str, distractors: set[tuple[str, str]]) -> None:
+    assert {distractor for _, distractor in pairs(parse(task))} == distractors
+
+
+def test_pretraining_has_sixteen_pairs_and_none_of_the_papers_targets() -> None:
+    found = [pair for task in TRAINING_CONCEPTS for pair in pairs(parse(task))]
+    assert len(set(found)) == 16
+    seen = {look for pair in found for look in pair}
+    assert {colour for colour, _ in seen} == set(COLOURS)
+    assert {shape for _, shape in seen} == set(SHAPES)
+    assert not seen & {(parse(task).colour, parse(task).shape) for task in COMPOSITIONS}
+
+
+@pytest.mark.parametrize("task", ["go to bowl", "go to purple cone"])
+def test_scenes(task: str) -> None:
+    drawn = scenes(task, 200, 0)
+    assert drawn.shape == (200, 52)
+    assert drawn.dtype == torch.float32
+    places = object_positions(drawn)
+    assert (places[:, 0, 0] >= 0).all()
+    assert (places[:, 1, 0] <= 0).all()
+    assert (places.abs()[..., 0] <= 1.66).all()
+    assert ((places[..., 2] >= -4.355) & (places[..., 2] <= -3.257)).all()
+    assert torch.linalg.vector_norm(places[:, 0] - places[:, 1], dim=-1).min() >= OBJECT_CLEARANCE
+    assert torch.linalg.vector_norm(places - drawn[:, None, :3], dim=-1).min() >= AGENT_CLEARANCE - 1e-6
+    chosen = target(task, drawn)
+    assert 80 <= chosen.sum() <= 120
+    counts = [sum(tuple(looks(row.tolist())) in (pair, pair[::-1]) for row in drawn) for pair in pairs(parse(task))]
+    assert counts == [50] * 4
+    assert torch.equal(drawn, scenes(task, 200, 0))
+    assert torch.equal(drawn[:5], scenes(task, 5, 0))
+    assert not torch.equal(drawn, scenes(task, 200, 1))
+
+
+def test_a_scene_without_one_target_is_refused() -> None:
+    with pytest.raises(UserError, match="expected one target in initial state 0, found 2"):
+        target("go to red object", scene())
+    with pytest.raises(UserError, match="found 0"):
+        target("go to green cone", scene())
+
+
+# Physics
+
+
+@pytest.mark.parametrize("mesh", [cone(0.1, 0.1), bowl(0.13, 0.1, 0.025)])
+def test_bodies_are_closed_and_wound_outwards(mesh: tuple[list[list[float]], list[int]]) -> None:
+    points = np.array(mesh[0])[np.array(mesh[1]).reshape(-1, 3)]
+    volume = np.einsum("ij,ij->i", points[:, 0], np.cross(points[:, 1], points[:, 2])).sum() / 6
+    assert 0 < volume < 0.3 * 0.3 * 0.2
+    assert np.abs(points[..., 1]).max() == pytest.approx(0.1)
+
+
+def test_a_bowl_is_concave() -> None:
+    environment = AgentEnvironment()
+    environment.reset(options={"initial_state": scene()[0].numpy()})
+    hit = environment.client.rayTest([1.0, 1.0, -3.8], [1.0, 0.0, -3.8])[0]
+    environment.close()
+    assert hit[3][1] < 0.1  # a ray from above ends at the bottom of the bowl, not at its rim
+
+
+def run(environment: AgentEnvironment, actions: list[tuple[float, float]]) -> np.ndarray:
+    seen = [environment.reset(options={"initial_state": scene()[0].numpy()})[0]]
+    seen += [environment.step(np.array(action, dtype=np.float32))[0] for action in actions]
+    return np.stack(seen)
+
+
+def test_forces_move_the_agent_and_nothing_else() -> None:
+    environment = AgentEnvironment()
+    still, pushed = run(environment, [(0, 0)] * 10), run(environment, [(0.1, 0.05)] * 10)
+    assert np.abs(still[-1, :3] - still[0, :3]).max() < 2e-3
+    assert pushed[-1, 0] > 0.1
+    assert pushed[-1, 2] - pushed[0, 2] == pytest.approx(pushed[-1, 0] / 2, rel=1e-3)
+    assert np.abs(pushed[:, 3:7] - [0, 0, 0, 1]).max() < 1e-6
+    assert (pushed[:, 13:] == pushed[0, 13:]).all()
+    # A force in newtons that equals the way in metres LOOKAHEAD steps ahead holds a steady speed.
+    assert pushed[-1, 7] == pytest.approx(0.1 / (expert.LOOKAHEAD * STEP), rel=0.05)
+    strong, limited = run(environment, [(5, 0)] * 3), run(environment, [(MAX_FORCE, 0)] * 3)
+    assert strong[-1, 0] == pytest.approx(limited[-1, 0])
+    environment.close()
+
+
+def test_bodies_are_solid() -> None:
+    environment = AgentEnvironment()
+    seen = run(environment, [(MAX_FORCE, 0)] * 80)
+    environment.close()
+    assert 0.15 < np.linalg.norm(seen[:, [0, 2]] - [1.0, -3.8], axis=-1).min() < 0.3  # it slides along the bowl, around it
+
+
+def test_determinism_within_and_between_instances() -> None:
+    first, second = AgentEnvironment(), AgentEnvironment()
+    rng = np.random.default_rng(0)
+    actions = [tuple(action) for action in rng.uniform(-0.2, 0.2, (30, 2))]
+    once = run(first, actions)
+    run(second, [(0.2, 0.0)] * 50)
+    assert np.array_equal(once, run(second, actions))
+    assert np.array_equal(once, run(first, actions))
+    assert np.array_equal(first.reset(seed=3)[0], second.reset(seed=3)[0])
+    first.close()
+    second.close()
+
+
+def test_an_episode_ends_at_an_object_or_after_its_steps() -> None:
+    environment = AgentEnvironment()
+    environment.reset(options={"initial_state": scene()[0].numpy()})
+    for _ in range(60):
+        observation, _, terminated, truncated, _ = environment.step(np.array([0.1, 0.0], dtype=np.float32))
+        if terminated:
+            break
+    assert terminated
+    assert not truncated
+    assert 1.0 - observation[0] < REACH
+    environment.reset(options={"initial_state": scene()[0].numpy()})
+    ends = [environment.step(np.zeros(2, dtype=np.float32))[2:4] for _ in range(MAX_STEPS)]
+    assert ends == [(False, False)] * (MAX_STEPS - 1) + [(False, True)]
+    environment.close()
+
+
+def test_a_picture_shows_the_scene() -> None:
+    environment = AgentEnvironment()
+    environment.reset(options={"initial_state": scene()[0].numpy()})
+    picture = environment.render().astype(int)
+    environment.close()
+    red = (picture[..., 0] > 1.5 * picture[..., 1]) & (picture[..., 0] > 100)
+    assert red[:, : picture.shape[1] // 2].sum() > 50
+    assert red[:, picture.shape[1] // 2 :].sum() > 50
+
+
+@pytest.mark.parametrize(
+    ("initial", "expected"),
+    [
+        (np.zeros(51), "expected 52 numbers"),
+        (scene((0.1, -3.8))[0].numpy(), "the agent and object 1 overlap"),
+        (np.full(52, np.nan), "expected finite numbers"),
+    ],
+)
+def test_wrong_initial_states(initial: np.ndarray, expected: str) -> None:
+    environment = AgentEnvironment()
+    with pytest.raises(UserError, match=expected):
+        environment.reset(options={"initial_state": initial})
+    environment.close()
+
+
+def test_wrong_actions() -> None:
+    environment = AgentEnvironment()
+    environment.reset(seed=0)
+    for wrong in (np.zeros(3), np.array([np.nan, 0])):
+        with pytest.raises(UserError, match="expected 2 finite numbers"):
+            environment.step(wrong)
+    environment.close()
+
+
+def test_a_simulator_that_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pybullet.connect", lambda *_: -1)
+    with pytest.raises(UserError, match="simulator does not start"):
+        AgentEnvironment()
+
+
+# Expert
+
+
+def test_the_expert_reaches_its_target_in_99_of_100_scenes() -> None:
+    tasks = ("go to red bowl", "go to purple cone", "go to bowl", "go to yellow object")
+    drives = [expert.demonstrations(task, 50, 7, lambda: None) for task in tasks]
+    success = torch.cat([reached(task, seen)["success"] for task, (seen, _) in zip(tasks, drives, strict=True)])
+    assert len(success) == 200
+    assert success.float().mean() >= 0.99
+    lengths = torch.cat([lengths for _, lengths in drives])
+    assert lengths.max() < expert.LENGTH
+    assert all(torch.equal(seen[0, lengths[0] - 1], seen[0, -1]) for seen, lengths in drives)
+
+
+def test_the_expert_drives_around_the_distractor() -> None:
+    start, goal, distractor = np.array([0.0, 0.0]), np.array([2.0, 0.0]), np.array([1.0, 0.1])
+    corners = expert.route(start, goal, distractor)
+    way = np.stack([expert.along(corners, distance) for distance in np.linspace(0, 3, 200)])
+    assert np.linalg.norm(way - distractor, axis=-1).min() > REACH
+    assert np.linalg.norm(way[-1] - goal) == pytest.approx(expert.STOP)
+
+
+def test_demonstrations_are_cached_and_repeat(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = DOMAIN.generate("go to red bowl", 2, 0)
+    assert first.states.shape == (2, 150, 13)
+    assert first.initial_states is not None
+    assert torch.equal(first.initial_states[..., :13], first.states)
+    monkeypatch.setattr(expert, "demonstrations", lambda *_: pytest.fail("made again"))
+    again = DOMAIN.generate("go to red bowl", 2, 0)
+    assert again.hash == first.hash
+
+
+# Metrics
+
+
+def plan_to(*places: tuple[float, float]) -> Tensor:
+    """A plan ``(1, time, 13)`` through places."""
+    states = torch.zeros(1, len(places), 13)
+    states[0, :, [0, 2]] = torch.tensor(places)
+    states[..., 1] = 0.102
+    return states
+
+
+def observed(*places: tuple[float, float]) -> Tensor:
+    """Observations ``(1, time, 52)`` of the same."""
+    whole = scene()[:, None].repeat(1, len(places), 1)
+    whole[..., :13] = plan_to(*places)
+    return whole
+
+
+@pytest.mark.parametrize(("x", "good"), [(0.01, True), (-0.01, False), (0.9, True), (2.1, False), (1.99, True)])
+def test_progress(x: float, good: bool) -> None:
+    plan = plan_to((-5.0, 0.0), (x, -3.806))  # only the end counts, against where the agent starts
+    assert progressed("go to bowl", plan, scene()).tolist() == [good]
+
+
+def test_a_plan_that_is_not_finite_makes_no_progress() -> None:
+    assert progressed("go to bowl", plan_to((0.0, 0.0), (float("nan"), 0.0)), scene()).tolist() == [False]
+
+
+@pytest.mark.parametrize(
+    ("places", "success", "distractor"),
+    [
+        ([(0.0, -3.8), (1.0 - REACH + 0.001, -3.8)], True, False),
+        ([(0.0, -3.8), (1.0 - REACH - 0.001, -3.8)], False, False),
+        ([(0.0, -3.8), (-1.0 + REACH - 0.001, -3.8), (0.9, -3.8)], False, True),
+        ([(0.0, -3.8), (-1.0 + REACH + 0.001, -3.8), (0.9, -3.8)], True, False),
+        ([(0.0, -3.8), (0.9, -3.8), (0.0, -3.8)], False, False),
+    ],
+)
+def test_reaching_the_target_first(places: list[tuple[float, float]], success: bool, distractor: bool) -> None:
+    outcome = reached("go to bowl", observed(*places))
+    assert (outcome["success"].item(), outcome["distractor"].item()) == (success, distractor)
+
+
+def test_actions_point_to_the_plan_five_steps_ahead() -> None:
+    plan = plan_to(*((0.1 * step, -3.8) for step in range(20)))
+    here = observed((0.0, -3.8))[:, 0]
+    assert act(plan, 0, here)[0].tolist() == pytest.approx([0.5, 0.0])
+    assert act(plan, 3, here)[0].tolist() == pytest.approx([0.8, 0.0])
+    assert act(plan, 19, here)[0].tolist() == pytest.approx([1.9, 0.0])
+
+
+def test_references_stand_where_they_must() -> None:
+    initial = scenes("go to red bowl", 40, 0)
+    rate = {
+        name: progressed("go to red bowl", draw("go to red bowl", 40, initial, 0), initial).float().mean().item()
+        for name, draw in DOMAIN.references.items()
+    }
+    assert rate["expert (oracle)"] == 1.0
+    assert 0.2 < rate["random object"] < 0.8
+    assert 0.2 < rate["nearest object"] < 0.8
+
+
+def test_entities_are_columns_of_position_colour_and_shape() -> None:
+    first, second = (scene()[0][list(columns)] for columns in DOMAIN.entities)
+    assert first[:3].tolist() == pytest.approx([1.0, 0.102, -3.8])
+    assert torch.equal(first[3:7], second[3:7])
+    assert [SHAPES[int(one[-4:].argmax())] for one in (first, second)] == ["bowl", "sphere"]
+    assert len(set(itertools.chain(*DOMAIN.entities))) == 22

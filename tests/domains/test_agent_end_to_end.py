@@ -1,0 +1,100 @@
+"""Navigation through the command line: pretraining, inversion, closed loop, sampling, mistakes."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from tests.conftest import CONF
+
+FIT = ["--config", str(CONF / "agent.yaml")]
+INVERT = ["--config", str(CONF / "invert" / "agent.yaml")]
+SMALL = [
+    "--model.denoiser_args={width: 8, multipliers: [1, 2], initial_encoder: entities}",
+    "--data.samples_per_concept=4",
+    "--data.validation_per_concept=1",
+    "--data.batch_size=8",
+    "--data.steps_per_epoch=10",
+    "--trainer.max_steps=20",
+]
+QUICK = ["--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.replan=32", "--evaluation.figures=2"]
+QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small pretrained model."""
+    folder = tmp_path_factory.mktemp("agent")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        assert main(["fit", *FIT, *SMALL, *QUICK, *QUIET, f"--trainer.logger.init_args.save_dir={folder}"]) == 0
+    return folder / "agent" / "fit" / "pretrained"
+
+
+def test_invert_judges_plans_and_executes_them(model: Path) -> None:
+    options = ["--data.steps=3", "--model.samples=2", "--data.demonstrations_per_concept=2"]
+    assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET]) == 0
+    rows = pd.read_csv("logs/agent/invert/results.csv", keep_default_na=False)
+    ours = rows[rows["K"] == 2]
+    assert set(ours["metric"]) == {"accuracy", "closed loop success", "closed loop distractor", "closed loop progress"}
+    assert set(ours["setting"]) == {"training concept", "training composition", "new initial state"}
+    assert set(ours["method"]) == {"FTL-IGM (entities, free)"}
+    assert len(ours) == 4 * (4 + 5 + 5)
+    oracle = rows[rows["method"] == "expert (oracle)"]
+    assert (oracle.loc[oracle["metric"] == "accuracy", "value"] == 1).all()
+    assert oracle.loc[oracle["metric"] == "closed loop success", "value"].mean() > 0.9
+    events = EventAccumulator("logs/agent/invert", size_guidance={"images": 0})
+    events.Reload()
+    tag = "closed loop/new initial state/go to red bowl"
+    assert events.Images(tag)[0].encoded_image_string.startswith(b"GIF89a")
+    assert "new initial state/go to red bowl" in events.Tags()["images"]
+    assert any(one.startswith("test/closed loop success/") for one in events.Tags()["scalars"])
+
+
+def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["sample", f"--pretrained={model}", "--compose=go to bowl:1.6", "--steps=2"]
+    assert main([*common, "--goal=go to bowl", "--count=3", "--figure=plans.png"]) == 0
+    drawn = Demonstrations.load("states.safetensors")
+    assert drawn.states.shape == (3, 128, 13)
+    assert drawn.initial_states is not None
+    assert drawn.initial_states.shape == (3, 52)
+    assert Path("plans.png").is_file()
+    assert main([*common, "--initial=states.safetensors", "--out=again.safetensors"]) == 0
+    again = Demonstrations.load("again.safetensors")
+    assert (again.states == drawn.states).all()
+    capsys.readouterr()
+    assert main(common) == 2
+    assert "goal, initial: expected" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--data.horizon=60"], "horizon: expected a multiple of 8"),
+        (["--data.horizon=0"], "data.horizon: expected 1 or more"),
+        (["--evaluation.replan=0"], "evaluation.replan: expected 1 or more"),
+        (["--model.prediction=x"], "prediction: expected one of epsilon, v, clean"),
+        (["--model.denoiser_args={initial_encoder: deep}"], "initial_encoder: expected one of flat, entities"),
+    ],
+)
+def test_mistakes(options: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    small = [one for one in SMALL if "denoiser_args" not in one]
+    assert main(["fit", *FIT, *small, *QUIET, *options]) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_another_horizon_is_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = model.parent / "checkpoints" / "last.ckpt"
+    assert main(["fit", *FIT, *SMALL, *QUIET, "--data.horizon=64", f"--ckpt_path={checkpoint}"]) == 2
+    assert "key 'horizon': expected 64, found 128" in capsys.readouterr().err
+
+
+def test_demonstrations_without_initial_states_are_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import numpy as np
+
+    np.savez("plain.npz", states=np.zeros((2, 150, 13), dtype=np.float32))
+    assert main(["invert", *INVERT, f"--model.pretrained={model}", "--data.demonstrations=plain.npz", *QUIET]) == 2
+    assert "key 'initial_states': expected 52 numbers each (the pretrained model's), found none" in capsys.readouterr().err

@@ -1,0 +1,127 @@
+"""Closed loop: lock-step, replanning, plans that are not finite, independence of the batch."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.samplers import ddpm
+from ftl_lightning.domains.domain import ClosedLoop
+from ftl_lightning.evaluation.closed_loop import fixed_plans, roll_out, sampled_plans
+from ftl_lightning.evaluation.tensorboard import gif
+from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig
+from ftl_lightning.seeding import generator
+
+
+class Line(gymnasium.Env[Any, Any]):
+    """A point on a line; an action is its next step. It ends beyond 3."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        assert options is not None
+        self.x = np.array(options["initial_state"], dtype=np.float32)
+        return self.x.copy(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.x = self.x + action
+        return self.x.copy(), 0.0, bool(self.x[0] > 3), False, {}
+
+
+LOOP = ClosedLoop(
+    environment=Line,
+    act=lambda plans, step, observations: plans[:, step + 1] - observations,
+    steps=8,
+    judge=lambda goal, observations: {"success": observations[:, -1, 0] > 3},
+    frames=lambda observations: [],
+)
+
+
+def ahead(observations: Tensor, rows: list[int]) -> Tensor:
+    """One unit a step from wherever one stands."""
+    return observations[:, None] + torch.arange(9)[None, :, None]
+
+
+@pytest.mark.parametrize("replan", [1, 3, 8])
+def test_plans_are_followed_until_the_environment_ends_an_episode(replan: int) -> None:
+    calls = []
+
+    def plan(observations: Tensor, rows: list[int]) -> Tensor:
+        calls.append(list(rows))
+        return ahead(observations, rows)
+
+    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), plan, replan)
+    assert found.observations[0, :, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 4, 4]  # padded with its last
+    assert found.observations[1, :, 0].tolist() == list(range(-9, 0))
+    assert not found.failed.any()
+    assert calls == [[0, 1] if start < 4 else [1] for start in range(0, 8, replan)]
+
+
+def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
+    def plan(observations: Tensor, rows: list[int]) -> Tensor:
+        plans = ahead(observations, rows)
+        if observations[0, 0] == 2:
+            plans[0, -1] = float("nan")
+        return plans
+
+    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), plan, 1)
+    assert found.failed.tolist() == [True, False]
+    assert found.observations[0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
+    assert found.observations[1, -1, 0] == -1
+    assert "episode 0, step 2: the plan is not finite" in caplog.text
+
+
+def test_all_episodes_may_fail() -> None:
+    found = roll_out(LOOP, torch.zeros(2, 1), lambda observations, rows: torch.full((2, 9, 1), float("inf")), 1)
+    assert found.failed.all()
+    assert (found.observations == 0).all()
+
+
+def test_fixed_plans_are_chosen_by_episode() -> None:
+    plans = torch.arange(3.0)[:, None, None]
+    assert fixed_plans(plans)(torch.zeros(2, 1), [2, 0]).flatten().tolist() == [2, 0]
+
+
+def model() -> GenerativeModel:
+    torch.manual_seed(0)
+    config = ModelConfig(
+        "agent", 16, 1, 1, 6, ("a", "b"), "none", "TemporalUNet", {"width": 8, "multipliers": [1, 2]}, diffusion_steps=10
+    )
+    limits = torch.tensor([-10.0]), torch.tensor([10.0])
+    return GenerativeModel(config, Normalization(*limits), torch.randn(3, 6), Normalization(*limits)).eval()
+
+
+def test_episodes_do_not_depend_on_their_neighbours() -> None:
+    net = model()
+    starts = torch.linspace(-2, 2, 5)[:, None]
+    concepts = [torch.randn(k, 6, generator=generator("cpu", k)) for k in (1, 2, 1, 2, 1)]
+    weights = [torch.ones(len(one)) for one in concepts]
+
+    def run(rows: list[int]) -> Tensor:
+        plan = sampled_plans(
+            net,
+            [concepts[row] for row in rows],
+            [weights[row] for row in rows],
+            ddpm,
+            5,
+            0.5,
+            [generator("cpu", 0, row) for row in rows],
+        )
+        return roll_out(LOOP, starts[rows], plan, 2).observations
+
+    together = run([0, 1, 2, 3, 4])
+    for rows in ([0], [3, 1], [4, 2, 0]):
+        torch.testing.assert_close(run(rows), together[rows], rtol=1e-4, atol=1e-4)
+
+
+def test_an_animation_holds_every_picture() -> None:
+    from io import BytesIO
+
+    from PIL import Image
+
+    pictures = [np.full((8, 8, 3), shade, dtype=np.uint8) for shade in (0, 120, 250)]
+    with Image.open(BytesIO(gif(pictures))) as animation:
+        assert animation.n_frames == 3
+        assert animation.info["loop"] == 0
