@@ -4,7 +4,6 @@ Both deliver demonstrations in the domain's units; the model normalises them. Wh
 the step's number alone, so a run that is killed and resumed goes on exactly as the unbroken one would have.
 """
 
-from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +19,8 @@ from ftl_lightning.domains.domain import Domain, load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import generator
 
+VALIDATION_SEED = 1_000_000
+"""Added to the seed of held-out demonstrations."""
 DEMONSTRATION_SEED = 2_000_000
 """Added to the seed of new tasks' demonstrations, so that they share no random stream with pretraining."""
 
@@ -54,10 +55,12 @@ class Steps(IterableDataset[int]):
 
 
 class PretrainingData(pl.LightningDataModule):
-    """Batches of (behaviour, concept) pairs. A domain's subclass says where the demonstrations come from.
+    """Batches of (behaviour, concept) pairs. A domain's subclass says how many.
 
     Args:
         domain: the domain.
+        samples_per_concept: demonstrations of each training concept.
+        validation_per_concept: others of each, for the validation loss, from a seed that no training run uses.
         seed: decides the demonstrations and the order they are seen in.
         batch_size: demonstrations a step.
         steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
@@ -68,6 +71,8 @@ class PretrainingData(pl.LightningDataModule):
     def __init__(
         self,
         domain: Domain,
+        samples_per_concept: int,
+        validation_per_concept: int,
         seed: int,
         batch_size: int,
         steps_per_epoch: int,
@@ -81,22 +86,16 @@ class PretrainingData(pl.LightningDataModule):
             if value < 1:
                 raise UserError(f"data.{name}: expected 1 or more, found {value}")
         self.domain = domain
+        self.samples_per_concept = samples_per_concept
+        self.validation_per_concept = validation_per_concept
         self.seed = seed
         self.batch_size = batch_size
         self.steps_per_epoch = steps_per_epoch
         self.encoder: Encoder = load_encoder(encoder, domain.table, revision)
 
-    @abstractmethod
-    def training_set(self) -> Demonstrations:
-        """Demonstrations of the training concepts."""
-
-    @abstractmethod
-    def validation_set(self) -> Demonstrations:
-        """Others, for the validation loss."""
-
     def setup(self, stage: str) -> None:
-        self.training = self.training_set()
-        self.validation = self.validation_set()
+        self.training = self.domain.training_set(self.samples_per_concept, self.seed)
+        self.validation = self.domain.training_set(self.validation_per_concept, VALIDATION_SEED + self.seed)
 
     def batch(self, step: int) -> Batch:
         """The batch of a step: demonstrations drawn with replacement, and of each a window that starts anywhere in it."""

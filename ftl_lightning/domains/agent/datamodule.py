@@ -1,6 +1,5 @@
 """Pretraining data of navigation."""
 
-from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.datamodule import PretrainingData
 from ftl_lightning.domains.agent.domain import DOMAIN
 
@@ -30,19 +29,7 @@ class AgentData(PretrainingData):
         revision: str = "main",
         horizon: int | None = None,
     ) -> None:
-        super().__init__(DOMAIN, seed, batch_size, steps_per_epoch, encoder, revision, horizon)
+        super().__init__(
+            DOMAIN, samples_per_concept, validation_per_concept, seed, batch_size, steps_per_epoch, encoder, revision, horizon
+        )
         self.save_hyperparameters()
-        self.samples_per_concept = samples_per_concept
-        self.validation_per_concept = validation_per_concept
-
-    def training_set(self) -> Demonstrations:
-        """Drives for training."""
-        return DOMAIN.training_set(self.samples_per_concept, self.seed)
-
-    def validation_set(self) -> Demonstrations:
-        """Others, from a seed that no training run uses."""
-        return DOMAIN.training_set(self.validation_per_concept, VALIDATION_SEED + self.seed)
-
-
-VALIDATION_SEED = 1_000_000
-"""Added to the seed of held-out drives."""

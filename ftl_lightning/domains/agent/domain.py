@@ -8,6 +8,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.agent import environment, expert
+from ftl_lightning.domains.agent import scenes as scene_settings
 from ftl_lightning.domains.agent.environment import LOOKAHEAD, MAX_STEPS, AgentEnvironment
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.published import PUBLISHED
@@ -36,6 +37,7 @@ _SETTINGS = {
     name: getattr(module, name)
     for module, names in (
         (environment, ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD")),
+        (scene_settings, ("AGENT_START", "OBJECT_X", "OBJECT_Z", "AGENT_CLEARANCE", "OBJECT_CLEARANCE", "COLOURS", "SHAPES")),
         (expert, ("LENGTH", "SPEED", "KEEP_CLEAR", "STOP", "AT_REST")),
     )
     for name in names
