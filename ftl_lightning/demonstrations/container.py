@@ -86,11 +86,17 @@ class Demonstrations:
             initial_states=None if self.initial_states is None else self.initial_states[chosen],
         )
 
-    @property
-    def starts(self) -> Tensor:
-        """How many times of each demonstration a window can start at ``(demo,)``: those whose initial state is known."""
-        known = self.initial_states is None or self.initial_states.dim() == 3
-        return self.lengths if known else torch.ones_like(self.lengths)
+    def starts(self, rows: Tensor, share: Tensor) -> Tensor:
+        """Times at which windows start ``(window,)`` int64; 0 where only a demonstration's first initial state is known.
+
+        Args:
+            rows: ``(window,)`` int64, which demonstration.
+            share: ``(window,)``, evenly spread over [0, 1). Its cube is the share of the demonstration before the window: half of
+                the windows start in the first eighth, where the first plan is made and nearly everything is still to be done.
+        """
+        if self.initial_states is not None and self.initial_states.dim() == 2:
+            return torch.zeros_like(rows)
+        return (share**3 * self.lengths[rows]).long()
 
     def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, Tensor | None]:
         """Stretches of demonstrations, padded with the last state.

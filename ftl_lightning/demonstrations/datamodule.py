@@ -98,14 +98,14 @@ class PretrainingData(pl.LightningDataModule):
         self.validation = self.domain.training_set(self.validation_per_concept, VALIDATION_SEED + self.seed)
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step: demonstrations drawn with replacement, and of each a window that starts anywhere in it."""
+        """The batch of a step: demonstrations drawn with replacement, and of each a window."""
         draw = generator("cpu", self.seed, step)
         rows = torch.randint(len(self.training), (self.batch_size,), generator=draw)
         return self._windows(self.training, rows, draw)
 
     def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
         concepts = torch.tensor([self.domain.training_concepts.index(demonstrations.concepts[row]) for row in rows.tolist()])
-        starts = (torch.rand(len(rows), generator=draw) * demonstrations.starts[rows]).long()
+        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw))
         states, initial = demonstrations.windows(rows, starts, self.horizon)
         return Batch(states, concepts, initial)
 

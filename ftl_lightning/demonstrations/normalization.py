@@ -42,6 +42,10 @@ class Normalization(nn.Module):
             high[columns] = high[columns].amax(dim=0).expand(columns.shape)
         return cls(low, torch.where(high - low < RESOLUTION, low, high))
 
+    def share(self, columns: Sequence[int], other: Self) -> None:
+        """Bring some columns on the scale of another normalisation's, of which there are as many."""
+        self.low[list(columns)], self.high[list(columns)] = other.low, other.high
+
     @property
     def _half_width(self) -> Tensor:
         return ((self.high - self.low) / 2).clamp(min=0)

@@ -60,9 +60,11 @@ class EntityEncoder(nn.Module):
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         # Keys are linear in an entity's columns: what makes red and what makes a bowl add up in a red bowl that was never seen.
-        self.key, self.value = nn.Linear(columns.shape[1], inner), nn.Linear(inner, inner)
+        self.key, self.value = nn.Linear(columns.shape[1], inner), nn.Linear(inner + columns.shape[1], inner)
         self.query = nn.Linear(concept_dim, inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
+        # Where the attended entity is gets through without a bend: a plan ends there.
+        self.direct = nn.Linear(inner + len(shared), width)
 
     def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
         """Features ``(batch, width)`` of ``initial_state (batch, m)``, normalised, for ``concept (batch, n)``."""
@@ -71,10 +73,11 @@ class EntityEncoder(nn.Module):
         hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
         query, key, value = (
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for part in (self.query(concept)[:, None], self.key(each), self.value(hidden))
+            for part in (self.query(concept)[:, None], self.key(each), self.value(torch.cat((hidden, each), dim=-1)))
         )
         attended = functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(1)
-        features: Tensor = self.out(torch.cat((attended, shared), dim=-1))
+        both = torch.cat((attended, shared), dim=-1)
+        features: Tensor = self.out(both) + self.direct(both)
         return features
 
 

@@ -1,4 +1,6 @@
-"""What a denoiser's network puts out: the noise itself, or the velocity or the clean plan, from which the noise follows."""
+"""What a denoiser's network puts out: the noise itself, or something from which the noise follows."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -6,26 +8,35 @@ from torch import Tensor, nn
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
 from ftl_lightning.errors import UserError
 
-PREDICTIONS = ("epsilon", "v", "clean")
+PREDICTIONS = ("epsilon", "v", "clean", "displacement")
+LOSSES = PREDICTIONS[:3]
 
 
 class Prediction(nn.Module):
     """A denoiser whose network does not estimate the noise; the noise is computed from what it estimates.
 
-    ``'v'`` is the velocity ``sqrt(abar) eps - sqrt(1 - abar) x_0`` (Salimans & Ho, 2022), ``'clean'`` is ``x_0``. Clean plans are
-    smooth, noise is not: a network that halves its input several times learns the one in a fraction of the steps.
+    ``'v'`` is the velocity ``sqrt(abar) eps - sqrt(1 - abar) x_0`` (Salimans & Ho, 2022), ``'clean'`` is ``x_0``,
+    ``'displacement'`` is ``x_0`` less the state that the plan starts from. Clean plans are smooth, noise is not: a network that
+    halves its input several times learns the one in a fraction of the steps. The displacement needs no copy of where the plan
+    starts, which a network blurs: the first states, which are those executed in closed loop, are the most exact.
 
     Args:
         net: a denoiser.
-        kind: ``'v'`` or ``'clean'``.
+        kind: ``'v'``, ``'clean'`` or ``'displacement'``.
         diffusion_steps: T.
+        state_columns: columns of the initial state that hold the state a plan starts from, on the plan's scale.
+
+    Raises:
+        UserError: for a displacement where the initial state holds no state.
     """
 
     alpha_bar: Tensor
 
-    def __init__(self, net: nn.Module, kind: str, diffusion_steps: int) -> None:
+    def __init__(self, net: nn.Module, kind: str, diffusion_steps: int, state_columns: Sequence[int] = ()) -> None:
         super().__init__()
-        self.net, self.kind = net, kind
+        if kind == "displacement" and not state_columns:
+            raise UserError("prediction: expected clean, found displacement: this domain's initial states hold no state")
+        self.net, self.kind, self.state_columns = net, kind, list(state_columns)
         self.register_buffer("alpha_bar", cosine_alpha_bar(diffusion_steps), persistent=False)
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
@@ -34,6 +45,9 @@ class Prediction(nn.Module):
         out: Tensor = self.net(x, t, concepts, index, initial_state)
         if self.kind == "v":
             return alpha_bar.sqrt() * out + (1 - alpha_bar).sqrt() * x
+        if self.kind == "displacement":
+            assert initial_state is not None
+            out = out + initial_state[:, None, self.state_columns]
         return (x - alpha_bar.sqrt() * out) / (1 - alpha_bar).sqrt()
 
 
@@ -41,10 +55,10 @@ def loss_weights(kind: str, alpha_bar: Tensor) -> Tensor:
     """Weights of the timesteps ``(T,)`` that turn the squared error of the noise into that of what ``kind`` names.
 
     Raises:
-        UserError: for a kind that is none of :data:`PREDICTIONS`.
+        UserError: for a kind that is none of :data:`LOSSES`.
     """
-    if kind not in PREDICTIONS:
-        raise UserError(f"prediction, loss: expected one of {', '.join(PREDICTIONS)}, found {kind!r}")
+    if kind not in LOSSES:
+        raise UserError(f"loss: expected one of {', '.join(LOSSES)}, found {kind!r}")
     if kind == "epsilon":
         return torch.ones_like(alpha_bar)
     return 1 / alpha_bar if kind == "v" else (1 - alpha_bar) / alpha_bar

@@ -35,8 +35,9 @@ class ModelConfig:
         denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
         denoiser_args: its arguments other than the sizes.
         diffusion_steps: T.
-        prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'`` or ``'clean'``.
+        prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'`` or ``'displacement'``.
         entities: columns of the initial state for each exchangeable entity.
+        state_columns: columns of the initial state that hold the state a plan starts from.
         training: how it was trained, for the record.
     """
 
@@ -52,6 +53,7 @@ class ModelConfig:
     diffusion_steps: int = 100
     prediction: str = "epsilon"
     entities: tuple[tuple[int, ...], ...] = ()
+    state_columns: tuple[int, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -77,7 +79,9 @@ def build_denoiser(config: ModelConfig) -> nn.Module:
         )
     except TypeError as error:
         raise UserError(f"denoiser_args: {config.denoiser} does not take them ({error})") from error
-    return denoiser if config.prediction == "epsilon" else Prediction(denoiser, config.prediction, config.diffusion_steps)
+    if config.prediction == "epsilon":
+        return denoiser
+    return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns)
 
 
 class GenerativeModel(nn.Module):
@@ -236,7 +240,7 @@ class GenerativeModel(nn.Module):
             expected_hash = content.pop("hash")
             if content.pop("format") != FORMAT:
                 raise ValueError(f"format is not {FORMAT}")
-            for key in ("training_concepts", "entities"):
+            for key in ("training_concepts", "entities", "state_columns"):
                 content[key] = tuple(tuple(one) if isinstance(one, list) else one for one in content.get(key, ()))
             config = ModelConfig(**content)
         except OSError as error:

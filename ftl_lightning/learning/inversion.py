@@ -160,8 +160,7 @@ class InversionModule(pl.LightningModule):
         noise = torch.randn((samples, horizon, self.model.config.state_dim), generator=draw, device=self.device)
         rows = self._rows(samples).flatten()
         share = torch.rand(samples, generator=draw, device=self.device).cpu().repeat(runs)
-        starts = (share * self.demonstrations.starts[rows]).long()
-        states, initial = self.demonstrations.windows(rows, starts, horizon)
+        states, initial = self.demonstrations.windows(rows, self.demonstrations.starts(rows, share), horizon)
         s0 = self.model.encode_initial(None if initial is None else initial.to(self.device))
         embeddings = self.parametrised
         losses = denoising_loss(

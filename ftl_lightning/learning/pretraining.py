@@ -43,10 +43,10 @@ class PretrainingModule(pl.LightningModule):
         weight_decay: of AdamW.
         ema_decay: of the running average; it starts lower.
         guidance: weight omega with which training concepts are generated in evaluation.
-        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'`` or ``'clean'``, from which the noise follows
-            (:class:`ftl_lightning.diffusion.prediction.Prediction`).
-        loss: whose squared error is minimised, one of the same three; ``'epsilon'`` is Eq. 1. The others weigh noisy timesteps,
-            at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
+            which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+        loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
+            weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         compile: compile the denoiser for training (worth it on GPUs).
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and noise, timesteps and condition dropout as a function of the step.
@@ -104,6 +104,7 @@ class PretrainingModule(pl.LightningModule):
             diffusion_steps=self.hparams["diffusion_steps"],
             prediction=self.hparams["prediction"],
             entities=data.domain.entities,
+            state_columns=data.domain.state_columns,
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
                 "data": {key: value for key, value in data.hparams.items() if not key.startswith("_")},
@@ -113,12 +114,11 @@ class PretrainingModule(pl.LightningModule):
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            self.model = GenerativeModel(
-                config,
-                Normalization.fit(data.training.states),
-                embeddings,
-                None if initial is None else Normalization.fit(initial, data.domain.entities),
-            )
+            normalization = Normalization.fit(data.training.states)
+            beside = None if initial is None else Normalization.fit(initial, data.domain.entities)
+            if beside is not None and data.domain.state_columns:
+                beside.share(data.domain.state_columns, normalization)
+            self.model = GenerativeModel(config, normalization, embeddings, beside)
         self.denoiser = copy.deepcopy(self.model.denoiser)
         self.model.requires_grad_(False).eval()
         self._trained = torch.compile(self.denoiser) if self.hparams["compile"] else self.denoiser

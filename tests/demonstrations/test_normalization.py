@@ -39,6 +39,13 @@ def test_exchangeable_entities_share_their_extremes() -> None:
     assert found.high.tolist() == [1, 7.5, 1, 7.5]
 
 
+def test_columns_can_share_another_scale() -> None:
+    found = Normalization.fit(torch.tensor([[0.0, 5.0, 7.0], [1.0, 6.0, 7.0]]))
+    found.share((2, 0), Normalization.fit(torch.tensor([[0.0, -1.0], [8.0, 3.0]])))
+    assert found.low.tolist() == [-1, 5, 0]
+    assert found.high.tolist() == [3, 6, 8]
+
+
 def test_what_varies_by_rounding_alone_is_constant() -> None:
     found = Normalization.fit(torch.tensor([[0.1020, 1.0], [0.1021, 2.0]]))
     assert found.encode(torch.tensor([0.1021, 1.5])).tolist() == [0, 0]

@@ -5,7 +5,7 @@ import torch
 
 from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet
 from ftl_lightning.diffusion.initial_state import EntityEncoder
-from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
+from ftl_lightning.diffusion.prediction import LOSSES, Prediction, loss_weights
 from ftl_lightning.diffusion.schedule import add_noise, cosine_alpha_bar
 from ftl_lightning.errors import UserError
 
@@ -89,18 +89,21 @@ def test_sizes_that_do_not_fit(options: dict[str, object], expected: str) -> Non
         TemporalUNet(**{"horizon": 16, "state_dim": 5, "concept_dim": 7, "initial_state_dim": 10} | options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("kind", ["v", "clean"])
+@pytest.mark.parametrize("kind", ["v", "clean", "displacement"])
 def test_what_the_network_puts_out_is_turned_into_noise(kind: str) -> None:
     alpha_bar = cosine_alpha_bar(100)
     clean, noise, t = torch.randn(4, 16, 5), torch.randn(4, 16, 5), torch.tensor([0, 30, 70, 95])
     signal, spread = alpha_bar[t].sqrt()[:, None, None], (1 - alpha_bar[t]).sqrt()[:, None, None]
     net = torch.nn.Module()
-    net.forward = lambda *_: clean if kind == "clean" else signal * noise - spread * clean  # type: ignore[assignment]
-    found = Prediction(net, kind, 100)(add_noise(clean, noise, alpha_bar[t]), t, None, None)  # type: ignore[arg-type]
+    initial, columns = torch.randn(4, 8), [1, 0, 3, 7, 5]
+    right = {"v": signal * noise - spread * clean, "clean": clean, "displacement": clean - initial[:, None, columns]}[kind]
+    net.forward = lambda *_: right  # type: ignore[assignment]
+    prediction = Prediction(net, kind, 100, columns)
+    found = prediction(add_noise(clean, noise, alpha_bar[t]), t, torch.zeros(1, 2), torch.zeros(4, dtype=torch.int64), initial)
     torch.testing.assert_close(found, noise, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", PREDICTIONS)
+@pytest.mark.parametrize("kind", LOSSES)
 def test_loss_weights_turn_the_error_of_the_noise_into_that_of_the_kind(kind: str) -> None:
     alpha_bar = cosine_alpha_bar(100)[[5, 40, 90]].double()
     clean, guess, noise = torch.randn(3, 3, 4, dtype=torch.float64)
@@ -117,5 +120,7 @@ def test_loss_weights_turn_the_error_of_the_noise_into_that_of_the_kind(kind: st
 
 
 def test_an_unknown_prediction_is_refused() -> None:
-    with pytest.raises(UserError, match="expected one of epsilon, v, clean"):
-        loss_weights("x", torch.ones(1))
+    with pytest.raises(UserError, match="expected one of epsilon, v, clean, found 'displacement'"):
+        loss_weights("displacement", torch.ones(1))
+    with pytest.raises(UserError, match="this domain's initial states hold no state"):
+        Prediction(torch.nn.Module(), "displacement", 100)

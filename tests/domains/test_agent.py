@@ -143,6 +143,14 @@ def test_bodies_are_solid() -> None:
     assert 0.15 < np.linalg.norm(seen[:, [0, 2]] - [1.0, -3.8], axis=-1).min() < 0.3  # it slides along the bowl, around it
 
 
+def test_the_agent_glides_without_hopping() -> None:
+    environment = AgentEnvironment()
+    seen = run(environment, [(0.1, 0.05)] * 30)
+    environment.close()
+    assert np.ptp(seen[:, 1]) < 1e-4
+    assert np.abs(seen[:, 8]).max() < 1e-4
+
+
 def test_determinism_within_and_between_instances() -> None:
     first, second = AgentEnvironment(), AgentEnvironment()
     rng = np.random.default_rng(0)
@@ -304,6 +312,12 @@ def test_references_stand_where_they_must() -> None:
     assert rate["expert (oracle)"] == 1.0
     assert 0.2 < rate["random object"] < 0.8
     assert 0.2 < rate["nearest object"] < 0.8
+
+
+def test_an_initial_state_begins_with_the_state_of_a_plan() -> None:
+    made = DOMAIN.generate("go to cube", 1, 0)
+    assert made.initial_states is not None
+    assert torch.equal(made.initial_states[0, 0, list(DOMAIN.state_columns)], made.states[0, 0])
 
 
 def test_entities_are_columns_of_position_colour_and_shape() -> None:

@@ -36,7 +36,7 @@ STATE_UNITS = ("m",) * 3 + ("1",) * 4 + ("m/s",) * 3 + ("rad/s",) * 3
 _SETTINGS = {
     name: getattr(module, name)
     for module, names in (
-        (environment, ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD")),
+        (environment, ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD", "MARGIN")),
         (scene_settings, ("AGENT_START", "OBJECT_X", "OBJECT_Z", "AGENT_CLEARANCE", "OBJECT_CLEARANCE", "COLOURS", "SHAPES")),
         (expert, ("LENGTH", "SPEED", "KEEP_CLEAR", "STOP", "AT_REST")),
     )
@@ -48,7 +48,7 @@ _SETTINGS = {
 def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrations:
     """``count`` drives of each task by the expert, from the cache if they are there."""
     return cached(
-        {"domain": NAME, "version": 1, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS},
+        {"domain": NAME, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS},
         len(tasks) * count,
         lambda progress: _drive(tasks, count, seed, progress),
     )
@@ -144,6 +144,7 @@ DOMAIN = Domain(
     entities=tuple(
         (*range(columns.start, columns.start + 3), *range(columns.start + 6, columns.stop)) for columns in OBJECT_COLUMNS
     ),
+    state_columns=tuple(range(STATE)),
     closed_loop=ClosedLoop(environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, frames=frames),
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
     published=PUBLISHED,

@@ -43,6 +43,8 @@ RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
 BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]
 """Half the size of the floor that is drawn."""
+MARGIN = 0.001
+"""Metres. The simulator keeps a cone so far above what it stands on; the ground lies so much lower, else the agent would hop."""
 IMAGE = (200, 320)
 """Height and width of a rendered picture."""
 
@@ -116,7 +118,8 @@ class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         client.resetSimulation()
         client.setGravity(0, -9.81, 0)
         client.setPhysicsEngineParameter(fixedTimeStep=STEP / SUBSTEPS, deterministicOverlappingPairs=1)
-        ground = client.createMultiBody(0, client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[0, 1, 0]))
+        plane = client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[0, 1, 0])
+        ground = client.createMultiBody(0, plane, basePosition=[0, -MARGIN, 0])
         client.changeDynamics(ground, -1, lateralFriction=0)
         floor = client.createVisualShape(pybullet.GEOM_BOX, halfExtents=FLOOR, rgbaColor=[0.93, 0.93, 0.93, 1])
         client.createMultiBody(0, -1, floor, [AGENT_START[0], -FLOOR[1], AGENT_START[2]])  # planes are not drawn
