@@ -30,26 +30,25 @@ class FlatEncoder(nn.Module):
 class EntityEncoder(nn.Module):
     """Every entity through the same network; the concept attends to them, so that it is a matter of looks and not of places.
 
-    Exchanging two entities changes nothing. What belongs to no entity goes to each of them, and into the features.
+    The concept is turned into a weight for each of an entity's columns, and their sum decides which entity is attended to: what
+    makes red and what makes a bowl add up in a red bowl that was never seen, and no column is harder to ask for than another.
+    There is one head: several can disagree about where to go, which traps concepts that are learned through them. Exchanging two
+    entities changes nothing. What belongs to no entity goes to each of them, and into the features.
 
     Args:
         initial_state_dim: columns of the initial state.
         entities: columns of each entity, in the same order for each.
         concept_dim: columns of a concept embedding.
         width: of the features.
-        heads: of the attention.
     """
 
     columns: Tensor
     shared: Tensor
 
-    def __init__(
-        self, initial_state_dim: int, entities: Sequence[Sequence[int]], concept_dim: int, width: int, heads: int = 4
-    ) -> None:
+    def __init__(self, initial_state_dim: int, entities: Sequence[Sequence[int]], concept_dim: int, width: int) -> None:
         super().__init__()
         if not entities:
             raise UserError("denoiser_args.initial_encoder: expected flat, found entities, which this domain does not name")
-        self.heads = heads
         columns = torch.tensor([list(entity) for entity in entities])
         own = set(columns.flatten().tolist())
         # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
@@ -59,9 +58,8 @@ class EntityEncoder(nn.Module):
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
-        # Keys are linear in an entity's columns: what makes red and what makes a bowl add up in a red bowl that was never seen.
-        self.key, self.value = nn.Linear(columns.shape[1], inner), nn.Linear(inner + columns.shape[1], inner)
-        self.query = nn.Linear(concept_dim, inner)
+        self.query = nn.Linear(concept_dim, columns.shape[1])
+        self.value = nn.Linear(inner + columns.shape[1], inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Where the attended entity is gets through without a bend: a plan ends there.
         self.direct = nn.Linear(inner + len(shared), width)
@@ -71,11 +69,8 @@ class EntityEncoder(nn.Module):
         shared = initial_state[:, self.shared]
         each = initial_state[:, self.columns]  # (batch, entity, columns)
         hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
-        query, key, value = (
-            part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for part in (self.query(concept)[:, None], self.key(each), self.value(torch.cat((hidden, each), dim=-1)))
-        )
-        attended = functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(1)
+        value = self.value(torch.cat((hidden, each), dim=-1))
+        attended = functional.scaled_dot_product_attention(self.query(concept)[:, None], each, value, scale=1.0)[:, 0]
         both = torch.cat((attended, shared), dim=-1)
         features: Tensor = self.out(both) + self.direct(both)
         return features

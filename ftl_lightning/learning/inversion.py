@@ -45,6 +45,9 @@ class InversionModule(pl.LightningModule):
         samples: noised demonstrations a step and run, spread over demonstrations and timesteps.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half of
+            them fall in the noisiest eighth. There the concept alone tells what to do; later a plan shows it, and a concept
+            that says nothing is right everywhere: a trap next to one that is wrong in a single demonstration.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -66,6 +69,7 @@ class InversionModule(pl.LightningModule):
         weight_learning_rate: float = 3e-3,
         samples: int = 32,
         loss: str = "epsilon",
+        timestep_power: float = 1.0,
         training_omega: float | None = None,
         output: str | None = None,
         seed: int = 0,
@@ -76,6 +80,8 @@ class InversionModule(pl.LightningModule):
             raise UserError(f"model.components: expected 1 or more, found {components}")
         if not 0 <= off_span <= 1:
             raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {off_span}")
+        if timestep_power < 1:
+            raise UserError(f"model.timestep_power: expected 1 or more, found {timestep_power}")
         for name, value in (("restarts", restarts), ("samples", samples)):
             if value < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
@@ -155,7 +161,10 @@ class InversionModule(pl.LightningModule):
         horizon = self.model.config.horizon
         total = len(self.model.alpha_bar)
         jitter = torch.rand(samples, generator=draw, device=self.device)
-        t = ((torch.arange(samples, device=self.device) + jitter) / samples * total).long()
+        spread = (torch.arange(samples, device=self.device) + jitter) / samples
+        if (power := self.hparams["timestep_power"]) != 1:
+            spread = 1 - spread**power
+        t = (spread * total).long().clamp(max=total - 1)
         t = t[torch.randperm(samples, generator=draw, device=self.device)]
         noise = torch.randn((samples, horizon, self.model.config.state_dim), generator=draw, device=self.device)
         rows = self._rows(samples).flatten()
