@@ -45,8 +45,8 @@ class InversionModule(pl.LightningModule):
         samples: noised demonstrations a step and run, spread over demonstrations and timesteps.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
-        timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half of
-            them fall in the noisiest eighth. There the concept alone tells what to do; later a plan shows it, and a concept
+        timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
+            of them fall in the noisiest eighth. There the concept alone tells what to do; later the plan shows it, and a concept
             that says nothing is right everywhere: a trap next to one that is wrong in a single demonstration.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
