@@ -220,6 +220,7 @@ def test_a_checkpoint_of_another_form_is_refused(tiny: Path, capsys: pytest.Capt
         (["--evaluation.suites=[trainig]"], "evaluation.suites: expected some of training"),
         (["--evaluation.steps=1000"], "evaluation.steps: expected 1 to 100"),
         (["--model.restarts=0"], "model.restarts: expected 1 or more"),
+        (["--model.timestep_power=0.5"], "model.timestep_power: expected 1 or more"),
         (["--data.steps=0"], "data.steps, data.demonstrations_per_concept: expected 1 or more"),
         (["--trainer.logger.init_args.save_dir=/proc/logs"], "choose a place"),
     ],

@@ -49,6 +49,19 @@ def test_learning_lowers_the_loss(tiny: Path) -> None:
     assert all(long[name].origin.loss < short[name].origin.loss for name in long)
 
 
+@pytest.mark.parametrize(("power", "expected"), [(1.0, 12.5), (3.0, 50.0)])
+def test_timesteps_are_even_or_mostly_noisy(tiny: Path, power: float, expected: float) -> None:
+    module = learn(tiny, timestep_power=power)
+    seen: list[torch.Tensor] = []
+    module.model.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[1]))
+    module._losses(2000, torch.Generator().manual_seed(0))
+    t = torch.cat(seen)
+    steps = len(module.model.alpha_bar)
+    assert t.min() >= 0
+    assert t.max() == steps - 1
+    assert 100 * (t >= steps * 7 / 8).float().mean() == pytest.approx(expected, abs=1.5)
+
+
 def test_what_is_learned_does_not_depend_on_what_is_learned_beside_it(tiny: Path) -> None:
     together = InversionData("object_rearrangement", suite="validation", steps=6)
     name = together.concepts[0]
