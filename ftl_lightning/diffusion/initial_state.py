@@ -58,7 +58,10 @@ class EntityEncoder(nn.Module):
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
+        # Weights of size 1 for an input of norm 1: a step of Adam turns the query a little; with the usual small weights it flips it,
+        # and attention that is sure of the wrong entity after ten steps stays so.
         self.query = nn.Linear(concept_dim, columns.shape[1])
+        nn.init.normal_(self.query.weight)
         self.value = nn.Linear(inner + columns.shape[1], inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Where the attended entity is gets through without a bend: a plan ends there.
@@ -70,7 +73,8 @@ class EntityEncoder(nn.Module):
         each = initial_state[:, self.columns]  # (batch, entity, columns)
         hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
         value = self.value(torch.cat((hidden, each), dim=-1))
-        attended = functional.scaled_dot_product_attention(self.query(concept)[:, None], each, value, scale=1.0)[:, 0]
+        query = self.query(concept / concept.shape[-1] ** 0.5)[:, None]
+        attended = functional.scaled_dot_product_attention(query, each, value, scale=1.0)[:, 0]
         both = torch.cat((attended, shared), dim=-1)
         features: Tensor = self.out(both) + self.direct(both)
         return features
