@@ -58,8 +58,8 @@ class EntityEncoder(nn.Module):
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
-        # Weights of size 1 for an input of norm 1: a step of Adam turns the query a little; with the usual small weights it flips it,
-        # and attention that is sure of the wrong entity after ten steps stays so.
+        # Weights of size 1 for an input of norm 1: a step of Adam turns the query a little. With the usual small weights it flips
+        # it, and attention that is sure of the wrong entity after ten steps stays so.
         self.query = nn.Linear(concept_dim, columns.shape[1])
         nn.init.normal_(self.query.weight)
         self.value = nn.Linear(inner + columns.shape[1], inner)
