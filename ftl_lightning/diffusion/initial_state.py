@@ -58,10 +58,10 @@ class EntityEncoder(nn.Module):
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
-        # Weights of size 1 for an input of norm 1: a step of Adam turns the query a little. With the usual small weights it flips
-        # it, and attention that is sure of the wrong entity after ten steps stays so.
+        # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
+        # Adam turns the query a little (with norm 20, as it is, it would flip it).
         self.query = nn.Linear(concept_dim, columns.shape[1])
-        nn.init.normal_(self.query.weight)
+        nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + columns.shape[1], inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Where the attended entity is gets through without a bend: a plan ends there.
