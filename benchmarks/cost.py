@@ -29,7 +29,7 @@ def milliseconds(horizon: int, components: int, width: int, concepts: int) -> tu
     """Of one step of inversion, and of one denoising step of as many plans without gradient; the fastest of some."""
     domain = load_domain("agent")
     states, initial_dim, n = len(domain.state_names), 52, 384
-    net = TemporalUNet(horizon, states, n, initial_dim, domain.entities, width=width, initial_encoder="entities")
+    net = TemporalUNet(horizon, states, n, initial_dim, domain.entities, domain.looks, width, initial_encoder="entities")
     net.requires_grad_(False).eval()
     batch = concepts * SAMPLES
     x, s0 = torch.randn(batch, horizon, states), torch.randn(batch, initial_dim)

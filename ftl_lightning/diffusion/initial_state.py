@@ -30,14 +30,15 @@ class FlatEncoder(nn.Module):
 class EntityEncoder(nn.Module):
     """Every entity through the same network; the concept attends to them, so that it is a matter of looks and not of places.
 
-    The concept is turned into a weight for each of an entity's columns, and their sum decides which entity is attended to: what
-    makes red and what makes a bowl add up in a red bowl that was never seen, and no column is harder to ask for than another.
+    The concept is turned into a weight for each column of an entity's looks, and their sum decides which entity is attended to:
+    what makes red and what makes a bowl add up in a red bowl that was never seen, and no column is harder to ask for than another.
     There is one head: several can disagree about where to go, which traps concepts that are learned through them. Exchanging two
     entities changes nothing. What belongs to no entity goes to each of them, and into the features.
 
     Args:
         initial_state_dim: columns of the initial state.
         entities: columns of each entity, in the same order for each.
+        looks: which of an entity's columns, counted from its first, a concept asks for; all where none are named.
         concept_dim: columns of a concept embedding.
         width: of the features.
     """
@@ -45,7 +46,9 @@ class EntityEncoder(nn.Module):
     columns: Tensor
     shared: Tensor
 
-    def __init__(self, initial_state_dim: int, entities: Sequence[Sequence[int]], concept_dim: int, width: int) -> None:
+    def __init__(
+        self, initial_state_dim: int, entities: Sequence[Sequence[int]], looks: Sequence[int], concept_dim: int, width: int
+    ) -> None:
         super().__init__()
         if not entities:
             raise UserError("denoiser_args.initial_encoder: expected flat, found entities, which this domain does not name")
@@ -54,13 +57,14 @@ class EntityEncoder(nn.Module):
         # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
         # columns are 0 after normalisation.
         shared = [column for column in range(initial_state_dim) if column not in own]
+        self.looks = list(looks or range(columns.shape[1]))
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
         # Adam turns the query a little (with norm 20, as it is, it would flip it).
-        self.query = nn.Linear(concept_dim, columns.shape[1])
+        self.query = nn.Linear(concept_dim, len(self.looks))
         nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + columns.shape[1], inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
@@ -74,7 +78,7 @@ class EntityEncoder(nn.Module):
         hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
         value = self.value(torch.cat((hidden, each), dim=-1))
         query = self.query(concept / concept.shape[-1] ** 0.5)[:, None]
-        attended = functional.scaled_dot_product_attention(query, each, value, scale=1.0)[:, 0]
+        attended = functional.scaled_dot_product_attention(query, each[..., self.looks], value, scale=1.0)[:, 0]
         both = torch.cat((attended, shared), dim=-1)
         features: Tensor = self.out(both) + self.direct(both)
         return features
@@ -84,7 +88,7 @@ ENCODERS = ("flat", "entities")
 
 
 def initial_state_encoder(
-    name: str, initial_state_dim: int, entities: Sequence[Sequence[int]], concept_dim: int, width: int
+    name: str, initial_state_dim: int, entities: Sequence[Sequence[int]], looks: Sequence[int], concept_dim: int, width: int
 ) -> FlatEncoder | EntityEncoder:
     """An encoder by its name in a configuration.
 
@@ -95,4 +99,4 @@ def initial_state_encoder(
         raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")
     if name == "flat":
         return FlatEncoder(initial_state_dim, width)
-    return EntityEncoder(initial_state_dim, entities, concept_dim, width)
+    return EntityEncoder(initial_state_dim, entities, looks, concept_dim, width)

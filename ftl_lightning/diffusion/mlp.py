@@ -47,6 +47,7 @@ class MLPDenoiser(nn.Module):
         concept_dim: int,
         initial_state_dim: int = 0,
         entities: Sequence[Sequence[int]] = (),
+        looks: Sequence[int] = (),
         hidden_dim: int = 512,
         depth: int = 4,
         condition_dim: int = 384,
@@ -62,7 +63,7 @@ class MLPDenoiser(nn.Module):
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(concept_dim, condition_dim), nn.SiLU())
         self.initial = (
-            initial_state_encoder(initial_encoder, initial_state_dim, entities, concept_dim, initial_dim)
+            initial_state_encoder(initial_encoder, initial_state_dim, entities, looks, concept_dim, initial_dim)
             if initial_state_dim
             else None
         )

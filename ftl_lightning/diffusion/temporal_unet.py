@@ -71,6 +71,7 @@ class TemporalUNet(nn.Module):
         concept_dim: columns of a concept embedding.
         initial_state_dim: columns of the initial state; 0 where the domain has none.
         entities: columns of the initial state for each exchangeable entity.
+        looks: which of an entity's columns a concept asks for.
         width: channels of the first level, and columns of each of the condition's three parts; the paper's size is 128.
         multipliers: channels of the levels, in widths.
         initial_encoder: ``'flat'`` (the paper's) or ``'entities'``.
@@ -92,6 +93,7 @@ class TemporalUNet(nn.Module):
         concept_dim: int,
         initial_state_dim: int = 0,
         entities: Sequence[Sequence[int]] = (),
+        looks: Sequence[int] = (),
         width: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8),
         initial_encoder: str = "flat",
@@ -116,7 +118,9 @@ class TemporalUNet(nn.Module):
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.initial = (
-            initial_state_encoder(initial_encoder, initial_state_dim, entities, concept_dim, width) if initial_state_dim else None
+            initial_state_encoder(initial_encoder, initial_state_dim, entities, looks, concept_dim, width)
+            if initial_state_dim
+            else None
         )
         condition = width * (3 if initial_state_dim else 2)
         channels = [width * multiplier for multiplier in multipliers]

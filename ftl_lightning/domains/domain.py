@@ -130,6 +130,7 @@ class Domain:
         initial_states: ``(task, count, seed) -> (count, m)``, new initial states of a task; ``None`` where behaviour has none.
         entities: columns of an initial state for each of its exchangeable entities, in the same order for each; the other columns
             say nothing about a single entity.
+        looks: which of an entity's columns, counted from its first, a concept asks for when it names an entity; all where empty.
         state_columns: columns of an initial state that hold the state a plan starts from, in a state's order; none where it
             holds no such state.
         closed_loop: how plans are executed; ``None`` where they cannot be.
@@ -152,6 +153,7 @@ class Domain:
     references: Mapping[str, Callable[[str, int, Tensor | None, int], Tensor]] = field(default_factory=dict)
     initial_states: Callable[[str, int, int], Tensor] | None = None
     entities: tuple[tuple[int, ...], ...] = ()
+    looks: tuple[int, ...] = ()
     state_columns: tuple[int, ...] = ()
     closed_loop: ClosedLoop | None = None
     published: tuple[Published, ...] = ()

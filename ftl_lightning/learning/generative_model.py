@@ -37,6 +37,7 @@ class ModelConfig:
         diffusion_steps: T.
         prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'`` or ``'displacement'``.
         entities: columns of the initial state for each exchangeable entity.
+        looks: which of an entity's columns a concept asks for; all where empty.
         state_columns: columns of the initial state that hold the state a plan starts from.
         training: how it was trained, for the record.
     """
@@ -53,6 +54,7 @@ class ModelConfig:
     diffusion_steps: int = 100
     prediction: str = "epsilon"
     entities: tuple[tuple[int, ...], ...] = ()
+    looks: tuple[int, ...] = ()
     state_columns: tuple[int, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
 
@@ -75,6 +77,7 @@ def build_denoiser(config: ModelConfig) -> nn.Module:
             initial_state_dim=config.initial_state_dim,
             concept_dim=config.concept_dim,
             entities=config.entities,
+            looks=config.looks,
             **config.denoiser_args,
         )
     except TypeError as error:
@@ -240,7 +243,7 @@ class GenerativeModel(nn.Module):
             expected_hash = content.pop("hash")
             if content.pop("format") != FORMAT:
                 raise ValueError(f"format is not {FORMAT}")
-            for key in ("training_concepts", "entities", "state_columns"):
+            for key in ("training_concepts", "entities", "looks", "state_columns"):
                 content[key] = tuple(tuple(one) if isinstance(one, list) else one for one in content.get(key, ()))
             config = ModelConfig(**content)
         except OSError as error:

@@ -104,6 +104,7 @@ class PretrainingModule(pl.LightningModule):
             diffusion_steps=self.hparams["diffusion_steps"],
             prediction=self.hparams["prediction"],
             entities=data.domain.entities,
+            looks=data.domain.looks,
             state_columns=data.domain.state_columns,
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},

@@ -126,6 +126,9 @@ def _oracle(goal: str, count: int, initial_states: Tensor | None, seed: int) -> 
     return torch.stack([drive[rows.clamp(max=len(drive) - 1), :STATE] for drive in drives])
 
 
+# Position, and as its looks colour and shape, of each object; its type (object 1 or 2) is what tells apart what should be alike.
+_ENTITIES = tuple((*range(columns.start, columns.start + 3), *range(columns.start + 6, columns.stop)) for columns in OBJECT_COLUMNS)
+
 DOMAIN = Domain(
     name=NAME,
     horizon=HORIZON,
@@ -140,10 +143,8 @@ DOMAIN = Domain(
     succeeded=progressed,
     render=render,
     initial_states=scenes,
-    # Position, colour and shape of each object; its type (object 1 or 2) is what tells apart what should be alike.
-    entities=tuple(
-        (*range(columns.start, columns.start + 3), *range(columns.start + 6, columns.stop)) for columns in OBJECT_COLUMNS
-    ),
+    entities=_ENTITIES,
+    looks=tuple(range(3, len(_ENTITIES[0]))),
     state_columns=tuple(range(STATE)),
     closed_loop=ClosedLoop(environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, frames=frames),
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
