@@ -31,6 +31,7 @@ class MLPDenoiser(nn.Module):
         concept_dim: columns of a concept embedding.
         initial_state_dim: columns of the initial state; 0 where the domain has none.
         entities: columns of the initial state for each exchangeable entity.
+        looks: which of an entity's columns a concept asks for.
         hidden_dim: width.
         depth: hidden layers.
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.

@@ -68,11 +68,20 @@ def test_exchanging_entities_changes_nothing_unless_the_encoder_is_flat() -> Non
 
 
 def test_a_gradient_reaches_the_concept_through_the_attention_alone() -> None:
-    encoder = EntityEncoder(10, ENTITIES, 7, 8)
+    encoder = EntityEncoder(10, ENTITIES, (), 7, 8)
     concept = torch.randn(3, 7, requires_grad=True)
     encoder(inputs()[-1], concept).sum().backward()
     assert concept.grad is not None
     assert concept.grad.abs().max() > 0
+
+
+def test_a_concept_tells_entities_apart_by_their_looks() -> None:
+    *_, initial = inputs()
+    initial[:, 8] = initial[:, 5]  # the second of two columns is the same for both entities
+    one, other = torch.randn(2, len(initial), 7)
+    for looks, same in (((1,), True), ((), False)):
+        encoder = EntityEncoder(10, ENTITIES, looks, 7, 8)
+        assert torch.allclose(encoder(initial, one), encoder(initial, other), atol=1e-6) == same
 
 
 @pytest.mark.parametrize(
