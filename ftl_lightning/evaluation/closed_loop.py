@@ -1,12 +1,13 @@
-"""Executing plans: environments step in lock-step, all their plans are made in one batch (paper, 'closed loop')."""
+"""Executing plans: environments step in lock-step, their plans are made in one batch (paper, 'closed loop')."""
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from rich.progress import track
+from rich.progress import Progress
 from torch import Tensor
 
 from ftl_lightning.diffusion.samplers import Sampler
@@ -17,6 +18,8 @@ _LOG = logging.getLogger(__name__)
 
 Plan = Callable[[Tensor, list[int]], Tensor]
 """``(observations (episode, m), which episodes) -> plans (episode, horizon, state)``."""
+SIDE_BY_SIDE = 64
+"""Episodes that run together: a simulator takes tens of megabytes, and a larger batch makes no plan faster."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Rollout:
 
 
 def roll_out(loop: ClosedLoop, initial_states: Tensor, plan: Plan, replan: int) -> Rollout:
-    """Run one episode from each initial state until its environment ends it.
+    """Run one episode from each initial state until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
 
     Args:
         loop: the domain's environment and planner.
@@ -42,14 +45,33 @@ def roll_out(loop: ClosedLoop, initial_states: Tensor, plan: Plan, replan: int) 
         replan: steps that a plan is followed before a new one is made; the paper's number is 1.
     """
     count = len(initial_states)
-    environments = [loop.environment() for _ in range(count)]
+    observations = initial_states[:, None].repeat(1, loop.steps + 1, 1)
+    failed = torch.zeros(count, dtype=torch.bool)
+    with Progress(transient=True) as progress:
+        bar = progress.add_task(f"{count} episodes", total=loop.steps * math.ceil(count / SIDE_BY_SIDE))
+        for rows in torch.arange(count).split(SIDE_BY_SIDE):
+            _lock_step(loop, rows.tolist(), observations, failed, plan, replan, lambda: progress.advance(bar))
+    return Rollout(observations, failed)
+
+
+def _lock_step(
+    loop: ClosedLoop,
+    rows: list[int],
+    observations: Tensor,
+    failed: Tensor,
+    plan: Plan,
+    replan: int,
+    advance: Callable[[], None],
+) -> None:
+    """Run these episodes together, one step of each after the other, and fill in their observations and failures."""
+    environments = {row: loop.environment() for row in rows}
     try:
-        observations = torch.empty(count, loop.steps + 1, initial_states.shape[1])
-        for row, (environment, initial) in enumerate(zip(environments, initial_states.numpy(), strict=True)):
+        for row, environment in environments.items():
+            initial = observations[row, 0].numpy()
             observations[row] = torch.as_tensor(environment.reset(options={"initial_state": initial})[0])
-        failed = torch.zeros(count, dtype=torch.bool)
-        active = list(range(count))
-        for step in track(range(loop.steps), f"{count} episodes", transient=True):
+        active, plans = rows, torch.empty(0)
+        for step in range(loop.steps):
+            advance()
             if active and step % replan == 0:
                 plans = plan(observations[active, step], active)
                 finite = plans.isfinite().flatten(1).all(dim=1)
@@ -68,9 +90,8 @@ def roll_out(loop: ClosedLoop, initial_states: Tensor, plan: Plan, replan: int) 
                     going.append(place)
             active, plans = [active[place] for place in going], plans[going]
     finally:
-        for environment in environments:
+        for environment in environments.values():
             environment.close()
-    return Rollout(observations, failed)
 
 
 def sampled_plans(
