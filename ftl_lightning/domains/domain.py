@@ -135,7 +135,8 @@ class Domain:
             holds no such state.
         closed_loop: how plans are executed; ``None`` where they cannot be.
         published: the paper's numbers for this domain.
-        omega: the fixed guidance weight of the paper's main figures, as text.
+        omega: the fixed guidance weight of two learned components in our main tables, as text.
+        published_omega: that of the paper's main figures.
     """
 
     name: str
@@ -158,6 +159,7 @@ class Domain:
     closed_loop: ClosedLoop | None = None
     published: tuple[Published, ...] = ()
     omega: str = "1.2"
+    published_omega: str = "1.2"
 
     @property
     def table(self) -> Path:

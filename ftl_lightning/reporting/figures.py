@@ -12,7 +12,7 @@ COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3")
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting beside the paper's, K = 2 and the paper's fixed omega; bars show standard errors over tasks.
+    """A metric of every setting beside the paper's, K = 2 and a fixed omega; bars show standard errors over tasks.
 
     Args:
         domain: the domain.
@@ -30,7 +30,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     published = {
         found.setting: found
         for found in domain.published
-        if not found.task and found.omega == domain.omega and found.metric == metric
+        if not found.task and found.omega == domain.published_omega and found.metric == metric
     }
     chance = rows[rows["K"] == 0]
     drawn = False

@@ -149,5 +149,6 @@ DOMAIN = Domain(
     closed_loop=ClosedLoop(environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, frames=frames),
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
     published=PUBLISHED,
-    omega="1.6",
+    omega="0.6",
+    published_omega="1.6",
 )
