@@ -32,13 +32,15 @@ class EntityEncoder(nn.Module):
 
     The concept is turned into a weight for each column of an entity's looks, and their sum decides which entity is attended to:
     what makes red and what makes a bowl add up in a red bowl that was never seen, and no column is harder to ask for than another.
-    There is one head: several can disagree about where to go, which traps concepts that are learned through them. Exchanging two
-    entities changes nothing. What belongs to no entity goes to each of them, and into the features.
+    There is one head: several can disagree about where to go, which traps concepts that are learned through them. What is read from
+    the attended entity is all but its looks, so that a red bowl is reached like any other. Exchanging two entities changes nothing.
+    What belongs to no entity goes to each of them, and into the features.
 
     Args:
         initial_state_dim: columns of the initial state.
         entities: columns of each entity, in the same order for each.
-        looks: which of an entity's columns, counted from its first, a concept asks for; all where none are named.
+        looks: which of an entity's columns, counted from its first, a concept asks for; where none are named, all are asked for and
+            all are read.
         concept_dim: columns of a concept embedding.
         width: of the features.
     """
@@ -58,15 +60,16 @@ class EntityEncoder(nn.Module):
         # columns are 0 after normalisation.
         shared = [column for column in range(initial_state_dim) if column not in own]
         self.looks = list(looks or range(columns.shape[1]))
+        self.rest = [column for column in range(columns.shape[1]) if column not in looks]
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
-        self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
+        self.entity = nn.Sequential(nn.Linear(len(self.rest) + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
         # Adam turns the query a little (with norm 20, as it is, it would flip it).
         self.query = nn.Linear(concept_dim, len(self.looks))
         nn.init.normal_(self.query.weight, std=0.2)
-        self.value = nn.Linear(inner + columns.shape[1], inner)
+        self.value = nn.Linear(inner + len(self.rest), inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Where the attended entity is gets through without a bend: a plan ends there.
         self.direct = nn.Linear(inner + len(shared), width)
@@ -75,8 +78,9 @@ class EntityEncoder(nn.Module):
         """Features ``(batch, width)`` of ``initial_state (batch, m)``, normalised, for ``concept (batch, n)``."""
         shared = initial_state[:, self.shared]
         each = initial_state[:, self.columns]  # (batch, entity, columns)
-        hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
-        value = self.value(torch.cat((hidden, each), dim=-1))
+        rest = each[..., self.rest]
+        hidden = self.entity(torch.cat((rest, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
+        value = self.value(torch.cat((hidden, rest), dim=-1))
         query = self.query(concept / concept.shape[-1] ** 0.5)[:, None]
         attended = functional.scaled_dot_product_attention(query, each[..., self.looks], value, scale=1.0)[:, 0]
         both = torch.cat((attended, shared), dim=-1)
