@@ -15,6 +15,7 @@ from rich.progress import track
 
 from ftl_lightning.concepts.composition import composed_epsilon
 from ftl_lightning.diffusion import TemporalUNet
+from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.tensor_file import write_text
 
@@ -29,7 +30,7 @@ def milliseconds(horizon: int, components: int, width: int, concepts: int) -> tu
     """Of one step of inversion, and of one denoising step of as many plans without gradient; the fastest of some."""
     domain = load_domain("agent")
     states, initial_dim, n = len(domain.state_names), 52, 384
-    net = TemporalUNet(horizon, states, n, initial_dim, domain.entities, domain.looks, width, initial_encoder="entities")
+    net = TemporalUNet(Sizes(horizon, states, n, initial_dim, domain.entities, domain.looks), width, initial_encoder="entities")
     net.requires_grad_(False).eval()
     batch = concepts * SAMPLES
     x, s0 = torch.randn(batch, horizon, states), torch.randn(batch, initial_dim)

@@ -1,11 +1,10 @@
 """Encoders of the initial state: the paper's, which takes it as one vector, and one that treats exchangeable entities alike."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.errors import UserError
 
 
@@ -13,13 +12,13 @@ class FlatEncoder(nn.Module):
     """The whole initial state through one network, as in the paper; it does not see the concept.
 
     Args:
-        initial_state_dim: columns of the initial state.
+        sizes: of which the initial state's is used.
         width: of the features.
     """
 
-    def __init__(self, initial_state_dim: int, width: int) -> None:
+    def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(nn.Linear(initial_state_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.net = nn.Sequential(nn.Linear(sizes.initial_state_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
 
     def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
         """Features ``(batch, width)`` of ``initial_state (batch, m)``; ``concept (batch, n)`` is not used."""
@@ -37,37 +36,32 @@ class EntityEncoder(nn.Module):
     What belongs to no entity goes to each of them, and into the features.
 
     Args:
-        initial_state_dim: columns of the initial state.
-        entities: columns of each entity, in the same order for each.
-        looks: which of an entity's columns, counted from its first, a concept asks for; where none are named, all are asked for and
-            all are read.
-        concept_dim: columns of a concept embedding.
+        sizes: of the initial state and its entities, of whose columns those a concept asks for are not read; where none are named,
+            all are asked for and all are read.
         width: of the features.
     """
 
     columns: Tensor
     shared: Tensor
 
-    def __init__(
-        self, initial_state_dim: int, entities: Sequence[Sequence[int]], looks: Sequence[int], concept_dim: int, width: int
-    ) -> None:
+    def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        if not entities:
+        if not sizes.entities:
             raise UserError("denoiser_args.initial_encoder: expected flat, found entities, which this domain does not name")
-        columns = torch.tensor([list(entity) for entity in entities])
+        columns = torch.tensor(sizes.entities)
         own = set(columns.flatten().tolist())
         # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
         # columns are 0 after normalisation.
-        shared = [column for column in range(initial_state_dim) if column not in own]
-        self.looks = list(looks or range(columns.shape[1]))
-        self.rest = [column for column in range(columns.shape[1]) if column not in looks]
+        shared = [column for column in range(sizes.initial_state_dim) if column not in own]
+        self.looks = list(sizes.looks or range(columns.shape[1]))
+        self.rest = [column for column in range(columns.shape[1]) if column not in sizes.looks]
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(len(self.rest) + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
         # Adam turns the query a little (with norm 20, as it is, it would flip it).
-        self.query = nn.Linear(concept_dim, len(self.looks))
+        self.query = nn.Linear(sizes.concept_dim, len(self.looks))
         nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + len(self.rest), inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
@@ -91,9 +85,7 @@ class EntityEncoder(nn.Module):
 ENCODERS = ("flat", "entities")
 
 
-def initial_state_encoder(
-    name: str, initial_state_dim: int, entities: Sequence[Sequence[int]], looks: Sequence[int], concept_dim: int, width: int
-) -> FlatEncoder | EntityEncoder:
+def initial_state_encoder(name: str, sizes: Sizes, width: int) -> FlatEncoder | EntityEncoder:
     """An encoder by its name in a configuration.
 
     Raises:
@@ -101,6 +93,4 @@ def initial_state_encoder(
     """
     if name not in ENCODERS:
         raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")
-    if name == "flat":
-        return FlatEncoder(initial_state_dim, width)
-    return EntityEncoder(initial_state_dim, entities, looks, concept_dim, width)
+    return FlatEncoder(sizes, width) if name == "flat" else EntityEncoder(sizes, width)

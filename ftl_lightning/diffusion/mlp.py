@@ -1,22 +1,12 @@
 """The MLP denoiser of the paper's object rearrangement domain."""
 
-import math
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.diffusion.initial_state import initial_state_encoder
 from ftl_lightning.errors import UserError
-
-
-def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) -> Tensor:
-    """``(batch, dimension)`` features of the timestep ``t (batch,)`` (Vaswani et al., 2017); ``dimension`` is even."""
-    half = dimension // 2
-    frequency = torch.exp(torch.arange(half, device=t.device) * (-math.log(period) / (half - 1)))
-    angle = t[:, None] * frequency
-    return torch.cat((angle.sin(), angle.cos()), dim=-1)
 
 
 class MLPDenoiser(nn.Module):
@@ -26,12 +16,7 @@ class MLPDenoiser(nn.Module):
     to than a concept that is only concatenated to the input. Hidden layers are residual.
 
     Args:
-        horizon: states in a plan.
-        state_dim: columns of a state.
-        concept_dim: columns of a concept embedding.
-        initial_state_dim: columns of the initial state; 0 where the domain has none.
-        entities: columns of the initial state for each exchangeable entity.
-        looks: which of an entity's columns a concept asks for.
+        sizes: of plans, concepts and initial states.
         hidden_dim: width.
         depth: hidden layers.
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
@@ -43,12 +28,7 @@ class MLPDenoiser(nn.Module):
 
     def __init__(
         self,
-        horizon: int,
-        state_dim: int,
-        concept_dim: int,
-        initial_state_dim: int = 0,
-        entities: Sequence[Sequence[int]] = (),
-        looks: Sequence[int] = (),
+        sizes: Sizes,
         hidden_dim: int = 512,
         depth: int = 4,
         condition_dim: int = 384,
@@ -62,18 +42,15 @@ class MLPDenoiser(nn.Module):
             raise UserError(f"denoiser_args.time_dim: expected an even number from 4 up, found {time_dim}")
         self.time_dim = time_dim
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
-        self.concept = nn.Sequential(nn.Linear(concept_dim, condition_dim), nn.SiLU())
-        self.initial = (
-            initial_state_encoder(initial_encoder, initial_state_dim, entities, looks, concept_dim, initial_dim)
-            if initial_state_dim
-            else None
-        )
-        inputs = [horizon * state_dim + (initial_dim if initial_state_dim else 0)] + [hidden_dim] * (depth - 1)
+        self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, condition_dim), nn.SiLU())
+        plan = sizes.horizon * sizes.state_dim
+        self.initial = initial_state_encoder(initial_encoder, sizes, initial_dim) if sizes.initial_state_dim else None
+        inputs = [plan + (initial_dim if sizes.initial_state_dim else 0)] + [hidden_dim] * (depth - 1)
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
         self.time_film = nn.Linear(time_dim, 2 * hidden_dim * depth)
         self.concept_film = nn.Linear(condition_dim, 2 * hidden_dim * depth, bias=False)
         self.dropout = nn.Dropout(dropout)
-        self.head = nn.Linear(hidden_dim, horizon * state_dim)
+        self.head = nn.Linear(hidden_dim, plan)
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
         """Estimated noise ``(batch, horizon, state)``.

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.diffusion.initial_state import initial_state_encoder
-from ftl_lightning.diffusion.mlp import sinusoidal_embedding
 from ftl_lightning.errors import UserError
 
 KERNEL, GROUPS = 5, 8
@@ -66,12 +66,7 @@ class TemporalUNet(nn.Module):
     """Estimates noise from the noisy plan, the timestep, the concept and the initial state.
 
     Args:
-        horizon: states in a plan; a multiple of 2 to the number of levels less one.
-        state_dim: columns of a state.
-        concept_dim: columns of a concept embedding.
-        initial_state_dim: columns of the initial state; 0 where the domain has none.
-        entities: columns of the initial state for each exchangeable entity.
-        looks: which of an entity's columns a concept asks for.
+        sizes: of plans, concepts and initial states; the horizon is a multiple of 2 to the number of levels less one.
         width: channels of the first level, and columns of each of the condition's three parts; the paper's size is 128.
         multipliers: channels of the levels, in widths.
         initial_encoder: ``'flat'`` (the paper's) or ``'entities'``.
@@ -88,12 +83,7 @@ class TemporalUNet(nn.Module):
 
     def __init__(
         self,
-        horizon: int,
-        state_dim: int,
-        concept_dim: int,
-        initial_state_dim: int = 0,
-        entities: Sequence[Sequence[int]] = (),
-        looks: Sequence[int] = (),
+        sizes: Sizes,
         width: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8),
         initial_encoder: str = "flat",
@@ -103,30 +93,26 @@ class TemporalUNet(nn.Module):
     ) -> None:
         super().__init__()
         factor = 2 ** (len(multipliers) - 1)
-        if horizon % factor:
+        if sizes.horizon % factor:
             halvings = len(multipliers) - 1
             raise UserError(
-                f"horizon: expected a multiple of {factor} (the temporal U-Net halves it {halvings} times), found {horizon}"
+                f"horizon: expected a multiple of {factor} (the temporal U-Net halves it {halvings} times), found {sizes.horizon}"
             )
         if width < GROUPS or width % GROUPS:
             raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
         if clock % 2:
             raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
-        self.width, self.broadcast = width, broadcast and initial_state_dim > 0
-        angle = torch.linspace(0, math.pi, horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
+        self.width, self.broadcast = width, broadcast and sizes.initial_state_dim > 0
+        angle = torch.linspace(0, math.pi, sizes.horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.concept = nn.Sequential(nn.Linear(concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.initial = (
-            initial_state_encoder(initial_encoder, initial_state_dim, entities, looks, concept_dim, width)
-            if initial_state_dim
-            else None
-        )
-        condition = width * (3 if initial_state_dim else 2)
+        self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.initial = initial_state_encoder(initial_encoder, sizes, width) if sizes.initial_state_dim else None
+        condition = width * (3 if sizes.initial_state_dim else 2)
         channels = [width * multiplier for multiplier in multipliers]
         self.down = nn.ModuleList(
             Level(inputs, outputs, condition, film)
-            for inputs, outputs in itertools.pairwise([state_dim + clock + (width if self.broadcast else 0), *channels])
+            for inputs, outputs in itertools.pairwise([sizes.state_dim + clock + (width if self.broadcast else 0), *channels])
         )
         self.shrink = nn.ModuleList(nn.Conv1d(width, width, 3, stride=2, padding=1) for width in channels[:-1])
         self.middle = Level(channels[-1], channels[-1], condition, film)
@@ -134,7 +120,7 @@ class TemporalUNet(nn.Module):
             Level(2 * inputs, outputs, condition, film) for inputs, outputs in itertools.pairwise(reversed(channels))
         )
         self.grow = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, stride=2, padding=1) for width in channels[-2::-1])
-        self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, state_dim, 1))
+        self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, sizes.state_dim, 1))
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
         """Estimated noise ``(batch, horizon, state)``.

@@ -13,6 +13,7 @@ from ftl_lightning import diffusion
 from ftl_lightning.concepts.composition import composed_epsilon
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction
 from ftl_lightning.diffusion.samplers import Sampler
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
@@ -23,38 +24,29 @@ KIND = "generative model"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 
 
-@dataclass(frozen=True)
-class ModelConfig:
-    """What is needed to build a model before its weights are read.
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig(Sizes):
+    """What is needed to build a model before its weights are read, beside the sizes.
 
     Attributes:
         domain: name of the domain.
-        horizon, state_dim, initial_state_dim, concept_dim: sizes.
         training_concepts: texts, in the order of the model's table of training embeddings.
         encoder: identity of the text encoder.
         denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
         denoiser_args: its arguments other than the sizes.
         diffusion_steps: T.
         prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'`` or ``'displacement'``.
-        entities: columns of the initial state for each exchangeable entity.
-        looks: which of an entity's columns a concept asks for; all where empty.
         state_columns: columns of the initial state that hold the state a plan starts from.
         training: how it was trained, for the record.
     """
 
     domain: str
-    horizon: int
-    state_dim: int
-    initial_state_dim: int
-    concept_dim: int
     training_concepts: tuple[str, ...]
     encoder: str
     denoiser: str = "MLPDenoiser"
     denoiser_args: Mapping[str, Any] = field(default_factory=dict)
     diffusion_steps: int = 100
     prediction: str = "epsilon"
-    entities: tuple[tuple[int, ...], ...] = ()
-    looks: tuple[int, ...] = ()
     state_columns: tuple[int, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
 
@@ -71,15 +63,7 @@ def build_denoiser(config: ModelConfig) -> nn.Module:
         raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {config.prediction!r}")
     kind: type[nn.Module] = getattr(diffusion, config.denoiser)
     try:
-        denoiser = kind(
-            horizon=config.horizon,
-            state_dim=config.state_dim,
-            initial_state_dim=config.initial_state_dim,
-            concept_dim=config.concept_dim,
-            entities=config.entities,
-            looks=config.looks,
-            **config.denoiser_args,
-        )
+        denoiser = kind(config, **config.denoiser_args)
     except TypeError as error:
         raise UserError(f"denoiser_args: {config.denoiser} does not take them ({error})") from error
     if config.prediction == "epsilon":

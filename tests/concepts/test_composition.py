@@ -5,10 +5,11 @@ from hypothesis import strategies as st
 
 from ftl_lightning.concepts.composition import composed_epsilon, parse_composition
 from ftl_lightning.diffusion import MLPDenoiser
+from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.errors import UserError
 
 torch.manual_seed(0)
-DENOISER = MLPDenoiser(horizon=2, state_dim=3, concept_dim=4, initial_state_dim=5, hidden_dim=16, depth=2, condition_dim=8)
+DENOISER = MLPDenoiser(Sizes(horizon=2, state_dim=3, concept_dim=4, initial_state_dim=5), hidden_dim=16, depth=2, condition_dim=8)
 EMPTY = torch.randn(4)
 
 

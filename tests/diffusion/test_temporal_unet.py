@@ -1,9 +1,12 @@
 """The temporal U-Net and the encoders of the initial state."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet
+from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.initial_state import EntityEncoder
 from ftl_lightning.diffusion.prediction import LOSSES, Prediction, loss_weights
 from ftl_lightning.diffusion.schedule import add_noise, cosine_alpha_bar
@@ -11,6 +14,7 @@ from ftl_lightning.errors import UserError
 
 ENTITIES = ((4, 5), (7, 8))
 """Columns of two entities among ten; 6 and 9 tell which is which and are constant in use."""
+SIZES = Sizes(horizon=16, state_dim=5, concept_dim=7, initial_state_dim=10, entities=ENTITIES)
 
 
 def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
@@ -24,7 +28,7 @@ def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
 
 def unet(**options: object) -> TemporalUNet:
     torch.manual_seed(0)
-    return TemporalUNet(16, 5, 7, 10, ENTITIES, width=8, **options).eval()  # type: ignore[arg-type]
+    return TemporalUNet(SIZES, width=8, **options).eval()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -63,12 +67,12 @@ def test_exchanging_entities_changes_nothing_unless_the_encoder_is_flat() -> Non
         net = unet(initial_encoder=encoder)
         out = net(x, t, concepts, index, initial)
         assert torch.allclose(out, net(x, t, concepts, index, swapped), atol=1e-6) == same
-    mlp = MLPDenoiser(16, 5, 7, 10, ENTITIES, initial_encoder="entities")
+    mlp = MLPDenoiser(SIZES, initial_encoder="entities")
     torch.testing.assert_close(mlp(x, t, concepts, index, initial), mlp(x, t, concepts, index, swapped))
 
 
 def test_a_gradient_reaches_the_concept_through_the_attention_alone() -> None:
-    encoder = EntityEncoder(10, ENTITIES, (), 7, 8)
+    encoder = EntityEncoder(SIZES, 8)
     concept = torch.randn(3, 7, requires_grad=True)
     encoder(inputs()[-1], concept).sum().backward()
     assert concept.grad is not None
@@ -80,7 +84,7 @@ def test_a_concept_tells_entities_apart_by_their_looks() -> None:
     initial[:, 8] = initial[:, 5]  # the second of two columns is the same for both entities
     one, other = torch.randn(2, len(initial), 7)
     for looks, same in (((1,), True), ((), False)):
-        encoder = EntityEncoder(10, ENTITIES, looks, 7, 8)
+        encoder = EntityEncoder(replace(SIZES, looks=looks), 8)
         assert torch.allclose(encoder(initial, one), encoder(initial, other), atol=1e-6) == same
         changed = initial.clone()
         changed[:, [5, 8]] += 1  # of both alike: it tells nothing about which, and what is read from an entity is not its looks
@@ -88,17 +92,17 @@ def test_a_concept_tells_entities_apart_by_their_looks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("sizes", "options", "expected"),
     [
-        ({"horizon": 12}, "horizon: expected a multiple of 8"),
-        ({"width": 12}, "width: expected a multiple of 8"),
-        ({"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities"),
-        ({"initial_encoder": "entities", "entities": ()}, "expected flat"),
+        ({"horizon": 12}, {}, "horizon: expected a multiple of 8"),
+        ({}, {"width": 12}, "width: expected a multiple of 8"),
+        ({}, {"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities"),
+        ({"entities": ()}, {"initial_encoder": "entities"}, "expected flat"),
     ],
 )
-def test_sizes_that_do_not_fit(options: dict[str, object], expected: str) -> None:
+def test_sizes_that_do_not_fit(sizes: dict[str, object], options: dict[str, object], expected: str) -> None:
     with pytest.raises(UserError, match=expected):
-        TemporalUNet(**{"horizon": 16, "state_dim": 5, "concept_dim": 7, "initial_state_dim": 10} | options)  # type: ignore[arg-type]
+        TemporalUNet(replace(SIZES, **sizes), **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["v", "clean", "displacement"])
