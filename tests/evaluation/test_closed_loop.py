@@ -87,7 +87,16 @@ def test_fixed_plans_are_chosen_by_episode() -> None:
 def model() -> GenerativeModel:
     torch.manual_seed(0)
     config = ModelConfig(
-        "agent", 16, 1, 1, 6, ("a", "b"), "none", "TemporalUNet", {"width": 8, "multipliers": [1, 2]}, diffusion_steps=10
+        domain="agent",
+        horizon=16,
+        state_dim=1,
+        initial_state_dim=1,
+        concept_dim=6,
+        training_concepts=("a", "b"),
+        encoder="none",
+        denoiser="TemporalUNet",
+        denoiser_args={"width": 8, "multipliers": [1, 2]},
+        diffusion_steps=10,
     )
     limits = torch.tensor([-10.0]), torch.tensor([10.0])
     return GenerativeModel(config, Normalization(*limits), torch.randn(3, 6), Normalization(*limits)).eval()
