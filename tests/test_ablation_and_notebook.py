@@ -12,7 +12,14 @@ from ftl_lightning.cli import main
 from ftl_lightning.evaluation.results import read_rows
 from tests.conftest import CONF, ROOT
 
-NOTEBOOK = ROOT / "notebooks" / "object_rearrangement.ipynb"
+NOTEBOOKS = ROOT / "notebooks"
+
+
+def run(name: str, folder: Path) -> list[str]:
+    """Tables that a notebook shows when it is run in a folder."""
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(folder)}}).execute()
+    return [output.get("data", {}).get("text/markdown", "") for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
 def test_cells_are_the_product_of_the_grid() -> None:
@@ -38,10 +45,7 @@ def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
     config = "conf/ablation/smoke.yaml"
     monkeypatch.setenv("FTL_ABLATION", config)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(checkout)}}).execute()
-    shown = [output.get("data", {}).get("text/markdown", "") for cell in notebook.cells for output in cell.get("outputs", [])]
-    assert sum("| paper |" in text for text in shown) == 4
+    assert sum("| paper |" in text for text in run("object_rearrangement", checkout)) == 4
     path = yaml.safe_load((CONF / "ablation" / "smoke.yaml").read_text())["results"]
     rows = read_rows(path)
     assert set(rows["seed"]) == {0, 1}
@@ -53,8 +57,15 @@ def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
     assert read_rows(path).equals(rows)
 
 
-def test_the_notebook_holds_no_logic() -> None:
-    code = [cell.source for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
+def test_the_notebook_of_navigation_shows_the_committed_results(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (checkout / "results").symlink_to(ROOT / "results")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    assert sum("| paper |" in text for text in run("agent", checkout)) == 5
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_holds_no_logic(path: Path) -> None:
+    code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     assert not any(word in source for source in code for word in ("def ", "class ", ".mean(", ".std("))
 
 
