@@ -92,7 +92,9 @@ def our_inversion(pretrained: str, concepts: list[str], steps: int) -> list[Conc
 def accuracy(model: GenerativeModel, task: str, concepts: Tensor, weights: Tensor) -> float:
     """Share of 50 samples that show the task."""
     states = model.sample([concepts], [weights], 50, ddpm, 100, TEMPERATURE, [generator("cpu", 0)])[0]
-    return float(load_domain(model.config.domain).succeeded(task, states, None).float().mean())
+    succeeded = load_domain(model.config.domain).succeeded
+    assert succeeded is not None
+    return float(succeeded(task, states, None).float().mean())
 
 
 def main() -> None:

@@ -6,7 +6,9 @@ from typing import Literal
 from ftl_lightning.ablation import Stage
 
 
-def generate(domain: str, task: str = "", count: int = 100, seed: int = 0, out: str = "demonstrations.safetensors") -> None:
+def generate(
+    domain: str, task: str = "", count: int = 100, seed: int = 0, workers: int = 1, out: str = "demonstrations.safetensors"
+) -> None:
     """Draw demonstrations of a task into a file.
 
     Args:
@@ -14,6 +16,7 @@ def generate(domain: str, task: str = "", count: int = 100, seed: int = 0, out: 
         task: in words, for example "circle right of square and triangle above square"; empty for every training concept.
         count: demonstrations of the task, or of each training concept.
         seed: the same seed gives the same bytes.
+        workers: processes, in domains whose expert takes long; a run that was stopped goes on where it was.
         out: file to write.
     """
     from ftl_lightning.domains.domain import load_domain
@@ -23,8 +26,10 @@ def generate(domain: str, task: str = "", count: int = 100, seed: int = 0, out: 
         raise UserError(f"count: expected 1 or more, found {count}")
     if seed < 0:
         raise UserError(f"seed: expected 0 or more, found {seed}")
+    if workers < 1:
+        raise UserError(f"workers: expected 1 or more, found {workers}")
     source = load_domain(domain)
-    demonstrations = source.generate(task, count, seed) if task else source.training_set(count, seed)
+    demonstrations = source.generate(task, count, seed, workers) if task else source.training_set(count, seed)
     demonstrations.save(out)
     print(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(source.training_concepts)} training concepts'}")
 
@@ -94,7 +99,7 @@ def sample(
     from ftl_lightning.diffusion.samplers import SAMPLERS
     from ftl_lightning.domains.domain import load_domain
     from ftl_lightning.errors import UserError
-    from ftl_lightning.evaluation.closed_loop import roll_out, sampled_plans
+    from ftl_lightning.evaluation.closed_loop import following, roll_out, sampled_plans
     from ftl_lightning.evaluation.tensorboard import gif
     from ftl_lightning.learning.generative_model import GenerativeModel
     from ftl_lightning.seeding import generator
@@ -166,7 +171,7 @@ def sample(
     )
     result.save(out)
     print(f"{out}: {count} samples")
-    right = domain.succeeded(goal, states, starts) if goal else None
+    right = domain.succeeded(goal, states, starts) if goal and domain.succeeded else None
     if right is not None:
         print(f"accuracy on '{goal}': {right.float().mean():.2f}")
     if figure:
@@ -183,9 +188,9 @@ def sample(
             temperature,
             [generator("cpu", seed, 1, episode) for episode in range(count)],
         )
-        rollout = roll_out(domain.closed_loop, starts, plan, replan)
+        rollout = roll_out(domain.closed_loop, starts, following(plan, domain.closed_loop.act, replan))
         if goal:
-            for name, values in domain.closed_loop.judge(goal, rollout.observations).items():
+            for name, values in domain.closed_loop.judge(goal, rollout.observations, rollout.infos).items():
                 print(f"closed loop, {name}: {values.float().mean():.2f} of {count} episodes")
         if animation:
             with atomic(animation) as temporary:

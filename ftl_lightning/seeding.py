@@ -3,6 +3,13 @@
 import numpy as np
 import torch
 
+VALIDATION_SEED = 1_000_000
+"""Added to the seed of held-out demonstrations."""
+DEMONSTRATION_SEED = 2_000_000
+"""Added to the seed of new tasks' demonstrations, so that they share no random stream with pretraining."""
+EVALUATION_SEED = 3_000_000
+"""Added to the seed of new initial states, so that they share no random stream with demonstrations."""
+
 
 def generator(device: torch.device | str, *key: int) -> torch.Generator:
     """A generator that the key alone decides, for example ``(seed, step)``.

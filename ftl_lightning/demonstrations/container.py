@@ -77,26 +77,30 @@ class Demonstrations:
 
     def select(self, concept: str) -> Self:
         """The demonstrations of one concept."""
-        chosen = [index for index, text in enumerate(self.concepts) if text == concept]
+        return self.rows([index for index, text in enumerate(self.concepts) if text == concept])
+
+    def rows(self, chosen: Sequence[int]) -> Self:
+        """Some of the demonstrations."""
         return replace(
             self,
             states=self.states[chosen],
             lengths=self.lengths[chosen],
-            concepts=(concept,) * len(chosen),
+            concepts=tuple(self.concepts[row] for row in chosen),
             initial_states=None if self.initial_states is None else self.initial_states[chosen],
         )
 
-    def starts(self, rows: Tensor, share: Tensor) -> Tensor:
+    def starts(self, rows: Tensor, share: Tensor, early: float) -> Tensor:
         """Times at which windows start ``(window,)`` int64; 0 where only a demonstration's first initial state is known.
 
         Args:
             rows: ``(window,)`` int64, which demonstration.
-            share: ``(window,)``, evenly spread over [0, 1). Its cube is the share of the demonstration before the window: half of
-                the windows start in the first eighth, where the first plan is made and nearly everything is still to be done.
+            share: ``(window,)``, evenly spread over [0, 1). To the power of ``early`` it is the share of the demonstration before
+                the window.
+            early: 1 or more; with 3 half of the windows start in the first eighth.
         """
         if self.initial_states is not None and self.initial_states.dim() == 2:
             return torch.zeros_like(rows)
-        return (share**3 * self.lengths[rows]).long()
+        return (share**early * self.lengths[rows]).long()
 
     def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, Tensor | None]:
         """Stretches of demonstrations, padded with the last state.
@@ -172,16 +176,24 @@ class Demonstrations:
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
-    """Demonstrations of the same domain and length, one after another; the first one's provenance is kept."""
+    """Demonstrations of the same domain one after another, padded to the longest; the first one's provenance is kept."""
     first = parts[0]
-    initial = [part.initial_states for part in parts if part.initial_states is not None]
+    longest = max(part.states.shape[1] for part in parts)
+    initial = [_padded(part.initial_states, longest) for part in parts if part.initial_states is not None]
     return replace(
         first,
-        states=torch.cat([part.states for part in parts]),
+        states=torch.cat([_padded(part.states, longest) for part in parts]),
         lengths=torch.cat([part.lengths for part in parts]),
         concepts=tuple(text for part in parts for text in part.concepts),
         initial_states=torch.cat(initial) if initial else None,
     )
+
+
+def _padded(values: Tensor, time: int) -> Tensor:
+    """``(demo, time, column)`` with its last time repeated; what is known for the first time alone stays as it is."""
+    if values.dim() == 2:
+        return values
+    return torch.cat((values, values[:, -1:].expand(-1, time - values.shape[1], -1)), dim=1)
 
 
 def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

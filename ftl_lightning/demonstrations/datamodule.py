@@ -17,12 +17,7 @@ from ftl_lightning.concepts.encoder import Encoder, load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain, load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.seeding import generator
-
-VALIDATION_SEED = 1_000_000
-"""Added to the seed of held-out demonstrations."""
-DEMONSTRATION_SEED = 2_000_000
-"""Added to the seed of new tasks' demonstrations, so that they share no random stream with pretraining."""
+from ftl_lightning.seeding import DEMONSTRATION_SEED, VALIDATION_SEED, generator
 
 
 class Batch(NamedTuple):
@@ -105,8 +100,17 @@ class PretrainingData(pl.LightningDataModule):
 
     def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
         concepts = torch.tensor([self.domain.training_concepts.index(demonstrations.concepts[row]) for row in rows.tolist()])
-        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw))
+        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw), self.domain.early)
         states, initial = demonstrations.windows(rows, starts, self.horizon)
+        return Batch(states, concepts, initial)
+
+    def every_window(self) -> Batch:
+        """One window from each time of each demonstration."""
+        lengths = self.training.lengths
+        rows = torch.arange(len(lengths)).repeat_interleave(lengths)
+        starts = torch.cat([torch.arange(length) for length in lengths.tolist()])
+        concepts = torch.tensor([self.domain.training_concepts.index(text) for text in self.training.concepts])[rows]
+        states, initial = self.training.windows(rows, starts, self.horizon)
         return Batch(states, concepts, initial)
 
     def train_dataloader(self) -> DataLoader[Batch]:

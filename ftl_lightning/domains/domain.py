@@ -5,7 +5,7 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import gymnasium
 import numpy as np
@@ -84,26 +84,56 @@ class Published:
     metric: str = "accuracy"
 
 
+Policy = Callable[[Tensor, list[int], int], Tensor]
+"""``(observations (episode, m), which episodes, step) -> actions (episode, action)``; not finite where there is none."""
+
+
 @dataclass(frozen=True)
 class ClosedLoop:
     """How a domain executes plans.
 
     Attributes:
         environment: makes an environment whose observation is an initial state ``(m,)`` and whose ``reset`` takes one as
-            ``options={'initial_state': ...}``.
+            ``options={'initial_state': ...}``. What its last step tells (``info``) is what ``judge`` knows besides observations.
         act: the planner, ``(plans (episode, horizon, state), steps since they were made, observations (episode, m)) ->
             actions (episode, action)``.
         steps: at most, of an episode.
-        judge: ``(goal, observations (episode, time, m)) -> what happened``, by name ``(episode,)`` of bool; ``'success'`` is the
-            paper's metric. Observations are padded with the last one.
+        judge: ``(goal, observations (episode, time, m), what the environment told at the end of each) -> what happened``, by name
+            ``(episode,)``; ``'success'``, of bool, is the paper's metric. Observations are padded with the last one.
         frames: ``observations (time, m) -> pictures (height, width, 3)`` of an episode.
+        headline: what of that the method and others are compared by, episode for episode.
+        policies: policies to print beside every rate: name to ``(goal, initial states (episode, m), demonstrations that the
+            behaviour was learned from or None, seed) -> policy``, or ``None`` where it would take too long.
     """
 
     environment: Callable[[], gymnasium.Env[Any, Any]]
     act: Callable[[Tensor, int, Tensor], Tensor]
     steps: int
-    judge: Callable[[str, Tensor], dict[str, Tensor]]
+    judge: Callable[[str, Tensor, Sequence[Mapping[str, Any]]], dict[str, Tensor]]
     frames: Callable[[Tensor], list[NDArray[np.uint8]]]
+    headline: str = "success"
+    policies: Mapping[str, Callable[[str, Tensor, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
+
+
+class Generate(Protocol):
+    """Draws demonstrations; the same task, count and seed give the same bytes, whatever the number of processes."""
+
+    def __call__(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations: ...
+
+
+@dataclass(frozen=True)
+class View:
+    """How a model sees behaviour, where it is not as it stands in files.
+
+    Attributes:
+        encode: ``(states (sample, horizon, state), initial states (sample, m)) -> (sample, horizon, state)``.
+        decode: its inverse.
+        observe: ``initial states (sample, m) -> (sample, what the model is conditioned on)``.
+    """
+
+    encode: Callable[[Tensor, Tensor], Tensor]
+    decode: Callable[[Tensor, Tensor], Tensor]
+    observe: Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -119,20 +149,24 @@ class Domain:
             and any other, such as ``'components'`` (what each learned component generates alone).
         descriptions: every text that the shipped table of embeddings holds besides the empty one.
         training_set: ``(samples per concept, seed) -> demonstrations`` of every training concept.
-        generate: ``(task, count, seed) -> demonstrations`` of any task of the domain's grammar.
-        reads: whether a text is a goal that :attr:`succeeded` can judge.
+        generate: demonstrations of any task of the domain's grammar.
+        reads: whether a text is a goal that behaviour can be judged by.
         succeeded: ``(goal, states (sample, horizon, state), initial states (sample, m) or None) -> (sample,)`` of bool, the paper's
-            metric of plans.
+            metric of plans; ``None`` where only what comes of them is judged.
         render: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title, initial states
             (sample, m) or None) -> figure``.
         references: trivial policies to print beside every rate: name to ``(goal, samples, initial states (sample, m) or None, seed)
             -> states (sample, horizon, state)``.
         initial_states: ``(task, count, seed) -> (count, m)``, new initial states of a task; ``None`` where behaviour has none.
+        views: by name, how a model may see behaviour; without any, as it is. The columns below are of what it sees.
         entities: columns of an initial state for each of its exchangeable entities, in the same order for each; the other columns
             say nothing about a single entity.
         looks: which of an entity's columns, counted from its first, a concept asks for when it names an entity; all where empty.
         state_columns: columns of an initial state that hold the state a plan starts from, in a state's order; none where it
             holds no such state.
+        early: how much more often windows start early in a demonstration, see
+            :meth:`~ftl_lightning.demonstrations.container.Demonstrations.starts`; 3 where a plan reaches over the whole
+            behaviour, so that the first one matters most, 1 where it is short.
         closed_loop: how plans are executed; ``None`` where they cannot be.
         published: the paper's numbers for this domain.
         omega: the fixed guidance weight of two learned components in our main tables, as text.
@@ -147,15 +181,17 @@ class Domain:
     suites: Mapping[str, Suite]
     descriptions: tuple[str, ...]
     training_set: Callable[[int, int], Demonstrations]
-    generate: Callable[[str, int, int], Demonstrations]
+    generate: Generate
     reads: Callable[[str], bool]
-    succeeded: Callable[[str, Tensor, Tensor | None], Tensor]
+    succeeded: Callable[[str, Tensor, Tensor | None], Tensor] | None
     render: Callable[[Tensor, Sequence[bool] | None, str, Tensor | None], Figure]
     references: Mapping[str, Callable[[str, int, Tensor | None, int], Tensor]] = field(default_factory=dict)
     initial_states: Callable[[str, int, int], Tensor] | None = None
+    views: Mapping[str, View] = field(default_factory=dict)
     entities: tuple[tuple[int, ...], ...] = ()
     looks: tuple[int, ...] = ()
     state_columns: tuple[int, ...] = ()
+    early: float = 1.0
     closed_loop: ClosedLoop | None = None
     published: tuple[Published, ...] = ()
     omega: str = "1.2"

@@ -1,17 +1,20 @@
 """Executing plans: environments step in lock-step, their plans are made in one batch (paper, 'closed loop')."""
 
+import itertools
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from rich.progress import Progress
 from torch import Tensor
 
 from ftl_lightning.diffusion.samplers import Sampler
-from ftl_lightning.domains.domain import ClosedLoop
+from ftl_lightning.domains.domain import ClosedLoop, Policy
 from ftl_lightning.learning.generative_model import GenerativeModel
 
 _LOG = logging.getLogger(__name__)
@@ -28,70 +31,97 @@ class Rollout:
 
     Attributes:
         observations: ``(episode, steps + 1, m)``, padded with an episode's last one.
-        failed: ``(episode,)`` of bool: a plan was not finite, and the episode ended there.
+        failed: ``(episode,)`` of bool: the policy had no finite action or the environment raised an error; the episode ended there.
+        infos: what the environment told of each episode's last step, by name.
     """
 
     observations: Tensor
     failed: Tensor
+    infos: Sequence[Mapping[str, Any]]
+
+    def split(self, counts: Sequence[int]) -> list["Rollout"]:
+        """The same in parts of so many episodes."""
+        ends = list(itertools.accumulate(counts))
+        return [
+            Rollout(self.observations[start:end], self.failed[start:end], self.infos[start:end])
+            for start, end in zip([0, *ends], ends, strict=False)
+        ]
 
 
-def roll_out(loop: ClosedLoop, initial_states: Tensor, plan: Plan, replan: int) -> Rollout:
+def roll_out(loop: ClosedLoop, initial_states: Tensor, policy: Policy) -> Rollout:
     """Run one episode from each initial state until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
 
     Args:
-        loop: the domain's environment and planner.
+        loop: the domain's environment.
         initial_states: ``(episode, m)``.
-        plan: makes the plans of those episodes that still run.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
+        policy: acts in those episodes that still run.
     """
     count = len(initial_states)
-    observations = initial_states[:, None].repeat(1, loop.steps + 1, 1)
-    failed = torch.zeros(count, dtype=torch.bool)
+    found = Rollout(
+        initial_states[:, None].repeat(1, loop.steps + 1, 1), torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)]
+    )
     with Progress(transient=True) as progress:
         bar = progress.add_task(f"{count} episodes", total=loop.steps * math.ceil(count / SIDE_BY_SIDE))
         for rows in torch.arange(count).split(SIDE_BY_SIDE):
-            _lock_step(loop, rows.tolist(), observations, failed, plan, replan, lambda: progress.advance(bar))
-    return Rollout(observations, failed)
+            _lock_step(loop, rows.tolist(), found, policy, lambda: progress.advance(bar))
+    return found
 
 
-def _lock_step(
-    loop: ClosedLoop,
-    rows: list[int],
-    observations: Tensor,
-    failed: Tensor,
-    plan: Plan,
-    replan: int,
-    advance: Callable[[], None],
-) -> None:
-    """Run these episodes together, one step of each after the other, and fill in their observations and failures."""
-    environments = {row: loop.environment() for row in rows}
+def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy, advance: Callable[[], None]) -> None:
+    """Run these episodes together, one step of each after the other, and fill in what happened."""
+    environments: dict[int, gymnasium.Env[Any, Any]] = {}
+    observations = found.observations
     try:
-        for row, environment in environments.items():
+        for row in rows:
+            environments[row] = loop.environment()
             initial = observations[row, 0].numpy()
-            observations[row] = torch.as_tensor(environment.reset(options={"initial_state": initial})[0])
-        active, plans = rows, torch.empty(0)
+            observations[row] = torch.as_tensor(environments[row].reset(options={"initial_state": initial})[0])
+        active = rows
         for step in range(loop.steps):
             advance()
-            if active and step % replan == 0:
-                plans = plan(observations[active, step], active)
-                finite = plans.isfinite().flatten(1).all(dim=1)
-                for row in [row for row, good in zip(active, finite.tolist(), strict=True) if not good]:
-                    failed[row] = True
-                    _LOG.warning("episode %d, step %d: the plan is not finite; the episode counts as failed", row, step)
-                active, plans = [row for row, good in zip(active, finite.tolist(), strict=True) if good], plans[finite]
             if not active:
                 break
-            actions = loop.act(plans, step % replan, observations[active, step]).numpy().astype(np.float32)
+            actions = policy(observations[active, step], active, step).numpy().astype(np.float32)
             going = []
-            for place, row in enumerate(active):
-                seen, _, terminated, truncated, _ = environments[row].step(actions[place])
+            for row, action in zip(active, actions, strict=True):
+                if not np.isfinite(action).all():
+                    found.failed[row] = True
+                    _LOG.warning("episode %d, step %d: the plan is not finite; the episode counts as failed", row, step)
+                    continue
+                try:
+                    seen, _, terminated, truncated, info = environments[row].step(action)
+                except Exception as error:  # whatever a simulator raises: the other episodes go on
+                    found.failed[row] = True
+                    _LOG.warning("episode %d, step %d: %s; the episode counts as failed", row, step, repr(error))
+                    continue
                 observations[row, step + 1 :] = torch.as_tensor(seen)
+                found.infos[row].update(info)  # type: ignore[attr-defined]
                 if not (terminated or truncated):
-                    going.append(place)
-            active, plans = [active[place] for place in going], plans[going]
+                    going.append(row)
+            active = going
     finally:
         for environment in environments.values():
             environment.close()
+
+
+def following(plan: Plan, act: Callable[[Tensor, int, Tensor], Tensor], replan: int) -> Policy:
+    """The policy that follows plans. Where one holds a number that is not finite, there is no action.
+
+    Args:
+        plan: makes plans.
+        act: the domain's planner, see :class:`~ftl_lightning.domains.domain.ClosedLoop`.
+        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
+    """
+    plans: dict[int, Tensor] = {}
+
+    def policy(observations: Tensor, rows: list[int], step: int) -> Tensor:
+        if step % replan == 0:
+            made = plan(observations, rows)
+            finite = made.isfinite().flatten(1).all(dim=1)
+            plans.update(zip(rows, torch.where(finite[:, None, None], made, torch.nan), strict=True))
+        return act(torch.stack([plans[row] for row in rows]), step % replan, observations)
+
+    return policy
 
 
 def sampled_plans(

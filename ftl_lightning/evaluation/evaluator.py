@@ -17,20 +17,21 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from ftl_lightning import __version__
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import SAMPLERS
-from ftl_lightning.domains.domain import Domain, EvaluationTask, Suite, load_domain
+from ftl_lightning.domains.domain import Domain, EvaluationTask, Policy, Suite, load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.closed_loop import Plan, Rollout, fixed_plans, roll_out, sampled_plans
+from ftl_lightning.evaluation.closed_loop import Rollout, fixed_plans, following, roll_out, sampled_plans
 from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.seeding import generator
+from ftl_lightning.seeding import EVALUATION_SEED, generator
 from ftl_lightning.tensor_file import content_hash, file_hash
 
 SUCCESS = "success"
 CLOSED = "closed loop"
-EVALUATION_SEED = 3_000_000
-"""Added to the seed of new initial states, so that they share no random stream with demonstrations."""
+WON, LOST = "won against ", "lost against "
+"""Metrics of the share of episodes in which only the method succeeds, or only a reference policy from the same initial state."""
 OWN = "own demonstrations"
 """The setting of learned concepts that no suite asks for."""
 
@@ -50,7 +51,7 @@ class Generates(Protocol):
 
     def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None: ...
 
-    def demonstrated(self, concept: str) -> Tensor | None: ...
+    def demonstrated(self, concept: str) -> Demonstrations | None: ...
 
     def concept_embeddings(self) -> dict[str, Tensor]: ...
 
@@ -62,15 +63,15 @@ class Judged:
     Attributes:
         task: what was asked.
         states: plans ``(sample, horizon, state)``.
-        right: whether each is right ``(sample,)``.
+        right: whether each is right ``(sample,)``, or ``None`` in domains that judge episodes alone.
         initial_states: that they start from ``(sample, m)``, or ``None``.
         rollout: what happened when they were executed, if they were.
-        outcomes: the domain's judgement of that, by name ``(sample,)`` of bool.
+        outcomes: the domain's judgement of that, by name ``(sample,)``.
     """
 
     task: EvaluationTask
     states: Tensor
-    right: Tensor
+    right: Tensor | None
     initial_states: Tensor | None = None
     rollout: Rollout | None = None
     outcomes: Mapping[str, Tensor] = field(default_factory=dict)
@@ -78,30 +79,34 @@ class Judged:
     @classmethod
     def of(cls, task: EvaluationTask, states: Tensor, initial_states: Tensor | None, domain: Domain) -> Self:
         """Judge states by the task's goal."""
-        return cls(task, states, domain.succeeded(task.goal, states, initial_states), initial_states)
+        right = domain.succeeded(task.goal, states, initial_states) if domain.succeeded else None
+        return cls(task, states, right, initial_states)
 
     def executed(self, rollout: Rollout, domain: Domain) -> Self:
         """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
         assert domain.closed_loop is not None
-        outcomes = domain.closed_loop.judge(self.task.goal, rollout.observations)
+        outcomes = domain.closed_loop.judge(self.task.goal, rollout.observations, rollout.infos)
         return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
-
-    @property
-    def accuracy(self) -> float:
-        """Share of right samples."""
-        return share(self.right)
 
     @property
     def values(self) -> dict[str, float]:
         """Every metric's value: ``accuracy`` of plans and, after ``closed loop``, what happened when they were executed."""
-        return {"accuracy": self.accuracy} | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
+        plans = {} if self.right is None else {"accuracy": share(self.right)}
+        return plans | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
 
 
 def share(values: Tensor) -> float:
-    """Share of true values."""
+    """Share of true values, or the mean of numbers."""
     metric = MeanMetric()
     metric.update(values.float())
     return float(metric.compute())
+
+
+def _paired(one: Judged, other: Judged, domain: Domain) -> dict[str, Tensor]:
+    """In which episodes ``(sample,)`` one succeeds and another, from the same initial state, does not, and the reverse."""
+    assert domain.closed_loop is not None
+    ours, theirs = (judged.outcomes[domain.closed_loop.headline] for judged in (one, other))
+    return {WON: ours & ~theirs, LOST: theirs & ~ours}
 
 
 def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -120,14 +125,12 @@ def standard_error(values: Sequence[float]) -> float:
     return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
 
 
-def _executed(judged: Sequence[Judged], plan: Plan, replan: int, domain: Domain) -> list[Judged]:
+def _executed(judged: Sequence[Judged], policy: Policy, domain: Domain) -> list[Judged]:
     """The same tasks with their episodes, which run all side by side."""
     assert domain.closed_loop is not None
     initial = torch.cat([one.initial_states for one in judged if one.initial_states is not None])
-    whole = roll_out(domain.closed_loop, initial, plan, replan)
-    counts = [len(one.states) for one in judged]
-    parts = zip(whole.observations.split(counts), whole.failed.split(counts), strict=True)
-    return [one.executed(Rollout(*part), domain) for one, part in zip(judged, parts, strict=True)]
+    parts = roll_out(domain.closed_loop, initial, policy).split([len(one.states) for one in judged])
+    return [one.executed(part, domain) for one, part in zip(judged, parts, strict=True)]
 
 
 class Evaluator(pl.Callback):
@@ -200,7 +203,10 @@ class Evaluator(pl.Callback):
             return None
         if task.initial == "demonstrated":
             assert task.learned is not None
-            return module.demonstrated(task.learned)
+            own = module.demonstrated(task.learned)
+            assert own is not None
+            rows = torch.arange(len(own))
+            return own.windows(rows, torch.zeros_like(rows), 1)[1]
         return domain.initial_states(task.goal, self.samples, EVALUATION_SEED + self.seed)
 
     @torch.no_grad()
@@ -254,7 +260,8 @@ class Evaluator(pl.Callback):
             self.temperature,
             draws,
         )
-        return _executed(judged, plan, self.replan, domain)
+        assert domain.closed_loop is not None
+        return _executed(judged, following(plan, domain.closed_loop.act, self.replan), domain)
 
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Tell mistakes before hours of training, not after."""
@@ -303,7 +310,9 @@ class Evaluator(pl.Callback):
         for one in self.judged if self.figures else ():
             shown = slice(0, self.figures)
             start = None if one.initial_states is None else one.initial_states[shown]
-            figure = domain.render(one.states[shown], one.right[shown].tolist(), f"{one.task.name}: {one.accuracy:.2f}", start)
+            right = None if one.right is None else one.right[shown].tolist()
+            title = one.task.name if one.right is None else f"{one.task.name}: {share(one.right):.2f}"
+            figure = domain.render(one.states[shown], right, title, start)
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
             if one.rollout is not None and domain.closed_loop is not None:
                 pictures = domain.closed_loop.frames(one.rollout.observations[0])
@@ -341,22 +350,42 @@ class Evaluator(pl.Callback):
                 Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in one.values.items()
             ]
 
-        references = [
-            row
-            for name in domain.references
-            for one in self._referees(name, domain)
-            for row in rows(one, nobody | {"method": name})
+        referees = self._referees(module, domain)
+        references = [row for name, judged in referees.items() for one in judged for row in rows(one, nobody | {"method": name})]
+        compared = [
+            Row(
+                **{"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]},
+                **ours,
+                n=len(one.states),
+                metric=f"{what}{name}",
+                value=round(share(only), 6),
+            )
+            for name in (domain.closed_loop.policies if domain.closed_loop else ())
+            for other in referees.get(name, ())
+            for one in self.judged
+            if one.task == other.task
+            for what, only in _paired(one, other, domain).items()
         ]
-        return [row for one in self.judged for row in rows(one, ours)] + references
+        return [row for one in self.judged for row in rows(one, ours)] + compared + references
 
-    def _referees(self, name: str, domain: Domain) -> list[Judged]:
-        """What a reference policy does on the tasks that were judged, from the same initial states."""
-        draw = domain.references[name]
-        plans = [draw(one.task.goal, len(one.states), one.initial_states, self.seed) for one in self.judged]
-        found = [Judged.of(one.task, states, one.initial_states, domain) for one, states in zip(self.judged, plans, strict=True)]
-        if domain.closed_loop is None or all(one.rollout is None for one in self.judged):
-            return found
-        return _executed(found, fixed_plans(torch.cat(plans)), domain.closed_loop.steps, domain)
+    def _referees(self, module: Generates, domain: Domain) -> dict[str, list[Judged]]:
+        """What reference policies do on the tasks that were judged, from the same initial states."""
+        loop = None if all(one.rollout is None for one in self.judged) else domain.closed_loop
+        found = {}
+        for name, draw in domain.references.items():
+            plans = [draw(one.task.goal, len(one.states), one.initial_states, self.seed) for one in self.judged]
+            own = [Judged.of(one.task, states, one.initial_states, domain) for one, states in zip(self.judged, plans, strict=True)]
+            if loop is not None:
+                own = _executed(own, following(fixed_plans(torch.cat(plans)), loop.act, loop.steps), domain)
+            found[name] = own
+        for name, make in loop.policies.items() if loop is not None else ():
+            found[name] = []
+            for one in self.judged:
+                assert one.initial_states is not None
+                known = module.demonstrated(one.task.learned) if one.task.learned else None
+                if (policy := make(one.task.goal, one.initial_states, known, self.seed)) is not None:
+                    found[name] += _executed([one], policy, domain)
+        return found
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

@@ -17,6 +17,7 @@ from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction
 from ftl_lightning.diffusion.samplers import Sampler
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
+from ftl_lightning.domains.domain import View, load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import FORMAT, bytes_hash, file_hash, load_tensors, save_tensors, serialise, write_text
 
@@ -36,6 +37,7 @@ class ModelConfig(Sizes):
         denoiser_args: its arguments other than the sizes.
         diffusion_steps: T.
         prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'`` or ``'displacement'``.
+        view: name of the domain's view that the model sees behaviour with; empty for as it is.
         state_columns: columns of the initial state that hold the state a plan starts from.
         training: how it was trained, for the record.
     """
@@ -47,8 +49,23 @@ class ModelConfig(Sizes):
     denoiser_args: Mapping[str, Any] = field(default_factory=dict)
     diffusion_steps: int = 100
     prediction: str = "epsilon"
+    view: str = ""
     state_columns: tuple[int, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
+
+
+def load_view(domain: str, name: str) -> View | None:
+    """A domain's view by its name; ``None`` for the empty one.
+
+    Raises:
+        UserError: for a name that is none.
+    """
+    if not name:
+        return None
+    views = load_domain(domain).views
+    if name not in views:
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *views)))}, found {name!r}")
+    return views[name]
 
 
 def build_denoiser(config: ModelConfig) -> nn.Module:
@@ -99,6 +116,7 @@ class GenerativeModel(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
+        self.view = load_view(config.domain, config.view)
         self.denoiser = build_denoiser(config)
         self.normalization = normalization
         self.initial_normalization = initial_normalization
@@ -142,19 +160,35 @@ class GenerativeModel(nn.Module):
                     f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
                 )
 
+    def encode(self, states: Tensor, initial_states: Tensor | None) -> Tensor:
+        """Behaviour ``(sample, horizon, state)`` in the domain's units to what the denoiser sees."""
+        if self.view is not None:
+            assert initial_states is not None
+            states = self.view.encode(states, initial_states)
+        return self.normalization.encode(states)
+
+    def decode(self, normalised: Tensor, initial_states: Tensor | None) -> Tensor:
+        """The inverse of :meth:`encode`."""
+        states = self.normalization.decode(normalised)
+        if self.view is not None:
+            assert initial_states is not None
+            states = self.view.decode(states, initial_states)
+        return states
+
     def encode_initial(self, initial_states: Tensor | None) -> Tensor | None:
-        """Initial states ``(batch, m)`` normalised, or ``None`` for a model that is not conditioned on any.
+        """Initial states ``(batch, m)`` as the denoiser sees them, or ``None`` for a model that is not conditioned on any.
 
         Raises:
             UserError: if the model needs them and there are none, or their size is another.
         """
         if self.initial_normalization is None:
             return None
+        seen = self.view.observe(initial_states) if self.view and initial_states is not None else initial_states
         expected = self.config.initial_state_dim
-        if initial_states is None or initial_states.shape[-1] != expected:
-            found = "none" if initial_states is None else str(initial_states.shape[-1])
+        if seen is None or seen.shape[-1] != expected:
+            found = "none" if seen is None else str(seen.shape[-1])
             raise UserError(f"key 'initial_states': expected {expected} numbers each (the pretrained model's), found {found}")
-        return self.initial_normalization.encode(initial_states)
+        return self.initial_normalization.encode(seen)
 
     @torch.no_grad()
     def sample(
@@ -197,7 +231,7 @@ class GenerativeModel(nn.Module):
             return torch.cat(drawn).to(self.alpha_bar.device)
 
         plans = sampler(epsilon, noise, self.alpha_bar, steps, temperature)
-        return self.normalization.decode(plans).unflatten(0, (len(concepts), count))
+        return self.decode(plans, initial_states).unflatten(0, (len(concepts), count))
 
     @property
     def hash(self) -> str:

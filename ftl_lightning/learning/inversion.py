@@ -125,6 +125,7 @@ class InversionModule(pl.LightningModule):
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
             raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
         self.demonstrations: Demonstrations = data.demonstrations
+        self.early = data.domain.early
         self.model.encode_initial(self.demonstrations.initial_states)  # a wrong size is told before anything is learned
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
@@ -169,12 +170,13 @@ class InversionModule(pl.LightningModule):
         noise = torch.randn((samples, horizon, self.model.config.state_dim), generator=draw, device=self.device)
         rows = self._rows(samples).flatten()
         share = torch.rand(samples, generator=draw, device=self.device).cpu().repeat(runs)
-        states, initial = self.demonstrations.windows(rows, self.demonstrations.starts(rows, share), horizon)
-        s0 = self.model.encode_initial(None if initial is None else initial.to(self.device))
+        states, initial = self.demonstrations.windows(rows, self.demonstrations.starts(rows, share, self.early), horizon)
+        initial = None if initial is None else initial.to(self.device)
+        s0 = self.model.encode_initial(initial)
         embeddings = self.parametrised
         losses = denoising_loss(
             lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, self.weights, self.model.empty, s0),
-            self.model.normalization.encode(states.to(self.device)),
+            self.model.encode(states.to(self.device), initial),
             noise.repeat(runs, 1, 1),
             t.repeat(runs),
             self.model.alpha_bar,
@@ -298,11 +300,9 @@ class InversionModule(pl.LightningModule):
             weights += concept.weights[chosen].tolist()
         return torch.stack(embeddings), torch.tensor(weights, device=self.device)
 
-    def demonstrated(self, concept: str) -> Tensor | None:
-        """Initial states ``(demo, m)`` that a concept was learned from, or ``None`` where the domain has none."""
-        own = self.demonstrations.select(concept)
-        rows = torch.arange(len(own))
-        return own.windows(rows, torch.zeros_like(rows), 1)[1]
+    def demonstrated(self, concept: str) -> Demonstrations | None:
+        """What a concept was learned from."""
+        return self.demonstrations.select(concept)
 
     def concept_embeddings(self) -> dict[str, Tensor]:
         """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""

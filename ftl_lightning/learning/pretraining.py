@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ftl_lightning.concepts.composition import Denoiser
 from ftl_lightning.concepts.encoder import EMPTY
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion import PAPER_SIZE
@@ -21,7 +22,7 @@ from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.domain import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import check_signature, sign
-from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig
+from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig, load_view
 from ftl_lightning.seeding import generator
 
 
@@ -47,6 +48,8 @@ class PretrainingModule(pl.LightningModule):
             which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
             weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        view: name of the domain's view that behaviour is seen with, see :class:`ftl_lightning.domains.domain.View`; empty for as
+            it stands in files.
         compile: compile the denoiser for training (worth it on GPUs).
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and noise, timesteps and condition dropout as a function of the step.
@@ -70,6 +73,7 @@ class PretrainingModule(pl.LightningModule):
         guidance: float = 1.2,
         prediction: str = "epsilon",
         loss: str = "epsilon",
+        view: str = "",
         compile: bool = False,
         output: str | None = None,
         seed: int = 0,
@@ -90,7 +94,13 @@ class PretrainingModule(pl.LightningModule):
         if not isinstance(data, PretrainingData):
             raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
         embeddings = data.encoder((EMPTY, *data.domain.training_concepts))
-        initial = data.training.initial_states
+        view = load_view(data.domain.name, self.hparams["view"])
+        if view is None:
+            states, initial = data.training.states, data.training.initial_states
+        else:
+            windows = data.every_window()
+            assert windows.initial_states is not None
+            states, initial = view.encode(windows.states, windows.initial_states), view.observe(windows.initial_states)
         config = ModelConfig(
             domain=data.domain.name,
             horizon=data.horizon,
@@ -105,6 +115,7 @@ class PretrainingModule(pl.LightningModule):
             prediction=self.hparams["prediction"],
             entities=data.domain.entities,
             looks=data.domain.looks,
+            view=self.hparams["view"],
             state_columns=data.domain.state_columns,
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
@@ -115,7 +126,7 @@ class PretrainingModule(pl.LightningModule):
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            normalization = Normalization.fit(data.training.states)
+            normalization = Normalization.fit(states)
             beside = None if initial is None else Normalization.fit(initial, data.domain.entities)
             if beside is not None and data.domain.state_columns:
                 beside.share(data.domain.state_columns, normalization)
@@ -133,7 +144,7 @@ class PretrainingModule(pl.LightningModule):
 
     def _loss(self, denoiser: Denoiser, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
         """Eq. 1 on a batch, ``(batch,)``."""
-        clean = self.model.normalization.encode(batch.states)
+        clean = self.model.encode(batch.states, batch.initial_states)
         initial = self.model.encode_initial(batch.initial_states)
         count = len(clean)
         removed = torch.rand(count, generator=draw, device=self.device) < dropout
@@ -201,8 +212,8 @@ class PretrainingModule(pl.LightningModule):
         embeddings = torch.stack([self.model.concept(text) for text in task.texts])
         return embeddings, embeddings.new_full((len(embeddings),), self.guidance)
 
-    def demonstrated(self, concept: str) -> Tensor | None:
-        """Initial states that a concept was learned from: none."""
+    def demonstrated(self, concept: str) -> Demonstrations | None:
+        """What a concept was learned from: nothing is learned here."""
         return None
 
     def concept_embeddings(self) -> dict[str, Tensor]:

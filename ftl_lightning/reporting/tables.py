@@ -1,15 +1,17 @@
 """Tables from results, each number beside the paper's: Markdown to read, LaTeX to paste."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain, Published
-from ftl_lightning.evaluation.evaluator import CLOSED, OWN, SUCCESS, standard_error
+from ftl_lightning.evaluation.evaluator import CLOSED, LOST, OWN, SUCCESS, WON, standard_error
 from ftl_lightning.evaluation.results import latest
 
 MISSING = "-"
+ACCURACY = "accuracy"
 EXECUTED = f"{CLOSED} {SUCCESS}"
 
 
@@ -109,19 +111,22 @@ def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     """Every table of a domain for which there are results."""
     every = latest(_select(results, domain=domain.name))
-    rows = _select(every, metric="accuracy")
-    executed = _select(every, metric=EXECUTED)
+    # Ablations are about plans where they are judged, else about episodes.
+    metric = ACCURACY if domain.succeeded else EXECUTED
+    rows = _select(every, metric=metric)
     candidates = (
-        _accuracy(domain, rows, "accuracy", "accuracy"),
-        _accuracy(domain, executed, EXECUTED, "closed_loop"),
-        _count(domain, rows),
-        _omega(domain, rows),
-        _components(domain, rows),
+        _accuracy(domain, _select(every, metric=ACCURACY), ACCURACY, "accuracy"),
+        _accuracy(domain, _select(every, metric=EXECUTED), EXECUTED, "closed_loop"),
+        _outcomes(domain, every),
+        _paired(domain, every),
+        _count(domain, rows, metric),
+        _omega(domain, rows, metric),
+        _components(domain, rows, metric),
     )
     return [table for table in candidates if not table.cells.empty]
 
 
-def _lookup(domain: Domain, setting: str, task: str, components: int, omega: str, metric: str = "accuracy") -> Published | None:
+def _lookup(domain: Domain, setting: str, task: str, components: int, omega: str, metric: str) -> Published | None:
     asked = (setting, task, components, omega, metric)
     for found in domain.published:
         if (found.setting, found.task, found.components, found.omega, found.metric) == asked:
@@ -150,9 +155,66 @@ def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> Tab
             lines.append(line)
     theirs = "" if domain.omega == domain.published_omega else f" (the paper's: {domain.published_omega})"
     caption = (
-        f"{domain.name}: {metric}, K = 2, fixed omega {domain.omega}{theirs}. Mean ± standard error over tasks (spread over seeds)"
+        f"{domain.name}: {metric}, K = 2, {_weights(domain.omega)}{theirs}. Mean ± standard error over tasks (spread over seeds)"
     )
     return Table(name, caption, pd.DataFrame(lines, columns=["setting", "paper", *learned, *references], dtype=str))
+
+
+def _weights(omega: str) -> str:
+    return "learned weights" if omega == "learned" else f"fixed omega {omega}"
+
+
+def _outcomes(domain: Domain, every: pd.DataFrame) -> Table:
+    """All that happened in closed loop, by setting."""
+    executed = every[every["metric"].str.startswith(CLOSED)]
+    ours = _select(executed, K=2, omega=domain.omega)
+    learned, references = _columns(executed)
+    lines = [
+        [
+            setting,
+            metric.removeprefix(f"{CLOSED} "),
+            _paper(_lookup(domain, setting, "", 2, domain.published_omega, metric)),
+            *(_text(summarise(_select(ours, setting=setting, metric=metric, method=method))) for method in learned),
+            *(_text(summarise(_select(executed, setting=setting, metric=metric, K=0, method=method))) for method in references),
+        ]
+        for setting in _settings(domain)
+        for metric in dict.fromkeys(_select(ours, setting=setting)["metric"])
+    ]
+    caption = f"{domain.name}: what happened in closed loop, K = 2, {_weights(domain.omega)}"
+    return Table("outcomes", caption, pd.DataFrame(lines, columns=["setting", "", "paper", *learned, *references], dtype=str))
+
+
+def difference(won: int, lost: int, count: int) -> str:
+    """A paired difference of two success rates with its 95 % interval, and McNemar's exact p.
+
+    Args:
+        won, lost: pairs in which only the one succeeds, and only the other.
+        count: all pairs.
+    """
+    mean = (won - lost) / count
+    error = 1.96 * math.sqrt(won + lost - (won - lost) ** 2 / count) / count
+    fewer, apart = min(won, lost), won + lost
+    chance = min(1.0, 2 * sum(math.comb(apart, k) for k in range(fewer + 1)) / 2**apart)
+    return f"{mean:+.2f} [{mean - error:+.2f}, {mean + error:+.2f}], p = {chance:.3f}"
+
+
+def _paired(domain: Domain, every: pd.DataFrame) -> Table:
+    """Our successes less those of reference policies from the same starts, over all seeds."""
+    ours = every[(every["K"] == 2) & (every["omega"] == domain.omega)]
+    learned, _ = _columns(ours[ours["metric"].str.startswith(WON)])
+    lines = []
+    for setting in _settings(domain):
+        for policy in domain.closed_loop.policies if domain.closed_loop else ():
+            line = []
+            for method in learned:
+                won, lost = (_select(ours, setting=setting, method=method, metric=f"{what}{policy}") for what in (WON, LOST))
+                gains, losses = (round(float((rows["value"] * rows["n"]).sum())) for rows in (won, lost))
+                line.append(MISSING if won.empty else difference(gains, losses, int(won["n"].sum())))
+            if set(line) - {MISSING}:
+                lines.append([setting, policy, *line])
+    headline = domain.closed_loop.headline if domain.closed_loop else ""
+    caption = f"{domain.name}: {headline} less that of policies from the same starts, 95 % interval, McNemar's exact p"
+    return Table("paired", caption, pd.DataFrame(lines, columns=["setting", "compared with", *learned], dtype=str))
 
 
 def _settings(domain: Domain) -> list[str]:
@@ -176,7 +238,7 @@ def _grid(
     return Table(name, caption, pd.DataFrame(cells, columns=[*heads, "paper", *learned], dtype=str))
 
 
-def _count(domain: Domain, rows: pd.DataFrame) -> Table:
+def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The ablation on the number of learned concepts, with learned weights."""
     own = _select(rows, omega="learned")
     learned, _ = _columns(own)
@@ -184,7 +246,7 @@ def _count(domain: Domain, rows: pd.DataFrame) -> Table:
         (
             setting,
             str(count),
-            _paper(_lookup(domain, setting, "", count, "learned")),
+            _paper(_lookup(domain, setting, "", count, "learned", metric)),
             _select(own, setting=setting, K=count),
         )
         for setting in domain.suites["paper"].settings
@@ -194,7 +256,7 @@ def _count(domain: Domain, rows: pd.DataFrame) -> Table:
     return _grid("concept_count", caption, learned, lines, ("setting", "K"))
 
 
-def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
+def _omega(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The effect of the guidance weight, K = 2."""
     own = _select(rows, K=2)
     learned, _ = _columns(own)
@@ -203,7 +265,7 @@ def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
         (
             setting,
             omega,
-            _paper(_lookup(domain, setting, "", 2, omega)),
+            _paper(_lookup(domain, setting, "", 2, omega, metric)),
             _select(own, setting=setting, omega=omega),
         )
         for setting in settings
@@ -212,7 +274,7 @@ def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
     return _grid("omega", f"{domain.name}: guidance weight omega, K = 2", learned, lines, ("setting", "omega"))
 
 
-def _components(domain: Domain, rows: pd.DataFrame) -> Table:
+def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """What each learned component generates alone, with learned weights."""
     own = _select(rows, K=2, omega="learned")
     learned, _ = _columns(own)
@@ -221,7 +283,7 @@ def _components(domain: Domain, rows: pd.DataFrame) -> Table:
         (
             task.name,
             task.setting,
-            _paper(_lookup(domain, task.setting, task.name, 2, "learned")),
+            _paper(_lookup(domain, task.setting, task.name, 2, "learned", metric)),
             _select(own, setting=task.setting, task=task.name),
         )
         for task in (suite.tasks if suite else ())

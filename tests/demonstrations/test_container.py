@@ -131,7 +131,7 @@ def test_an_unwritable_folder_is_a_clear_error(tmp_path: Path) -> None:
 def test_windows_are_padded_with_the_last_state() -> None:
     states = torch.arange(10.0).reshape(2, 5, 1)
     whole = Demonstrations(states, torch.tensor([5, 3]), "", ("x",), ("m",), ("a", "b"), initial_states=states + 100)
-    assert whole.starts(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 0.9999, 0.5, 0.9])).tolist() == [0, 4, 0, 2]
+    assert whole.starts(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 0.9999, 0.5, 0.9]), 3.0).tolist() == [0, 4, 0, 2]
     found, initial = whole.windows(torch.tensor([0, 1]), torch.tensor([3, 0]), 4)
     assert found[..., 0].tolist() == [[3, 4, 4, 4], [5, 6, 7, 8]]
     assert initial is not None
@@ -140,7 +140,7 @@ def test_windows_are_padded_with_the_last_state() -> None:
 
 def test_windows_start_at_the_beginning_where_only_the_first_initial_state_is_known() -> None:
     whole = Demonstrations(torch.zeros(2, 5, 1), torch.tensor([5, 3]), "", ("x",), ("m",), ("a", "b"), torch.eye(2))
-    assert whole.starts(torch.tensor([0, 1]), torch.tensor([0.1, 0.9])).tolist() == [0, 0]
+    assert whole.starts(torch.tensor([0, 1]), torch.tensor([0.1, 0.9]), 3.0).tolist() == [0, 0]
     assert torch.equal(whole.windows(torch.tensor([1]), torch.tensor([0]), 2)[1], torch.eye(2)[1:])
 
 

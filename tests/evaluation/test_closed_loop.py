@@ -11,7 +11,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import ddpm
 from ftl_lightning.domains.domain import ClosedLoop
-from ftl_lightning.evaluation.closed_loop import fixed_plans, roll_out, sampled_plans
+from ftl_lightning.evaluation.closed_loop import fixed_plans, following, roll_out, sampled_plans
 from ftl_lightning.evaluation.tensorboard import gif
 from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig
 from ftl_lightning.seeding import generator
@@ -26,15 +26,17 @@ class Line(gymnasium.Env[Any, Any]):
         return self.x.copy(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self.x[0] == 100:
+            raise RuntimeError("the simulator broke")
         self.x = self.x + action
-        return self.x.copy(), 0.0, bool(self.x[0] > 3), False, {}
+        return self.x.copy(), 0.0, bool(self.x[0] > 3), False, {"x": float(self.x[0])}
 
 
 LOOP = ClosedLoop(
     environment=Line,
     act=lambda plans, step, observations: plans[:, step + 1] - observations,
     steps=8,
-    judge=lambda goal, observations: {"success": observations[:, -1, 0] > 3},
+    judge=lambda goal, observations, infos: {"success": observations[:, -1, 0] > 3},
     frames=lambda observations: [],
 )
 
@@ -52,7 +54,7 @@ def test_plans_are_followed_until_the_environment_ends_an_episode(replan: int) -
         calls.append(list(rows))
         return ahead(observations, rows)
 
-    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), plan, replan)
+    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), following(plan, LOOP.act, replan))
     assert found.observations[0, :, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 4, 4]  # padded with its last
     assert found.observations[1, :, 0].tolist() == list(range(-9, 0))
     assert not found.failed.any()
@@ -66,7 +68,7 @@ def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: 
             plans[0, -1] = float("nan")
         return plans
 
-    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), plan, 1)
+    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), following(plan, LOOP.act, 1))
     assert found.failed.tolist() == [True, False]
     assert found.observations[0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
     assert found.observations[1, -1, 0] == -1
@@ -74,9 +76,18 @@ def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: 
 
 
 def test_all_episodes_may_fail() -> None:
-    found = roll_out(LOOP, torch.zeros(2, 1), lambda observations, rows: torch.full((2, 9, 1), float("inf")), 1)
+    nowhere = following(lambda observations, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
+    found = roll_out(LOOP, torch.zeros(2, 1), nowhere)
     assert found.failed.all()
     assert (found.observations == 0).all()
+
+
+def test_an_episode_whose_simulator_raises_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
+    found = roll_out(LOOP, torch.tensor([[100.0], [-9.0]]), following(ahead, LOOP.act, 1))
+    assert found.failed.tolist() == [True, False]
+    assert "episode 0, step 0: RuntimeError('the simulator broke')" in caplog.text
+    assert [info.get("x") for info in found.infos] == [None, -1]
+    assert [len(part.infos) for part in found.split([1, 1])] == [1, 1]
 
 
 def test_fixed_plans_are_chosen_by_episode() -> None:
@@ -118,7 +129,7 @@ def test_episodes_do_not_depend_on_their_neighbours() -> None:
             0.5,
             [generator("cpu", 0, row) for row in rows],
         )
-        return roll_out(LOOP, starts[rows], plan, 2).observations
+        return roll_out(LOOP, starts[rows], following(plan, LOOP.act, 2)).observations
 
     together = run([0, 1, 2, 3, 4])
     for rows in ([0], [3, 1], [4, 2, 0]):

@@ -38,7 +38,7 @@ def test_accuracy_is_the_share_of_right_samples() -> None:
     task = domain.suites["training"].tasks[0]
     good = domain.generate(task.goal, 3, 0).states
     bad = domain.generate("square right of circle", 1, 0).states
-    assert Judged.of(task, torch.cat((good, bad)), None, domain).accuracy == pytest.approx(0.75)
+    assert Judged.of(task, torch.cat((good, bad)), None, domain).values == {"accuracy": pytest.approx(0.75)}
 
 
 def test_standard_error_over_tasks() -> None:

@@ -1,5 +1,8 @@
 """The paper's two metrics of navigation: progress to the target (open loop) and reaching it first (closed loop)."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -40,12 +43,13 @@ def progressed(goal: str, states: Tensor, initial_states: Tensor | None) -> Tens
     return to_target[:, -1] < to_target[:, 0]
 
 
-def reached(goal: str, observations: Tensor) -> dict[str, Tensor]:
+def reached(goal: str, observations: Tensor, infos: Sequence[Mapping[str, Any]] = ()) -> dict[str, Tensor]:
     """What happened in episodes (paper, closed loop).
 
     Args:
         goal: the task in words.
         observations: ``(episode, time, 52)``, padded with the last one.
+        infos: not used; observations tell everything.
 
     Returns:
         ``(episode,)`` of bool each: ``success``, the agent ends within :data:`REACH` of the target and was never that near to

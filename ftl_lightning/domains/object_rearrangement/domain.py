@@ -68,7 +68,7 @@ DOMAIN = Domain(
         dict.fromkeys((*TRAINING_CONCEPTS, *(text for suite in SUITES.values() for task in suite.tasks for text in (task.goal,))))
     ),
     training_set=functools.partial(_demonstrations, TRAINING_CONCEPTS),
-    generate=lambda task, count, seed: _demonstrations((task,), count, seed),
+    generate=lambda task, count, seed, workers=1: _demonstrations((task,), count, seed),
     reads=reads,
     succeeded=succeeded,
     render=render,
