@@ -3,7 +3,7 @@
 import itertools
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +37,7 @@ class Rollout:
 
     observations: Tensor
     failed: Tensor
-    infos: Sequence[Mapping[str, Any]]
+    infos: list[dict[str, Any]]
 
     def split(self, counts: Sequence[int]) -> list["Rollout"]:
         """The same in parts of so many episodes."""
@@ -95,7 +95,7 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                     _LOG.warning("episode %d, step %d: %s; the episode counts as failed", row, step, repr(error))
                     continue
                 observations[row, step + 1 :] = torch.as_tensor(seen)
-                found.infos[row].update(info)  # type: ignore[attr-defined]
+                found.infos[row].update(info)
                 if not (terminated or truncated):
                     going.append(row)
             active = going
