@@ -1,0 +1,161 @@
+"""Closed loop: an environment whose actions are wishes for the next state; a look-ahead planner turns them into decisions."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, arrived, make, observe
+from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
+from ftl_lightning.errors import UserError
+
+NAMES = tuple(SCENARIOS)
+STATE = len(FEATURES)
+OBSERVED = VEHICLES * STATE
+INITIAL = OBSERVED + 2
+"""Columns of an initial state: what is observed, and what no model sees: the scenario's number and the seed of its start."""
+MAX_STEPS = 30
+SEEDS = 2**24
+"""Seeds are below, so that float32 holds them exactly."""
+
+
+class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """Any scenario, from a start that its number and seed decide.
+
+    An observation is an initial state (37 numbers). An action is either the state (7 numbers) that the controlled vehicle should
+    be in a step later, or the number of one of the scenario's decisions, for policies that decide themselves. Each decision is
+    tried for a step; the one that comes nearest to the wish (Euclidean, in raw units) without a crash is taken, at random among
+    equals, and to brake if all crash. A decision that would crash is replaced by a random one that does not.
+
+    The information of the last step tells what happened: ``crashed``, ``arrived`` (where the scenario wants the vehicle, and no
+    crash), ``passed`` (the count of the paper's code), ``return`` (sum of rewards) and ``length``.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
+    render_mode = "rgb_array"
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)
+    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
+
+    def __init__(self) -> None:
+        self._name = ""
+        self._seed = 0
+        self._return = 0.0
+        self._length = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Go to a start.
+
+        Args:
+            seed: of the start, if no initial state is given.
+            options: ``initial_state``, 37 numbers; or ``task``, a scenario (default 'roundabout').
+
+        Raises:
+            UserError: for an initial state that is not the start that its scenario and seed lead to.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        given = options.get("initial_state")
+        if given is None:
+            name, start = options.get("task", "roundabout"), int(self.np_random.integers(SEEDS))
+        else:
+            name, start = origin(np.asarray(given))
+        if name != self._name:
+            self._env, self._name = make(name), name
+        self._env.reset(seed=start)
+        self._seed, self._return, self._length = start, 0.0, 0
+        seen = self._observation()
+        if given is not None and not np.allclose(seen, given, atol=1e-3):
+            raise UserError(
+                f"driving initial state: expected the start of {name!r} that seed {start} gives, found another; episodes start at "
+                "starts, not in the middle of a drive"
+            )
+        return seen, {}
+
+    def _observation(self) -> NDArray[np.float32]:
+        return initial_state(observe(self._env), self._name, self._seed)
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Decide and drive on until the next decision.
+
+        Raises:
+            UserError: for an action of another size, or with numbers that are not finite.
+        """
+        wish = np.asarray(action, dtype=np.float64)
+        if wish.shape not in ((STATE,), (1,)) or not np.isfinite(wish).all():
+            raise UserError(f"driving action: expected {STATE} finite numbers, or 1, found {wish.tolist()}")
+        tried = self._tried()
+        safe = [number for number, (_, _, _, state) in enumerate(tried) if state is not None]
+        if not safe:
+            chosen = self._slower
+        elif len(wish) == 1:
+            chosen = int(wish[0]) if int(wish[0]) in safe else int(self.np_random.choice(safe))
+        else:
+            far = np.array([np.linalg.norm(np.asarray(tried[number][3]) - wish) for number in safe])
+            chosen = int(self.np_random.choice(np.array(safe)[far <= far.min() + 1e-6]))
+        after, reward, ended, _ = tried[chosen]
+        restore(self._env, after)
+        self._return += reward
+        self._length += 1
+        info = self._outcome() if ended or self._length >= MAX_STEPS else {}
+        return self._observation(), reward, ended, self._length >= MAX_STEPS, info
+
+    def _tried(self) -> list[tuple[Snapshot, float, bool, NDArray[np.float64] | None]]:
+        """Of each decision what comes of it: the simulation, reward, whether the episode ends, and unless it crashes the state."""
+        now, found = save(self._env), []
+        for decision in range(self._env.action_space.n):
+            restore(self._env, now)
+            reward, ended = advance(self._env, decision)
+            state = None if self._env.vehicle.crashed else observe(self._env)[0].astype(np.float64)
+            found.append((save(self._env), reward, ended, state))
+        return found
+
+    @property
+    def _slower(self) -> int:
+        return int(self._env.action_type.actions_indexes["SLOWER"])
+
+    def _outcome(self) -> dict[str, float]:
+        crashed = bool(self._env.vehicle.crashed)
+        there = arrived(self._env, self._name)
+        passed = SCENARIOS[self._name].passed
+        return {
+            "crashed": crashed,
+            "arrived": there and not crashed,
+            "passed": passed(self._env) if passed else there and not crashed,
+            "return": self._return,
+            "length": self._length,
+        }
+
+    def render(self) -> NDArray[np.uint8]:
+        """A picture from above ``(height, width, 3)``."""
+        picture: NDArray[np.uint8] = self._env.render()
+        return picture
+
+    def close(self) -> None:
+        """Close the simulation."""
+        if self._name:
+            self._env.close()
+
+
+def initial_state(seen: NDArray[np.float32], name: str, seed: int) -> NDArray[np.float32]:
+    """The 37 numbers of what is observed ``(..., 5, 7)`` in an episode of this scenario and seed."""
+    hidden = np.broadcast_to(np.array((NAMES.index(name), seed), dtype=np.float32), (*seen.shape[:-2], 2))
+    return np.concatenate((seen.reshape(*seen.shape[:-2], OBSERVED), hidden), axis=-1)
+
+
+def origin(initial: NDArray[np.float32]) -> tuple[str, int]:
+    """Scenario and seed of an initial state.
+
+    Raises:
+        UserError: for another size, or numbers that are none of a scenario and seed.
+    """
+    if initial.shape != (INITIAL,) or not np.isfinite(initial).all():
+        raise UserError(f"driving initial state: expected {INITIAL} finite numbers, found shape {initial.shape}")
+    number, seed = initial[OBSERVED:].tolist()
+    if number not in range(len(NAMES)) or not (0 <= seed < SEEDS and seed == int(seed)):
+        raise UserError(
+            f"driving initial state: expected a scenario from 0 to {len(NAMES) - 1} and a seed, found {number:g} and {seed:g}"
+        )
+    return NAMES[int(number)], int(seed)

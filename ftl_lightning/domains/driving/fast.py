@@ -1,0 +1,295 @@
+"""The same simulation, faster: scalar arithmetic, one lane lookup a frame, a broad phase of collisions.
+
+highway-env spends its time on numpy calls for two numbers and on looking at all pairs of vehicles again and again. The classes here
+take the place of its own in one environment; none of them changes what is computed, only in what order numbers are added
+(tests compare both on random actions). ``scenarios.make(name, fast=False)`` does without them.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from highway_env import utils
+from highway_env.road.lane import CircularLane, SineLane, StraightLane
+from highway_env.road.regulation import RegulatedRoad
+from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.objects import Landmark, RoadObject
+
+LaneIndex = tuple[str, str, int]
+
+
+def _clip(value: float, low: float, high: float) -> float:
+    return low if value < low else high if value > high else value
+
+
+def _wrap(angle: float) -> float:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+class FastStraightLane(StraightLane):
+    """A straight lane."""
+
+    def local_coordinates(self, position: Any) -> tuple[float, float]:
+        x, y = position.tolist()
+        x0, y0, dx, dy = self._line
+        x, y = x - x0, y - y0
+        return x * dx + y * dy, y * dx - x * dy
+
+    def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
+        """``distance_with_heading`` if it is below a bound."""
+        x0, y0, dx, dy = self._line
+        x, y = x - x0, y - y0
+        s = x * dx + y * dy
+        found = abs(y * dx - x * dy) + (s - self.length if s > self.length else -s if s < 0 else 0)
+        if found < than and (found := found + abs(_wrap(heading - self.heading))) < than:
+            return found
+        return None
+
+
+class FastSineLane(SineLane):
+    """A lane that swings to one side."""
+
+    local_coordinates_along = FastStraightLane.local_coordinates
+
+    def local_coordinates(self, position: Any) -> tuple[float, float]:
+        s, r = self.local_coordinates_along(position)
+        return s, r - self.amplitude * math.sin(self.pulsation * s + self.phase)
+
+    def heading_at(self, longitudinal: float) -> float:
+        slope = self.amplitude * self.pulsation * math.cos(self.pulsation * longitudinal + self.phase)
+        return self.heading + math.atan(slope)
+
+    def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
+        """As of :class:`FastStraightLane`."""
+        x0, y0, dx, dy = self._line
+        x, y = x - x0, y - y0
+        s, r = x * dx + y * dy, y * dx - x * dy
+        beyond = s - self.length if s > self.length else -s if s < 0 else 0
+        if abs(r) - abs(self.amplitude) + beyond > than:
+            return None
+        found = abs(r - self.amplitude * math.sin(self.pulsation * s + self.phase)) + beyond
+        if found < than and (found := found + abs(_wrap(heading - self.heading_at(s)))) < than:
+            return found
+        return None
+
+
+class FastCircularLane(CircularLane):
+    """A lane along an arc."""
+
+    def local_coordinates(self, position: Any) -> tuple[float, float]:
+        x, y = position.tolist()
+        x0, y0 = self._centre
+        x, y = x - x0, y - y0
+        turned = _wrap(math.atan2(y, x) - self.start_phase)
+        return self.direction * turned * self.radius, self.direction * (self.radius - math.sqrt(x * x + y * y))
+
+    def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
+        """As of :class:`FastStraightLane`."""
+        x0, y0 = self._centre
+        x, y = x - x0, y - y0
+        found = abs(self.radius - math.sqrt(x * x + y * y))
+        if found >= than:
+            return None
+        s = self.direction * _wrap(math.atan2(y, x) - self.start_phase) * self.radius
+        found += s - self.length if s > self.length else -s if s < 0 else 0
+        if found < than and (found := found + abs(_wrap(heading - self.heading_at(s)))) < than:
+            return found
+        return None
+
+
+_LANES = {StraightLane: FastStraightLane, SineLane: FastSineLane, CircularLane: FastCircularLane}
+
+
+class FastNetwork(RoadNetwork):
+    """Looks for the closest lane without building lists."""
+
+    def get_closest_lane_index(self, position: Any, heading: float | None = None, likely: LaneIndex | None = None) -> LaneIndex:
+        if heading is None:
+            return super().get_closest_lane_index(position, heading)
+        x, y = position.tolist()
+        # Nearly all lanes are farther than the one it was on, which takes one look at each. Of equally near lanes the first counts.
+        bound = math.inf if likely is None else math.nextafter(self.get_lane(likely).nearer(x, y, heading, math.inf), math.inf)
+        best, found = bound, self._lanes[0][0]
+        for index, lane in self._lanes:
+            if (distance := lane.nearer(x, y, heading, best)) is not None:
+                best, found = distance, index
+        return found
+
+
+class FastVehicle(IDMVehicle):
+    """The other drivers."""
+
+    position: Any
+    impact: Any
+    crashed: Any
+    lane_index: Any
+    lane: Any
+
+    def act(self, action: Any = None) -> None:
+        if self.crashed:
+            return
+        self.follow_road()
+        if self.enable_lane_change:
+            self.change_lane_policy()
+        front, rear = self.road.neighbour_vehicles(self, self.lane_index)
+        pull = self.acceleration(self, front, rear)
+        if self.lane_index != self.target_lane_index:
+            front, rear = self.road.neighbour_vehicles(self, self.target_lane_index)
+            pull = min(pull, self.acceleration(self, front, rear))
+        turn = self.steering_control(self.target_lane_index)
+        self.action = {"steering": turn, "acceleration": _clip(pull, -self.ACC_MAX, self.ACC_MAX)}
+
+    def steering_control(self, target_lane_index: LaneIndex) -> float:
+        lane = self.road.network.get_lane(target_lane_index)
+        s, r = lane.local_coordinates(self.position)
+        ahead = lane.heading_at(s + self.speed * self.TAU_PURSUIT)
+        speed = utils.not_zero(self.speed)
+        command = math.asin(_clip(-self.KP_LATERAL * r / speed, -1, 1))
+        heading = ahead + _clip(command, -math.pi / 4, math.pi / 4)
+        rate = self.KP_HEADING * _wrap(heading - self.heading)
+        slip = math.asin(_clip(self.LENGTH / 2 / speed * rate, -1, 1))
+        return _clip(math.atan(2 * math.tan(slip)), -self.MAX_STEERING_ANGLE, self.MAX_STEERING_ANGLE)
+
+    def acceleration(self, ego_vehicle: Any, front_vehicle: Any = None, rear_vehicle: Any = None) -> float:
+        if not hasattr(ego_vehicle, "action"):  # nobody, or an obstacle
+            return 0
+        wanted = getattr(ego_vehicle, "target_speed", 0)
+        if ego_vehicle.lane and ego_vehicle.lane.speed_limit is not None:
+            wanted = _clip(wanted, 0, ego_vehicle.lane.speed_limit)
+        found = self.COMFORT_ACC_MAX * (1 - math.pow(max(ego_vehicle.speed, 0) / abs(utils.not_zero(wanted)), self.DELTA))
+        if front_vehicle:
+            gap = self.desired_gap(ego_vehicle, front_vehicle) / utils.not_zero(ego_vehicle.lane_distance_to(front_vehicle))
+            found -= self.COMFORT_ACC_MAX * gap * gap
+        return found
+
+    def desired_gap(self, ego_vehicle: Any, front_vehicle: Any = None, projected: bool = True) -> float:
+        speed = ego_vehicle.speed
+        closing = speed - front_vehicle.speed
+        if projected:
+            closing = speed - front_vehicle.speed * math.cos(front_vehicle.heading - ego_vehicle.heading)
+        both = math.sqrt(-self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN)
+        return self.DISTANCE_WANTED + speed * self.TIME_WANTED + speed * closing / (2 * both)
+
+    def step(self, dt: float) -> None:
+        self.timer += dt
+        self.clip_actions()
+        beta = math.atan(math.tan(self.action["steering"]) / 2)
+        x, y = self.position.tolist()
+        self.position = np.array(
+            (x + self.speed * math.cos(self.heading + beta) * dt, y + self.speed * math.sin(self.heading + beta) * dt)
+        )
+        if self.impact is not None:
+            self.position += self.impact
+            self.crashed = True
+            self.impact = None
+        self.heading += self.speed * math.sin(beta) / (self.LENGTH / 2) * dt
+        self.speed += self.action["acceleration"] * dt
+        network = self.road.network
+        if type(network) is FastNetwork:
+            self.lane_index = network.get_closest_lane_index(self.position, self.heading, self.lane_index)
+            self.lane = network.get_lane(self.lane_index)
+        else:
+            self.on_state_update()
+
+
+class FastRoad(Road):
+    """Knows who is on which lane, and which vehicles are near enough to touch."""
+
+    def act(self) -> None:
+        # Nothing moves while everybody decides.
+        self._on_lane: dict[LaneIndex, list[tuple[float, RoadObject]]] | None = {}
+        super().act()
+        self._on_lane = None
+
+    def neighbour_vehicles(self, vehicle: Any, lane_index: LaneIndex | None = None) -> tuple[Any, Any]:
+        lane_index = lane_index or vehicle.lane_index
+        known: dict[LaneIndex, list[tuple[float, RoadObject]]] | None = getattr(self, "_on_lane", None)
+        if known is None or self.neighbour_vehicles_connected_lanes or not lane_index:
+            return super().neighbour_vehicles(vehicle, lane_index)
+        lane = self.network.get_lane(lane_index)
+        there = known.get(lane_index)
+        if there is None:
+            there = known[lane_index] = self._along(lane)
+        s = lane.local_coordinates(vehicle.position)[0]
+        front, rear, v_front, v_rear = math.inf, -math.inf, None, None
+        for s_v, v in there:
+            if v is vehicle:
+                continue
+            if s_v >= s:
+                if s_v <= front:
+                    front, v_front = s_v, v
+            elif s_v > rear:
+                rear, v_rear = s_v, v
+        return v_front, v_rear
+
+    def _along(self, lane: Any) -> list[tuple[float, RoadObject]]:
+        found = []
+        for v in self.vehicles + self.objects:
+            if not isinstance(v, Landmark):
+                s, r = lane.local_coordinates(v.position)
+                if abs(r) <= lane.width / 2 + 1 and -lane.VEHICLE_LENGTH <= s < lane.length + lane.VEHICLE_LENGTH:
+                    found.append((s, v))
+        return found
+
+    def step(self, dt: float) -> None:
+        for vehicle in self.vehicles:
+            vehicle.step(dt)
+        x, y = np.array([v.position for v in self.vehicles]).T
+        reach = max(v.diagonal for v in self.vehicles) + max(abs(v.speed) for v in self.vehicles) * dt
+        near = (np.abs(x[:, None] - x) <= reach) & (np.abs(y[:, None] - y) <= reach)
+        pairs = np.argwhere(np.triu(near, 1)).tolist()[::-1]
+        for i, vehicle in enumerate(self.vehicles):
+            while pairs and pairs[-1][0] == i:
+                vehicle.handle_collisions(self.vehicles[pairs.pop()[1]], dt)
+            for other in self.objects:
+                vehicle.handle_collisions(other, dt)
+
+
+class FastRegulatedRoad(FastRoad, RegulatedRoad):
+    """Predicts each vehicle's way once, and looks closer only at ways that come near each other."""
+
+    def step(self, dt: float) -> None:
+        self.steps += 1
+        if self.steps % int(1 / dt / self.REGULATION_FREQUENCY) == 0:
+            self.enforce_road_rules()
+        FastRoad.step(self, dt)
+
+    def enforce_road_rules(self) -> None:
+        times = np.arange(0.25, 3, 0.25)  # as of is_conflict_possible
+        ways = [vehicle.predict_trajectory_constant_speed(times) for vehicle in self.vehicles]
+        places = np.array([positions for positions, _ in ways])
+        gaps = ((places[:, None] - places[None]) ** 2).sum(axis=-1)
+        self._near = gaps <= np.array([vehicle.LENGTH**2 for vehicle in self.vehicles])[:, None, None]
+        self._ever = self._near.any(axis=-1).tolist()
+        self._ways = {id(vehicle): (row, *way) for row, (vehicle, way) in enumerate(zip(self.vehicles, ways, strict=True))}
+        super().enforce_road_rules()
+
+    def is_conflict_possible(self, v1: Any, v2: Any, horizon: int = 3, step: float = 0.25) -> bool | None:
+        row_1, at_1, heading_1 = self._ways[id(v1)]
+        row_2, at_2, heading_2 = self._ways[id(v2)]
+        if self._ever[row_1][row_2]:
+            for k in self._near[row_1, row_2].nonzero()[0].tolist():
+                if utils.rotated_rectangles_intersect(
+                    (at_1[k], 1.5 * v1.LENGTH, 0.9 * v1.WIDTH, heading_1[k]),
+                    (at_2[k], 1.5 * v2.LENGTH, 0.9 * v2.WIDTH, heading_2[k]),
+                ):
+                    return True
+        return None
+
+
+_ROADS = {Road: FastRoad, RegulatedRoad: FastRegulatedRoad}
+
+
+def accelerate(road: Road) -> None:
+    """Let a road, its network and lanes compute as the classes above."""
+    network = road.network
+    for lane in network.lanes_list():
+        if type(lane) in (StraightLane, SineLane):
+            lane._line = (*map(float, lane.start), *map(float, lane.direction))
+        elif type(lane) is CircularLane:
+            lane._centre = tuple(map(float, lane.center))
+        lane.__class__ = _LANES.get(type(lane), type(lane))
+    network._lanes = list(network.lanes_dict().items())
+    network.__class__ = FastNetwork
+    road.__class__ = _ROADS.get(type(road), type(road))

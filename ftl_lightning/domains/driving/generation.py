@@ -1,0 +1,113 @@
+"""The expert's episodes: kept one by one as they are made, so that a run that is killed goes on where it stopped."""
+
+import logging
+import multiprocessing
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ftl_lightning.demonstrations.cache import cache_folder
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.driving import expert
+from ftl_lightning.domains.driving.environment import SEEDS, STATE, initial_state
+from ftl_lightning.domains.driving.expert import SEARCH
+from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import content_hash, load_tensors, save_tensors
+
+_LOG = logging.getLogger(__name__)
+
+NAME = "driving"
+STATE_NAMES = tuple(f"ego.{feature}" for feature in FEATURES)
+STATE_UNITS = ("1", "m", "m", "m/s", "m/s", "1", "1")
+KIND = "driving episode"
+MOST = 4
+"""Episodes that are driven at most for each that is kept."""
+
+
+def episode_seed(seed: int, number: int) -> int:
+    """Seed of the simulation of an episode, below 2^24."""
+    return zlib.crc32(f"{seed} {number}".encode()) % SEEDS
+
+
+def shard(name: str, seed: int) -> Path:
+    """File of one episode."""
+    key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__])
+    return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
+
+
+def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
+    """Observations ``(time, 5, 7)`` of the expert and whether it succeeded, from the cache if they are there."""
+    path = shard(name, seed)
+    if path.is_file():
+        try:
+            tensors, header = load_tensors(path, KIND)
+            return tensors["observations"].numpy(), bool(header["succeeded"])
+        except UserError:
+            path.unlink()  # damaged from outside: driven again
+    try:
+        seen, succeeded = expert.drive(name, seed)
+    except Exception as error:  # whatever the simulation raises: the other episodes go on
+        _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected", name, seed, error)
+        seen, succeeded = np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
+    save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
+    return seen, succeeded
+
+
+def _made(job: tuple[str, int]) -> tuple[np.ndarray, bool]:
+    return episode(*job)
+
+
+def _episodes(name: str, seeds: list[int], workers: int) -> Iterator[tuple[np.ndarray, bool]]:
+    jobs = [(name, seed) for seed in seeds]
+    if workers == 1:
+        yield from map(_made, jobs)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(_made, jobs)
+
+
+def demonstrations(name: str, count: int, seed: int, workers: int, progress: Callable[[], None]) -> Demonstrations:
+    """The first ``count`` successful episodes of a scenario, in the order of their seeds, whatever the number of workers.
+
+    Args:
+        name: of the scenario.
+        count: demonstrations.
+        seed: decides the episodes' seeds.
+        workers: processes.
+        progress: called after each successful episode.
+
+    Raises:
+        UserError: if too few episodes succeed.
+    """
+    kept: list[tuple[int, np.ndarray]] = []
+    driven = 0
+    seeds = [episode_seed(seed, number) for number in range(MOST * count)]
+    for number, (seen, succeeded) in enumerate(_episodes(name, seeds, workers)):
+        driven = number + 1
+        if succeeded:
+            kept.append((seeds[number], seen))
+            progress()
+        if len(kept) == count:
+            break
+    else:
+        raise UserError(f"driving {name!r}: expected {count} successful episodes of {driven}, found {len(kept)}")
+    longest = max(len(seen) for _, seen in kept)
+    # Padded with the last observation.
+    rows = [np.minimum(np.arange(longest), len(seen) - 1) for _, seen in kept]
+    observations = torch.from_numpy(
+        np.stack([initial_state(seen[row], name, start) for (start, seen), row in zip(kept, rows, strict=True)])
+    )
+    return Demonstrations(
+        states=observations[..., :STATE].contiguous(),
+        lengths=torch.tensor([len(seen) for _, seen in kept]),
+        domain=NAME,
+        state_names=STATE_NAMES,
+        state_units=STATE_UNITS,
+        concepts=(name,) * count,
+        initial_states=observations,
+        provenance={"generator": NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count},
+    )

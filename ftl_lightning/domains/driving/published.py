@@ -1,0 +1,20 @@
+"""The paper's numbers for driving, to stand beside ours. Its success rate counts a vehicle past the roundabout, crashed or not."""
+
+from ftl_lightning.domains.domain import Published
+from ftl_lightning.domains.driving.tasks import NEW
+
+SUCCESS, CRASH = "closed loop success", "closed loop crash"
+
+
+def _omega() -> list[Published]:
+    """Table 'Classifier-free guidance weight choice effect'."""
+    rows = (("1.2", 0.18, 0.38), ("1.4", 0.14, 0.40), ("1.6", 0.04, 0.48), ("1.8", 0.10, 0.40), ("learned", 0.24, 0.32))
+    return [
+        Published(NEW, value, omega=omega, metric=metric)
+        for omega, success, crash in rows
+        for metric, value in ((SUCCESS, success), (CRASH, crash))
+    ]
+
+
+PUBLISHED = (*_omega(), Published(NEW, 0.14, components=1, metric=SUCCESS))
+"""And of the table 'Ablation on the number of learned concepts' the row that is not in the other."""

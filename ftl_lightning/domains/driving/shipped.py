@@ -1,0 +1,32 @@
+"""The expert's episodes that ship with the package."""
+
+from pathlib import Path
+
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
+from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import VALIDATION_SEED
+
+SHIPPED = Path(__file__).parent / "demonstrations"
+"""The expert's episodes of the training scenarios, a file each; see the data card beside them."""
+HELD_OUT = 10
+"""So many of the shipped episodes of each scenario, its last, are for validation."""
+
+
+def training_set(count: int, seed: int) -> Demonstrations:
+    """The first ``count`` shipped episodes of each training scenario; with a validation seed, of those that are held out.
+
+    The expert takes half an hour for them, so they are the same for every seed.
+
+    Raises:
+        UserError: if fewer ship.
+    """
+    parts = []
+    for name in TRAINING_CONCEPTS:
+        shipped = Demonstrations.load(SHIPPED / f"{name}.safetensors")
+        rows = list(range(len(shipped)))
+        pool = rows[-HELD_OUT:] if seed >= VALIDATION_SEED else rows[:-HELD_OUT]
+        if count > len(pool):
+            raise UserError(f"data.samples_per_concept: expected at most {len(pool)} episodes of {name!r}, found {count}")
+        parts.append(shipped.rows(pool[:count]))
+    return concatenate(parts)

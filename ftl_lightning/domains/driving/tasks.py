@@ -1,0 +1,13 @@
+"""What is learned and evaluated: the paper's scenarios, and the validation suite on which everything is tuned."""
+
+from ftl_lightning.domains.domain import EvaluationTask, Suite
+
+TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
+NEW = "new initial state"
+
+TRAINING = Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in TRAINING_CONCEPTS))
+PAPER = Suite((EvaluationTask(NEW, "roundabout", learned="roundabout"),))
+VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned="roundabout third exit"),))
+"""Another way through the same roundabout."""
+
+SUITES = {"training": TRAINING, "paper": PAPER, "validation": VALIDATION}

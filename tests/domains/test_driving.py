@@ -1,0 +1,258 @@
+"""Driving: scenarios, the faster simulation, save and restore, expert, planner."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from highway_env.vehicle.behavior import IDMVehicle
+
+from ftl_lightning.domains.driving import expert, generation
+from ftl_lightning.domains.driving.environment import INITIAL, OBSERVED, DrivingEnvironment, initial_state, origin
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
+from ftl_lightning.domains.driving.simulation import advance, restore, save
+from ftl_lightning.errors import UserError
+
+PAPER = ("highway", "exit", "merge", "intersection", "roundabout")
+
+
+def places(env: object) -> np.ndarray:
+    return np.array([vehicle.position for vehicle in env.road.vehicles])  # type: ignore[attr-defined]
+
+
+def start(name: str, seed: int = 0, fast: bool = True) -> object:
+    env = make(name, fast)
+    env.reset(seed=seed)
+    return env
+
+
+# Scenarios
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_the_seed_decides_an_episode(name: str) -> None:
+    first, again, other = start(name, 3), start(name, 3), start(name, 4)
+    for env in (first, again, other):
+        env.step(1)
+    assert np.array_equal(places(first), places(again))
+    assert places(first).shape != places(other).shape or not np.array_equal(places(first), places(other))
+    assert np.isfinite(observe(first)).all()
+
+
+def test_no_state_leaks_from_one_scenario_to_the_next() -> None:
+    before = {name: value for name, value in vars(IDMVehicle).items() if name.isupper()}
+    alone = start("merge")
+    alone.step(1)
+    start("intersection").step(1)
+    after = start("merge")
+    after.step(1)
+    assert np.array_equal(places(alone), places(after))
+    assert {name: value for name, value in vars(IDMVehicle).items() if name.isupper()} == before
+
+
+def test_an_unknown_scenario() -> None:
+    with pytest.raises(UserError, match="expected one of highway, exit, merge"):
+        make("motorway")
+
+
+def test_the_exit_is_entered_from_any_lane() -> None:
+    env = make("exit")
+    lanes = set()
+    for seed in range(24):
+        env.reset(seed=seed)
+        lanes.add(env.vehicle.lane_index[2])
+    assert lanes == {0, 1, 2, 3}
+
+
+# The same simulation, faster
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_the_faster_simulation_is_the_published_one(name: str) -> None:
+    draw = np.random.default_rng(0)
+    for seed in range(2):
+        fast, published = start(name, seed), start(name, seed, fast=False)
+        ended = False
+        for _ in range(4 if name == "highway" else 12):
+            decision = int(draw.integers(fast.action_space.n))
+            seen, reward, ended, late, _ = fast.step(decision)
+            expected, expected_reward, expected_end, expected_late, _ = published.step(decision)
+            np.testing.assert_allclose(seen, expected, atol=1e-4)
+            np.testing.assert_allclose(places(fast), places(published), atol=1e-6)
+            assert (round(reward, 6), ended, late) == (round(expected_reward, 6), expected_end, expected_late)
+            np.testing.assert_array_equal(observe(fast), fast.observation_type.observe())
+            if ended or late:
+                break
+
+
+# Save and restore
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_save_and_restore_are_exact(name: str) -> None:
+    env = start(name, 1)
+    advance(env, 1)
+    saved, draw = save(env), np.random.default_rng(0)
+    futures = [draw.integers(env.action_space.n, size=3).tolist() for _ in range(10)]
+
+    def go(decisions: list[int]) -> list[tuple[float, bool, bytes, bytes]]:
+        restore(env, saved)
+        found = []
+        for decision in decisions:
+            reward, ended = advance(env, decision)
+            found.append((reward, ended, places(env).tobytes(), observe(env).tobytes()))
+            if ended:
+                break
+        return found
+
+    first = [go(future) for future in futures]
+    assert [go(future) for future in reversed(futures)] == first[::-1]
+    assert len({str(one) for one in first}) > 1
+
+
+# Expert
+
+
+@pytest.mark.parametrize("name", ["roundabout", "merge"])
+def test_the_expert_arrives(name: str) -> None:
+    env = make(name)
+    for seed in range(2):
+        seen, succeeded = expert.drive(name, seed, env)
+        assert succeeded
+        assert arrived(env, name)
+        assert not env.vehicle.crashed
+        assert seen.shape[1:] == (5, 7)
+    again, _ = expert.drive(name, 1)
+    assert np.array_equal(seen, again)
+
+
+def test_planning_leaves_the_simulation_as_it_was() -> None:
+    env = start("roundabout")
+    before, random = places(env), env.np_random.bit_generator.state
+    assert expert.plan(env, "roundabout") == expert.plan(env, "roundabout")
+    assert np.array_equal(places(env), before)
+    assert env.np_random.bit_generator.state == random
+    assert env.config["simulation_frequency"] == 15
+
+
+# Closed loop
+
+
+def follow(actions: list[np.ndarray], task: str = "roundabout", seed: int = 0) -> tuple[np.ndarray, dict[str, float]]:
+    env = DrivingEnvironment()
+    seen, info = [env.reset(seed=seed, options={"task": task})[0]], {}
+    for action in actions:
+        observation, _, ended, late, info = env.step(action)
+        seen.append(observation)
+        if ended or late:
+            break
+    env.close()
+    return np.stack(seen), info
+
+
+def test_the_planner_does_what_the_expert_did() -> None:
+    env = DrivingEnvironment()
+    name, seed = origin(env.reset(seed=5)[0])
+    seen, succeeded = expert.drive(name, seed)
+    assert succeeded
+    driven, info = follow(list(seen[1:, 0]), seed=5)
+    np.testing.assert_allclose(driven[:, :OBSERVED], seen.reshape(len(seen), -1), atol=1e-4)
+    assert info["arrived"]
+    assert info["passed"]
+    assert not info["crashed"]
+    assert info["length"] == len(seen) - 1
+
+
+def test_the_planner_takes_what_comes_nearest_without_a_crash() -> None:
+    fast, slow = (np.array([1, 0, y, 0, 0, 0, 0]) for y in (-999.0, 999.0))
+    ahead, behind = follow([fast] * 3)[0], follow([slow] * 3)[0]
+    assert ahead[-1, 2] < behind[-1, 2] - 3  # farther up the page
+    idle = follow([np.array([1.0])] * 3)[0]
+    assert behind[-1, 2] >= idle[-1, 2] - 1e-3
+
+
+def test_an_episode_repeats_and_starts_where_its_numbers_say() -> None:
+    first, again = follow([np.array([3.0])] * 4, seed=9)[0], follow([np.array([3.0])] * 4, seed=9)[0]
+    assert np.array_equal(first, again)
+    env = DrivingEnvironment()
+    seen, _ = env.reset(options={"initial_state": first[0]})
+    assert np.array_equal(seen, first[0])
+    with pytest.raises(UserError, match="expected the start of 'roundabout'"):
+        env.reset(options={"initial_state": first[2]})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        (np.zeros(35), "expected 37 finite numbers"),
+        (np.full(INITIAL, np.nan), "expected 37 finite numbers"),
+        (np.concatenate((np.zeros(OBSERVED), [99, 0])), "a scenario from 0 to"),
+        (np.concatenate((np.zeros(OBSERVED), [0, 0.5])), "and a seed, found 0 and 0.5"),
+    ],
+)
+def test_initial_states_that_are_none(wrong: np.ndarray, expected: str) -> None:
+    with pytest.raises(UserError, match=expected):
+        DrivingEnvironment().reset(options={"initial_state": wrong})
+
+
+def test_actions_that_are_none() -> None:
+    env = DrivingEnvironment()
+    env.reset(seed=0)
+    for wrong in (np.zeros(3), np.full(7, np.nan)):
+        with pytest.raises(UserError, match="driving action: expected 7 finite numbers, or 1"):
+            env.step(wrong)
+
+
+def test_what_no_model_sees_stands_last() -> None:
+    row = initial_state(np.ones((5, 7), dtype=np.float32), "merge", 12345)
+    assert row.shape == (INITIAL,)
+    assert origin(row) == ("merge", 12345)
+
+
+def test_success_rules() -> None:
+    for name in PAPER:
+        assert not arrived(start(name), name)
+
+
+# Demonstrations
+
+
+def test_demonstrations_do_not_depend_on_workers_and_go_on_where_they_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "one"))
+    told: list[int] = []
+    alone = generation.demonstrations("merge", 2, 0, 1, lambda: told.append(1))
+    assert len(told) == 2
+    assert alone.initial_states is not None
+    assert torch.equal(alone.states, alone.initial_states[..., :7])
+    assert alone.provenance["rejected"] == alone.provenance["driven"] - 2
+    for row, (length, start) in enumerate(zip(alone.lengths.tolist(), alone.initial_states[:, 0].numpy(), strict=True)):
+        assert (alone.states[row, length:] == alone.states[row, length - 1]).all()
+        assert origin(start) == ("merge", generation.episode_seed(0, row))
+    (tmp_path / "two").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "two"))
+    first = generation.shard("merge", generation.episode_seed(0, 0))
+    generation.episode("merge", generation.episode_seed(0, 0))
+    first.write_bytes(first.read_bytes()[:-20])  # damaged: driven again
+    two = generation.demonstrations("merge", 2, 0, 2, lambda: None)
+    assert two.hash == alone.hash
+    monkeypatch.setattr(expert, "drive", lambda *_: pytest.fail("driven though it was kept"))
+    assert generation.demonstrations("merge", 2, 0, 1, lambda: None).hash == alone.hash
+
+
+def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    whole = np.ones((3, 5, 7), dtype=np.float32)
+
+    def drive(name: str, seed: int) -> tuple[np.ndarray, bool]:
+        if seed == generation.episode_seed(0, 0):
+            raise RuntimeError("the simulator broke")
+        return whole, seed != generation.episode_seed(0, 1)
+
+    monkeypatch.setattr(expert, "drive", drive)
+    found = generation.demonstrations("merge", 2, 0, 1, lambda: None)
+    assert (found.provenance["driven"], found.provenance["rejected"]) == (4, 2)
+    monkeypatch.setattr(expert, "drive", lambda *_: (whole, False))
+    with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
+        generation.demonstrations("exit", 1, 0, 1, lambda: None)

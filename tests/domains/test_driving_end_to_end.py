@@ -1,0 +1,103 @@
+"""Driving through the command line: pretraining, inversion, closed loop, mistakes."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.environment import origin
+from ftl_lightning.domains.driving.shipped import training_set
+from ftl_lightning.seeding import VALIDATION_SEED
+from tests.conftest import CONF
+
+FIT = ["--config", str(CONF / "driving.yaml")]
+INVERT = ["--config", str(CONF / "invert" / "driving.yaml")]
+SMALL = [
+    "--model.denoiser_args={width: 8, multipliers: [1, 2]}",
+    "--data.samples_per_concept=6",
+    "--data.validation_per_concept=2",
+    "--data.batch_size=16",
+    "--data.steps_per_epoch=10",
+    "--trainer.max_steps=20",
+]
+QUICK = ["--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.figures=2"]
+QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small pretrained model."""
+    folder = tmp_path_factory.mktemp("driving")
+    assert main(["fit", *FIT, *SMALL, *QUICK, *QUIET, f"--trainer.logger.init_args.save_dir={folder}"]) == 0
+    return folder / "driving" / "fit" / "pretrained"
+
+
+def test_the_shipped_demonstrations() -> None:
+    train, held_out = training_set(100, 0), training_set(10, VALIDATION_SEED)
+    assert len(train) == 400
+    assert len(held_out) == 40
+    assert train.initial_states is not None
+    assert held_out.initial_states is not None
+    starts = {origin(row) for part in (train, held_out) for row in part.initial_states[:, 0].numpy()}
+    assert len(starts) == 440
+    assert {name for name, _ in starts} == set(DOMAIN.training_concepts)
+    assert torch.equal(training_set(3, 7).states, training_set(3, 0).states)
+    # Each is where the seed in its card puts it.
+    again = DOMAIN.initial_states("exit", 40, 0)  # type: ignore[misc]
+    first = train.select("exit").initial_states[0, 0]  # type: ignore[index]
+    assert any(torch.allclose(first, row, atol=1e-3) for row in again)
+
+
+def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
+    options = ["--data.steps=3", "--model.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
+    assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET]) == 0
+    rows = pd.read_csv("logs/driving/invert/results.csv", keep_default_na=False)
+    ours = rows[rows["K"] == 2]
+    outcomes = {f"closed loop {name}" for name in ("success", "strict success", "crash", "return", "length")}
+    assert outcomes <= set(ours["metric"])
+    assert {metric for metric in set(ours["metric"]) - outcomes if not metric.startswith(("won against", "lost against"))} == set()
+    assert {metric.removeprefix("won against ") for metric in set(ours["metric"]) if metric.startswith("won")} == {
+        "IDLE",
+        "random",
+        "FASTER",
+        "nearest demonstration",
+        "expert (oracle)",
+    }
+    oracle = rows[(rows["method"] == "expert (oracle)") & (rows["metric"] == "closed loop strict success")]
+    assert oracle["value"].tolist() == [1.0]
+
+
+def test_generate_writes_what_invert_reads(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "driving", "--task=merge", "--count=2", "--out=demos.safetensors"]) == 0
+    found = Demonstrations.load("demos.safetensors")
+    assert found.states.shape[2] == 7
+    assert found.initial_states is not None
+    assert found.initial_states.shape[2] == 37
+    capsys.readouterr()
+    for arguments, expected in (
+        (["generate", "driving", "--task=motorway"], "driving task: expected one of highway"),
+        (["generate", "driving", "--task=merge", "--workers=0"], "workers: expected 1 or more"),
+        (["fit", *FIT, *SMALL, *QUIET, "--data.samples_per_concept=101"], "expected at most 100 episodes"),
+        (["fit", *FIT, *SMALL, *QUIET, "--model.view=mirror"], "model.view: expected one of '', 'map', 'ego'"),
+    ):
+        assert main(arguments) == 2
+        assert expected in capsys.readouterr().err
+
+
+def test_a_file_whose_states_do_not_fit(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wide = Demonstrations(
+        states=torch.zeros(1, 9, 8),
+        lengths=torch.tensor([9]),
+        domain="driving",
+        state_names=tuple("abcdefgh"),
+        state_units=("",) * 8,
+        concepts=("roundabout",),
+        initial_states=torch.zeros(1, 9, 37),
+    )
+    wide.save("wide.safetensors")
+    assert main(["invert", *INVERT, *QUIET, f"--model.pretrained={model}", "--data.demonstrations=wide.safetensors"]) == 2
+    assert "expected shape (demo, time, 7), found (1, 9, 8)" in capsys.readouterr().err

@@ -1,0 +1,63 @@
+"""How a model sees traffic."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.views import VIEWS
+from ftl_lightning.errors import UserError
+
+
+def vehicle(x: float, y: float, speed: float, heading: float) -> list[float]:
+    cos, sin = math.cos(heading), math.sin(heading)
+    return [1, x, y, speed * cos, speed * sin, cos, sin]
+
+
+def scene(turn: float = 0.0, x: float = 0.0, y: float = 0.0) -> Tensor:
+    """A vehicle at 8 m/s and another 10 m ahead of it at 4 m/s, the whole turned and moved."""
+    ahead = vehicle(x + 10 * math.cos(turn), y + 10 * math.sin(turn), 4, turn)
+    return torch.tensor([vehicle(x, y, 8, turn) + ahead + [0.0] * 21 + [4, 99]])
+
+
+def straight_on(turn: float = 0.0, x: float = 0.0, y: float = 0.0) -> Tensor:
+    return torch.tensor([[vehicle(x + 8 * k * math.cos(turn), y + 8 * k * math.sin(turn), 8, turn) for k in range(8)]])
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_decoding_undoes_encoding(name: str) -> None:
+    view, start = VIEWS[name], scene(1.1, 30, -20)
+    states = torch.randn(1, 8, 7)
+    torch.testing.assert_close(view.decode(view.encode(states, start), start), states, atol=1e-5, rtol=1e-5)
+
+
+def test_from_the_vehicle_all_straight_roads_are_alike() -> None:
+    view = VIEWS["ego"]
+    plain = view.encode(straight_on(), scene())
+    turned = view.encode(straight_on(2.0, 300, 40), scene(2.0, 300, 40))
+    torch.testing.assert_close(turned, plain, atol=1e-4, rtol=1e-4)
+    assert plain[0, 1].tolist() == pytest.approx([1, 8, 0, 8, 0, 1, 0], abs=1e-5)
+    seen, seen_turned = view.observe(scene()), view.observe(scene(2.0, 300, 40))
+    torch.testing.assert_close(seen_turned[:, 7:], seen[:, 7:], atol=1e-4, rtol=1e-4)
+    assert seen[0, 7:14].tolist() == pytest.approx([1, 10, 0, 4, 0, 1, 0], abs=1e-5)
+    assert (seen[0, 14:] == 0).all()  # who is not there is nowhere, wherever the vehicle is
+    assert (seen_turned[0, 14:] == 0).all()
+    assert seen_turned[0, 1:3].tolist() == [300, 40]
+
+
+def test_no_model_sees_scenario_and_seed() -> None:
+    start = scene()
+    other = start.clone()
+    other[:, -2:] = 0
+    for view in VIEWS.values():
+        assert view.observe(start).shape == (1, 35)
+        assert torch.equal(view.observe(start), view.observe(other))
+        with pytest.raises(UserError, match="expected 37 numbers each, found 35"):
+            view.observe(start[:, :35])
+
+
+def test_entities_are_the_other_vehicles() -> None:
+    assert [columns[0] for columns in DOMAIN.entities] == [7, 14, 21, 28]
+    assert {len(columns) for columns in DOMAIN.entities} == {7}
