@@ -100,7 +100,8 @@ class ClosedLoop:
         steps: at most, of an episode.
         judge: ``(goal, observations (episode, time, m), what the environment told at the end of each) -> what happened``, by name
             ``(episode,)``; ``'success'``, of bool, is the paper's metric. Observations are padded with the last one.
-        frames: ``observations (time, m) -> pictures (height, width, 3)`` of an episode.
+        frames: ``(observations (time, m), plans (step, horizon, state) that were followed) -> pictures (height, width, 3)`` of an
+            episode.
         headline: what of that the method and others are compared by, episode for episode.
         policies: policies to print beside every rate: name to ``(goal, initial states (episode, m), demonstrations that the
             behaviour was learned from or None, seed) -> policy``, or ``None`` where it would take too long.
@@ -110,7 +111,7 @@ class ClosedLoop:
     act: Callable[[Tensor, int, Tensor], Tensor]
     steps: int
     judge: Callable[[str, Tensor, Sequence[Mapping[str, Any]]], dict[str, Tensor]]
-    frames: Callable[[Tensor], list[NDArray[np.uint8]]]
+    frames: Callable[[Tensor, Tensor], list[NDArray[np.uint8]]]
     headline: str = "success"
     policies: Mapping[str, Callable[[str, Tensor, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
 

@@ -104,24 +104,33 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
             environment.close()
 
 
-def following(plan: Plan, act: Callable[[Tensor, int, Tensor], Tensor], replan: int) -> Policy:
+class Following:
     """The policy that follows plans. Where one holds a number that is not finite, there is no action.
 
     Args:
         plan: makes plans.
         act: the domain's planner, see :class:`~ftl_lightning.domains.domain.ClosedLoop`.
         replan: steps that a plan is followed before a new one is made; the paper's number is 1.
+
+    Attributes:
+        followed: for each episode the plan ``(horizon, state)`` of each of its steps.
     """
-    plans: dict[int, Tensor] = {}
 
-    def policy(observations: Tensor, rows: list[int], step: int) -> Tensor:
-        if step % replan == 0:
-            made = plan(observations, rows)
+    def __init__(self, plan: Plan, act: Callable[[Tensor, int, Tensor], Tensor], replan: int) -> None:
+        self._plan, self._act, self._replan = plan, act, replan
+        self.followed: dict[int, list[Tensor]] = {}
+
+    def __call__(self, observations: Tensor, rows: list[int], step: int) -> Tensor:
+        age = step % self._replan
+        if age == 0:
+            made = self._plan(observations, rows)
             finite = made.isfinite().flatten(1).all(dim=1)
-            plans.update(zip(rows, torch.where(finite[:, None, None], made, torch.nan), strict=True))
-        return act(torch.stack([plans[row] for row in rows]), step % replan, observations)
-
-    return policy
+            plans = torch.where(finite[:, None, None], made, torch.nan)
+        else:
+            plans = torch.stack([self.followed[row][-1] for row in rows])
+        for row, plan in zip(rows, plans, strict=True):
+            self.followed.setdefault(row, []).append(plan)
+        return self._act(plans, age, observations)
 
 
 def sampled_plans(

@@ -4,6 +4,7 @@ It works the same while fitting, in ``validate``, in ``test`` and after ``invert
 model and :class:`Generates`.
 """
 
+import itertools
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import SAMPLERS
 from ftl_lightning.domains.domain import Domain, EvaluationTask, Policy, Suite, load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.closed_loop import Rollout, fixed_plans, following, roll_out, sampled_plans
+from ftl_lightning.evaluation.closed_loop import Following, Rollout, fixed_plans, roll_out, sampled_plans
 from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
@@ -66,6 +67,7 @@ class Judged:
         right: whether each is right ``(sample,)``, or ``None`` in domains that judge episodes alone.
         initial_states: that they start from ``(sample, m)``, or ``None``.
         rollout: what happened when they were executed, if they were.
+        followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
         outcomes: the domain's judgement of that, by name ``(sample,)``.
     """
 
@@ -74,6 +76,7 @@ class Judged:
     right: Tensor | None
     initial_states: Tensor | None = None
     rollout: Rollout | None = None
+    followed: Tensor | None = None
     outcomes: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
@@ -261,7 +264,10 @@ class Evaluator(pl.Callback):
             draws,
         )
         assert domain.closed_loop is not None
-        return _executed(judged, following(plan, domain.closed_loop.act, self.replan), domain)
+        policy = Following(plan, domain.closed_loop.act, self.replan)
+        executed = _executed(judged, policy, domain)
+        firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
+        return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(executed, firsts, strict=True)]
 
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Tell mistakes before hours of training, not after."""
@@ -314,8 +320,8 @@ class Evaluator(pl.Callback):
             title = one.task.name if one.right is None else f"{one.task.name}: {share(one.right):.2f}"
             figure = domain.render(one.states[shown], right, title, start)
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
-            if one.rollout is not None and domain.closed_loop is not None:
-                pictures = domain.closed_loop.frames(one.rollout.observations[0])
+            if one.rollout is not None and one.followed is not None and domain.closed_loop is not None:
+                pictures = domain.closed_loop.frames(one.rollout.observations[0], one.followed)
                 log_animation(logger, f"{CLOSED}/{one.task.setting}/{one.task.name}", pictures, step)
 
     def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:
@@ -376,7 +382,7 @@ class Evaluator(pl.Callback):
             plans = [draw(one.task.goal, len(one.states), one.initial_states, self.seed) for one in self.judged]
             own = [Judged.of(one.task, states, one.initial_states, domain) for one, states in zip(self.judged, plans, strict=True)]
             if loop is not None:
-                own = _executed(own, following(fixed_plans(torch.cat(plans)), loop.act, loop.steps), domain)
+                own = _executed(own, Following(fixed_plans(torch.cat(plans)), loop.act, loop.steps), domain)
             found[name] = own
         for name, make in loop.policies.items() if loop is not None else ():
             found[name] = []

@@ -104,10 +104,11 @@ class InversionModule(pl.LightningModule):
     @property
     def method(self) -> str:
         """The method's name in tables."""
-        encoder = self.model.config.denoiser_args.get("initial_encoder")
+        config = self.model.config
+        seen = [part for part in (config.view, config.denoiser_args.get("initial_encoder")) if part]
         form = {1.0: "free", 0.0: "span"}.get(self.off_span, f"near span {self.off_span:g}")
         weight = self.hparams["training_omega"]
-        parts = [*([encoder] if encoder else []), form, *([] if weight is None else [f"training weight {weight:g}"])]
+        parts = [*seen, form, *([] if weight is None else [f"training weight {weight:g}"])]
         return f"FTL-IGM ({', '.join(parts)})"
 
     def configure_model(self) -> None:

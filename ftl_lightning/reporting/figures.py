@@ -9,10 +9,12 @@ from ftl_lightning.reporting.tables import summarise
 
 PAPER_COLOUR = "#9a9a9a"
 COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3")
+LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
+"""Of reference policies."""
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting beside the paper's, K = 2 and a fixed omega; bars show standard errors over tasks.
+    """A metric of every setting beside the paper's and reference policies, K = 2; bars show standard errors over tasks.
 
     Args:
         domain: the domain.
@@ -24,7 +26,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     names = ("training", "paper")
     settings = [s for name in names for s in domain.suites[name].settings if s in set(ours["setting"])]
     methods = sorted(set(ours["method"]))
-    figure = Figure(figsize=(1.9 * max(len(settings), 2) + 1.5, 3.4), layout="constrained")
+    figure = Figure(figsize=(1.9 * max(len(settings), 2) + 3.5, 3.4), layout="constrained")
     axes = figure.subplots()
     width = 0.8 / (len(methods) + 1)
     published = {
@@ -32,7 +34,8 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
         for found in domain.published
         if not found.task and found.omega == domain.published_omega and found.metric == metric
     }
-    chance = rows[rows["K"] == 0]
+    references = rows[rows["omega"] == ""]
+    policies = sorted(set(references["method"]))
     drawn = False
     for place, setting in enumerate(settings):
         found = published.get(setting)
@@ -52,11 +55,15 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
                     capsize=2,
                     label=label,
                 )
-        trivial = summarise(chance[(chance["setting"] == setting) & chance["method"].str.startswith("random")])
-        if trivial:
-            span = (place - width / 2, place + (len(methods) + 0.5) * width)
-            axes.hlines(trivial.mean, *span, colors="black", linestyles="dotted", label="chance" if place == 0 else "")
+        span = (place - width / 2, place + (len(methods) + 0.5) * width)
+        for index, policy in enumerate(policies):
+            reference = summarise(references[(references["setting"] == setting) & (references["method"] == policy)])
+            if reference:
+                _, known = axes.get_legend_handles_labels()
+                line = LINES[index % len(LINES)]
+                label = "" if policy in known else policy
+                axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
     axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
     axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, K = 2, omega = {domain.omega}")
-    axes.legend(fontsize=8, loc="lower left")
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure

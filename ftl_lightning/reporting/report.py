@@ -6,7 +6,7 @@ from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.reporting.figures import accuracy_bars
-from ftl_lightning.reporting.tables import EXECUTED, tables
+from ftl_lightning.reporting.tables import ACCURACY, EXECUTED, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
@@ -35,10 +35,10 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         for table in found:
             write_text(out / name / f"{table.name}.md", table.markdown())
             write_text(out / name / f"{table.name}.tex", table.latex())
-        for table in found:
-            if table.name in (metrics := {"accuracy": "accuracy", "closed_loop": EXECUTED}):
-                with atomic(out / name / f"{table.name}.png") as temporary:
-                    accuracy_bars(domain, rows, metrics[table.name]).savefig(temporary, dpi=120)
+        measured = set(rows.loc[(rows["domain"] == name) & (rows["K"] == 2), "metric"])
+        for metric in sorted(measured & {ACCURACY, EXECUTED, *(one.metric for one in domain.published)}):
+            with atomic(out / name / f"{metric.replace(' ', '_')}.png") as temporary:
+                accuracy_bars(domain, rows, metric).savefig(temporary, dpi=120)
         everything += [table.markdown() for table in found]
         headline += [table.markdown() for table in found if table.name in ("accuracy", "closed_loop", "concept_count")]
     if readme:

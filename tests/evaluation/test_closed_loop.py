@@ -11,7 +11,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import ddpm
 from ftl_lightning.domains.domain import ClosedLoop
-from ftl_lightning.evaluation.closed_loop import fixed_plans, following, roll_out, sampled_plans
+from ftl_lightning.evaluation.closed_loop import Following, fixed_plans, roll_out, sampled_plans
 from ftl_lightning.evaluation.tensorboard import gif
 from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig
 from ftl_lightning.seeding import generator
@@ -37,7 +37,7 @@ LOOP = ClosedLoop(
     act=lambda plans, step, observations: plans[:, step + 1] - observations,
     steps=8,
     judge=lambda goal, observations, infos: {"success": observations[:, -1, 0] > 3},
-    frames=lambda observations: [],
+    frames=lambda observations, plans: [],
 )
 
 
@@ -54,11 +54,13 @@ def test_plans_are_followed_until_the_environment_ends_an_episode(replan: int) -
         calls.append(list(rows))
         return ahead(observations, rows)
 
-    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), following(plan, LOOP.act, replan))
+    policy = Following(plan, LOOP.act, replan)
+    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), policy)
     assert found.observations[0, :, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 4, 4]  # padded with its last
     assert found.observations[1, :, 0].tolist() == list(range(-9, 0))
     assert not found.failed.any()
     assert calls == [[0, 1] if start < 4 else [1] for start in range(0, 8, replan)]
+    assert [int(plan[0, 0]) for plan in policy.followed[0]] == [step - step % replan for step in range(4)]
 
 
 def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
@@ -68,7 +70,7 @@ def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: 
             plans[0, -1] = float("nan")
         return plans
 
-    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), following(plan, LOOP.act, 1))
+    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), Following(plan, LOOP.act, 1))
     assert found.failed.tolist() == [True, False]
     assert found.observations[0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
     assert found.observations[1, -1, 0] == -1
@@ -76,14 +78,14 @@ def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: 
 
 
 def test_all_episodes_may_fail() -> None:
-    nowhere = following(lambda observations, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
+    nowhere = Following(lambda observations, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
     found = roll_out(LOOP, torch.zeros(2, 1), nowhere)
     assert found.failed.all()
     assert (found.observations == 0).all()
 
 
 def test_an_episode_whose_simulator_raises_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
-    found = roll_out(LOOP, torch.tensor([[100.0], [-9.0]]), following(ahead, LOOP.act, 1))
+    found = roll_out(LOOP, torch.tensor([[100.0], [-9.0]]), Following(ahead, LOOP.act, 1))
     assert found.failed.tolist() == [True, False]
     assert "episode 0, step 0: RuntimeError('the simulator broke')" in caplog.text
     assert [info.get("x") for info in found.infos] == [None, -1]
@@ -129,7 +131,7 @@ def test_episodes_do_not_depend_on_their_neighbours() -> None:
             0.5,
             [generator("cpu", 0, row) for row in rows],
         )
-        return roll_out(LOOP, starts[rows], following(plan, LOOP.act, 2)).observations
+        return roll_out(LOOP, starts[rows], Following(plan, LOOP.act, 2)).observations
 
     together = run([0, 1, 2, 3, 4])
     for rows in ([0], [3, 1], [4, 2, 0]):

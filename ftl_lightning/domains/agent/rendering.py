@@ -56,8 +56,11 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
         spine.set(color=frame, linewidth=2.0)
 
 
-def frames(observations: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode ``(time, 52)``, every :data:`EVERY` steps, until nothing moves any more."""
+def frames(observations: Tensor, plans: Tensor) -> list[NDArray[np.uint8]]:
+    """Pictures ``(height, width, 3)`` of an episode ``(time, 52)``, every :data:`EVERY` steps, until nothing moves any more.
+
+    Plans are not drawn: the pictures are the simulator's.
+    """
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1
     environment = AgentEnvironment()

@@ -72,8 +72,11 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, initial_sta
     return figure
 
 
-def frames(observations: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode ``(time, 37)``, one a decision, until nothing moves any more."""
+def frames(observations: Tensor, plans: Tensor) -> list[NDArray[np.uint8]]:
+    """Pictures ``(height, width, 3)`` of an episode ``(time, 37)``, one a decision, until nothing moves any more.
+
+    What was driven is green; the plan ``(time, 8, 7)`` that decided where to go next is orange.
+    """
     moving = (observations[1:, 1:3] - observations[:-1, 1:3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1
     ways = observations[:end, 1:3].numpy()
@@ -82,7 +85,7 @@ def frames(observations: Tensor) -> list[NDArray[np.uint8]]:
         figure = Figure(figsize=(3.2, 3.2), dpi=80, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         axes = figure.subplots()
-        _draw(axes, observation, None, ways)
+        _draw(axes, observation, plans[time].numpy() if time < len(plans) else None, ways)
         axes.plot(*ways[: time + 1].T, color=EGO, linewidth=1, zorder=1)
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
