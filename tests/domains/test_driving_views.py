@@ -30,6 +30,7 @@ def straight_on(turn: float = 0.0, x: float = 0.0, y: float = 0.0) -> Tensor:
 def test_decoding_undoes_encoding(name: str) -> None:
     view, start = VIEWS[name], scene(1.1, 30, -20)
     states = torch.randn(1, 8, 7)
+    states[..., 5:] /= states[..., 5:].norm(dim=-1, keepdim=True)
     torch.testing.assert_close(view.decode(view.encode(states, start), start), states, atol=1e-5, rtol=1e-5)
 
 
@@ -45,6 +46,19 @@ def test_from_the_vehicle_all_straight_roads_are_alike() -> None:
     assert (seen[0, 14:] == 0).all()  # who is not there is nowhere, wherever the vehicle is
     assert (seen_turned[0, 14:] == 0).all()
     assert seen_turned[0, 1:3].tolist() == [300, 40]
+
+
+def test_in_steps_every_state_of_a_straight_drive_is_the_same() -> None:
+    seen = VIEWS["steps"].encode(straight_on(2.0, 300, 40), scene(2.0, 300, 40))[0]
+    torch.testing.assert_close(seen[1:], torch.tensor([1.0, 8, 0, 8, 0, 1, 0]).expand(7, -1), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(seen[0], torch.tensor([1.0, 0, 0, 8, 0, 1, 0]), atol=1e-4, rtol=1e-4)
+
+
+def test_in_steps_a_heading_is_of_length_one_whatever_the_model_said() -> None:
+    view, start = VIEWS["steps"], scene()
+    seen = view.encode(straight_on(), start)
+    seen[..., 5:] *= 3
+    torch.testing.assert_close(view.decode(seen, start), straight_on(), atol=1e-4, rtol=1e-4)
 
 
 def test_no_model_sees_scenario_and_seed() -> None:

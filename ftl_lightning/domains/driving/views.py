@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.environment import INITIAL, OBSERVED, STATE
@@ -50,6 +51,21 @@ def _observe_from_ego(initial_states: Tensor) -> Tensor:
     return torch.cat((ego, seen.flatten(1)), dim=-1)
 
 
+def _encode_steps(states: Tensor, initial_states: Tensor) -> Tensor:
+    """Each state ``(sample, horizon, 7)`` seen from the one before, the first from where the vehicle is."""
+    before = torch.cat((_vehicles(initial_states)[:, :1], states[:, :-1]), dim=1)
+    return _seen_from(states.flatten(0, 1)[:, None], before.flatten(0, 1))[:, 0].unflatten(0, states.shape[:2])
+
+
+def _decode_steps(steps: Tensor, initial_states: Tensor) -> Tensor:
+    """The inverse; headings are brought back to unit length, or their errors would multiply from step to step."""
+    states = [_vehicles(initial_states)[:, 0]]
+    for step in steps.unbind(dim=1):
+        seen = torch.cat((step[:, :5], functional.normalize(step[:, 5:], dim=1)), dim=1)
+        states.append(_on_the_map(seen[:, None], states[-1])[:, 0])
+    return torch.stack(states[1:], dim=1)
+
+
 VIEWS = {
     "map": View(
         encode=lambda states, initial_states: states,
@@ -61,5 +77,8 @@ VIEWS = {
         decode=lambda states, initial_states: _on_the_map(states, _vehicles(initial_states)[:, 0]),
         observe=_observe_from_ego,
     ),
+    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego),
 }
-"""``map`` is the paper's. In ``ego`` the next state is the same number on every road where the vehicle drives straight on."""
+"""``map`` is the paper's. In ``ego`` the next state is the same number on every road where the vehicle drives straight on; in ``steps``
+so is every state of a plan, where the plans of ``ego`` spread over a hundred metres, beside which a metre is lost.
+"""
