@@ -57,10 +57,11 @@ def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
     assert read_rows(path).equals(rows)
 
 
-def test_the_notebook_of_navigation_shows_the_committed_results(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("name", "tables"), [("agent", 5), ("driving", 4)])
+def test_a_notebook_shows_the_committed_results(name: str, tables: int, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (checkout / "results").symlink_to(ROOT / "results")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    assert sum("| paper |" in text for text in run("agent", checkout)) == 5
+    assert sum("| paper |" in text for text in run(name, checkout)) == tables
 
 
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)

@@ -130,11 +130,13 @@ class View:
         encode: ``(states (sample, horizon, state), initial states (sample, m)) -> (sample, horizon, state)``.
         decode: its inverse.
         observe: ``initial states (sample, m) -> (sample, what the model is conditioned on)``.
+        alike: groups of columns of a state, in the same order: those in the same place of each share a scale.
     """
 
     encode: Callable[[Tensor, Tensor], Tensor]
     decode: Callable[[Tensor, Tensor], Tensor]
     observe: Callable[[Tensor], Tensor]
+    alike: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ class PretrainingModule(pl.LightningModule):
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            normalization = Normalization.fit(states)
+            normalization = Normalization.fit(states, view.alike if view else ())
             beside = None if initial is None else Normalization.fit(initial, data.domain.entities)
             if beside is not None and data.domain.state_columns:
                 beside.share(data.domain.state_columns, normalization)

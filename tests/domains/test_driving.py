@@ -256,3 +256,15 @@ def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(expert, "drive", lambda *_: (whole, False))
     with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
         generation.demonstrations("exit", 1, 0, 1, lambda: None)
+
+
+@pytest.mark.parametrize(("name", "seconds"), [("merge", 1.0), ("intersection", 0.5)])
+def test_after_an_episode_every_vehicle_drives_straight_on(name: str, seconds: float) -> None:
+    seen = np.zeros((2, 5, 7), dtype=np.float32)
+    seen[-1, :2] = (1, 10, 20, 4, -2, 1, 0)
+    longer = generation.driven_on(seen, name, 5)
+    assert np.array_equal(longer[:2], seen)
+    assert longer[2:, 1, 1].tolist() == [10 + 4 * seconds * k for k in (1, 2, 3)]
+    assert longer[2:, 0, 2].tolist() == [20 - 2 * seconds * k for k in (1, 2, 3)]
+    assert (longer[2:, :2, 3:] == seen[-1, :2, 3:]).all()
+    assert (longer[2:, 2:] == 0).all()

@@ -12,15 +12,13 @@ from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.environment import MAX_STEPS, STATE, DrivingEnvironment, initial_state
 from ftl_lightning.domains.driving.expert import SEARCH
-from ftl_lightning.domains.driving.generation import NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
+from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.published import PUBLISHED
 from ftl_lightning.domains.driving.rendering import frames, render
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, VEHICLES, make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.views import VIEWS
-
-HORIZON = 8
 
 
 def generate(task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
@@ -32,6 +30,7 @@ def generate(task: str, count: int, seed: int, workers: int = 1) -> Demonstratio
         "seed": seed,
         "config": scenario(task).config,
         "search": SEARCH[task],
+        "beyond": HORIZON,
     }
     return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress))
 

@@ -14,7 +14,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.environment import SEEDS, STATE, initial_state
 from ftl_lightning.domains.driving.expert import SEARCH
-from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES
+from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import content_hash, load_tensors, save_tensors
 
@@ -24,6 +24,8 @@ NAME = "driving"
 STATE_NAMES = tuple(f"ego.{feature}" for feature in FEATURES)
 STATE_UNITS = ("1", "m", "m", "m/s", "m/s", "1", "1")
 KIND = "driving episode"
+HORIZON = 8
+"""States in a plan; the paper's number."""
 MOST = 4
 """Episodes that are driven at most for each that is kept."""
 
@@ -55,6 +57,18 @@ def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
         seen, succeeded = np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
     save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
     return seen, succeeded
+
+
+def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
+    """An episode's observations ``(time, 5, 7)``, longer: every vehicle drives straight on after the end.
+
+    Plans look beyond the end of an episode, which ends because time is up or there is nothing left to decide. Vehicles that stood
+    still there, as if turned to stone, would teach that a drive ends with a stop.
+    """
+    times = decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
+    beyond = np.repeat(seen[-1:], len(times), axis=0)
+    beyond[..., 1:3] += (times * beyond[..., 3:5]).astype(np.float32)
+    return np.concatenate((seen, beyond))
 
 
 def _made(job: tuple[str, int]) -> tuple[np.ndarray, bool]:
@@ -95,12 +109,8 @@ def demonstrations(name: str, count: int, seed: int, workers: int, progress: Cal
             break
     else:
         raise UserError(f"driving {name!r}: expected {count} successful episodes of {driven}, found {len(kept)}")
-    longest = max(len(seen) for _, seen in kept)
-    # Padded with the last observation.
-    rows = [np.minimum(np.arange(longest), len(seen) - 1) for _, seen in kept]
-    observations = torch.from_numpy(
-        np.stack([initial_state(seen[row], name, start) for (start, seen), row in zip(kept, rows, strict=True)])
-    )
+    longest = max(len(seen) for _, seen in kept) + HORIZON
+    observations = torch.from_numpy(np.stack([initial_state(driven_on(seen, name, longest), name, start) for start, seen in kept]))
     return Demonstrations(
         states=observations[..., :STATE].contiguous(),
         lengths=torch.tensor([len(seen) for _, seen in kept]),

@@ -178,6 +178,12 @@ def scenario(name: str) -> Scenario:
     return SCENARIOS[name]
 
 
+def decision_seconds(name: str) -> float:
+    """Seconds between two decisions."""
+    found = scenario(name)
+    return float(1 / (found.environment.default_config() | found.config)["policy_frequency"])
+
+
 def make(name: str, fast: bool = True) -> AbstractEnv:
     """An environment of a scenario.
 

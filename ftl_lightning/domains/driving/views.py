@@ -2,12 +2,16 @@
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.environment import INITIAL, OBSERVED, STATE
-from ftl_lightning.domains.driving.scenarios import VEHICLES
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.errors import UserError
+
+SECONDS = torch.tensor([decision_seconds(name) for name in SCENARIOS])
+"""Between two decisions, by the number of the scenario."""
+_PAIRS = ((1, 3, 5), (2, 4, 6))
+"""Columns of a direction and the one across."""
 
 
 def _vehicles(initial_states: Tensor) -> Tensor:
@@ -51,19 +55,52 @@ def _observe_from_ego(initial_states: Tensor) -> Tensor:
     return torch.cat((ego, seen.flatten(1)), dim=-1)
 
 
+def _speed(states: Tensor) -> Tensor:
+    """Velocity ``(sample, 2)`` of states ``(sample, 7)``, along and across their own headings."""
+    return _turned(states[:, 3:5], states[:, 5], -states[:, 6])
+
+
+def _seconds(step: int, initial_states: Tensor) -> Tensor:
+    """Between the state that comes before a plan's step and the one there ``(sample, 1)``: a plan's first is the present."""
+    return SECONDS[initial_states[:, OBSERVED].long(), None] * min(step, 1)
+
+
 def _encode_steps(states: Tensor, initial_states: Tensor) -> Tensor:
-    """Each state ``(sample, horizon, 7)`` seen from the one before, the first from where the vehicle is."""
-    before = torch.cat((_vehicles(initial_states)[:, :1], states[:, :-1]), dim=1)
-    return _seen_from(states.flatten(0, 1)[:, None], before.flatten(0, 1))[:, 0].unflatten(0, states.shape[:2])
+    """How each state ``(sample, horizon, 7)`` differs from the one before kept at its speed; the first, from the present.
+
+    Presence; metres along and across the mean of both headings, which for a curve are its length and 0; metres a second along and
+    across the own heading; cosine and sine of the turn.
+    """
+    found, before = [], _vehicles(initial_states)[:, 0]
+    for step, state in enumerate(states.unbind(dim=1)):
+        turn = _turned(state[:, 5:], before[:, 5], -before[:, 6])
+        way = _turned(state[:, 1:3] - before[:, 1:3], before[:, 5], -before[:, 6])
+        half = torch.atan2(turn[:, 1], turn[:, 0]) / 2
+        way = _turned(way, half.cos(), -half.sin()) - _seconds(step, initial_states) * _speed(before)
+        found.append(torch.cat((state[:, :1], way, _speed(state) - _speed(before), turn), dim=-1))
+        before = state
+    return torch.stack(found, dim=1)
 
 
 def _decode_steps(steps: Tensor, initial_states: Tensor) -> Tensor:
-    """The inverse; headings are brought back to unit length, or their errors would multiply from step to step."""
+    """The inverse, for turns of any length."""
     states = [_vehicles(initial_states)[:, 0]]
-    for step in steps.unbind(dim=1):
-        seen = torch.cat((step[:, :5], functional.normalize(step[:, 5:], dim=1)), dim=1)
-        states.append(_on_the_map(seen[:, None], states[-1])[:, 0])
+    for step, change in enumerate(steps.unbind(dim=1)):
+        before = states[-1]
+        angle = torch.atan2(change[:, 6], change[:, 5])
+        heading = _turned(before[:, 5:], angle.cos(), angle.sin())
+        way = change[:, 1:3] + _seconds(step, initial_states) * _speed(before)
+        way = _turned(_turned(way, (angle / 2).cos(), (angle / 2).sin()), before[:, 5], before[:, 6])
+        velocity = _turned(change[:, 3:5] + _speed(before), heading[:, 0], heading[:, 1])
+        states.append(torch.cat((change[:, :1], before[:, 1:3] + way, velocity, heading), dim=-1))
     return torch.stack(states[1:], dim=1)
+
+
+def _observe_without_place(initial_states: Tensor) -> Tensor:
+    """The same without where on the map the controlled vehicle is and where it heads, only its speed."""
+    seen = _observe_from_ego(initial_states)
+    speed = seen[:, 3:5].norm(dim=-1, keepdim=True)
+    return torch.cat((torch.zeros_like(seen[:, :3]), speed, torch.zeros_like(seen[:, :3]), seen[:, STATE:]), dim=-1)
 
 
 VIEWS = {
@@ -77,8 +114,9 @@ VIEWS = {
         decode=lambda states, initial_states: _on_the_map(states, _vehicles(initial_states)[:, 0]),
         observe=_observe_from_ego,
     ),
-    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego),
+    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, alike=_PAIRS),
+    "blind": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_without_place, alike=_PAIRS),
 }
-"""``map`` is the paper's. In ``ego`` the next state is the same number on every road where the vehicle drives straight on; in ``steps``
-so is every state of a plan, where the plans of ``ego`` spread over a hundred metres, beside which a metre is lost.
+"""``map`` is the paper's. In ``ego`` the next state is the same number on every road where the vehicle drives straight on. In
+``steps`` every state of a plan is, where the plans of ``ego`` spread over a hundred metres, beside which a metre is lost.
 """
