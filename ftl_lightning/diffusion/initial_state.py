@@ -1,4 +1,6 @@
-"""Encoders of the initial state: the paper's, which takes it as one vector, and one that treats exchangeable entities alike."""
+"""Encoders of the initial state: the paper's, which takes it as one vector, and two that treat exchangeable entities alike."""
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +28,18 @@ class FlatEncoder(nn.Module):
         return features
 
 
+def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
+    """Columns of each entity ``(entity, columns)`` and those that belong to none."""
+    if not sizes.entities:
+        raise UserError(f"denoiser_args.initial_encoder: expected flat, found {name}: this domain does not name its entities")
+    columns = torch.tensor(sizes.entities)
+    own = set(columns.flatten().tolist())
+    # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
+    # columns are 0 after normalisation.
+    shared = [column for column in range(sizes.initial_state_dim) if column not in own]
+    return columns, torch.tensor(shared, dtype=torch.int64)
+
+
 class EntityEncoder(nn.Module):
     """Every entity through the same network; the concept attends to them, so that it is a matter of looks and not of places.
 
@@ -46,17 +60,11 @@ class EntityEncoder(nn.Module):
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        if not sizes.entities:
-            raise UserError("denoiser_args.initial_encoder: expected flat, found entities, which this domain does not name")
-        columns = torch.tensor(sizes.entities)
-        own = set(columns.flatten().tolist())
-        # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
-        # columns are 0 after normalisation.
-        shared = [column for column in range(sizes.initial_state_dim) if column not in own]
+        columns, shared = _entity_columns("entities", sizes)
         self.looks = list(sizes.looks or range(columns.shape[1]))
         self.rest = [column for column in range(columns.shape[1]) if column not in sizes.looks]
         self.register_buffer("columns", columns, persistent=False)
-        self.register_buffer("shared", torch.tensor(shared, dtype=torch.int64), persistent=False)
+        self.register_buffer("shared", shared, persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(len(self.rest) + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
@@ -82,15 +90,46 @@ class EntityEncoder(nn.Module):
         return features
 
 
-ENCODERS = ("flat", "entities")
+class SetEncoder(nn.Module):
+    """Every entity through the same network, of whose features the largest and the mean are read (deep sets, Zaheer et al., 2017).
+
+    What belongs to no entity goes to each of them, and into the features. The concept is not seen.
+
+    Args:
+        sizes: of the initial state and its entities.
+        width: of the features.
+    """
+
+    columns: Tensor
+    shared: Tensor
+
+    def __init__(self, sizes: Sizes, width: int) -> None:
+        super().__init__()
+        columns, shared = _entity_columns("set", sizes)
+        self.register_buffer("columns", columns, persistent=False)
+        self.register_buffer("shared", shared, persistent=False)
+        inner = 2 * width
+        self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
+        self.out = nn.Sequential(nn.Linear(2 * inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
+
+    def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
+        """Features ``(batch, width)`` of ``initial_state (batch, m)``, normalised; ``concept (batch, n)`` is not used."""
+        shared = initial_state[:, self.shared]
+        each = initial_state[:, self.columns]  # (batch, entity, columns)
+        hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
+        features: Tensor = self.out(torch.cat((hidden.amax(dim=1), hidden.mean(dim=1), shared), dim=-1))
+        return features
 
 
-def initial_state_encoder(name: str, sizes: Sizes, width: int) -> FlatEncoder | EntityEncoder:
+ENCODERS: dict[str, Callable[[Sizes, int], nn.Module]] = {"flat": FlatEncoder, "entities": EntityEncoder, "set": SetEncoder}
+
+
+def initial_state_encoder(name: str, sizes: Sizes, width: int) -> nn.Module:
     """An encoder by its name in a configuration.
 
     Raises:
-        UserError: for a name that is none, or ``entities`` in a domain without them.
+        UserError: for a name that is none, or one that needs entities in a domain without them.
     """
     if name not in ENCODERS:
         raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")
-    return FlatEncoder(sizes, width) if name == "flat" else EntityEncoder(sizes, width)
+    return ENCODERS[name](sizes, width)

@@ -22,7 +22,7 @@ class MLPDenoiser(nn.Module):
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
         time_dim: features of the timestep; even.
         dropout: of the hidden layers, in training.
-        initial_encoder: ``'flat'`` (the paper's) or ``'entities'``.
+        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.initial_state`.
         initial_dim: features of the initial state.
     """
 

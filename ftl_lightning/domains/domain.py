@@ -130,12 +130,16 @@ class View:
         encode: ``(states (sample, horizon, state), initial states (sample, m)) -> (sample, horizon, state)``.
         decode: its inverse.
         observe: ``initial states (sample, m) -> (sample, what the model is conditioned on)``.
+        perturb: ``(states (sample, horizon, state), initial states (sample, m), noise (sample,) of variance 1) -> both``, as if the
+            present had been a little different; ``None`` where that is not known. A model that has learned the ways back from there
+            does not get lost where its demonstrations never were.
         alike: groups of columns of a state, in the same order: those in the same place of each share a scale.
     """
 
     encode: Callable[[Tensor, Tensor], Tensor]
     decode: Callable[[Tensor, Tensor], Tensor]
     observe: Callable[[Tensor], Tensor]
+    perturb: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
     alike: tuple[tuple[int, ...], ...] = ()
 
 

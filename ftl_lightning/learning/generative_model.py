@@ -38,6 +38,7 @@ class ModelConfig(Sizes):
         diffusion_steps: T.
         prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'`` or ``'displacement'``.
         view: name of the domain's view that the model sees behaviour with; empty for as it is.
+        perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
         state_columns: columns of the initial state that hold the state a plan starts from.
         training: how it was trained, for the record.
     """
@@ -50,6 +51,7 @@ class ModelConfig(Sizes):
     diffusion_steps: int = 100
     prediction: str = "epsilon"
     view: str = ""
+    perturb: bool = False
     state_columns: tuple[int, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
 
@@ -117,6 +119,8 @@ class GenerativeModel(nn.Module):
         super().__init__()
         self.config = config
         self.view = load_view(config.domain, config.view)
+        if config.perturb and (self.view is None or self.view.perturb is None):
+            raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
         self.denoiser = build_denoiser(config)
         self.normalization = normalization
         self.initial_normalization = initial_normalization
@@ -159,6 +163,16 @@ class GenerativeModel(nn.Module):
                 raise UserError(
                     f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
                 )
+
+    def perturbed(self, states: Tensor, initial_states: Tensor | None, draw: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """What to learn from: behaviour and initial states with another present, if the model's configuration says so."""
+        if not self.config.perturb:
+            return states, initial_states
+        assert self.view is not None
+        assert self.view.perturb is not None
+        assert initial_states is not None
+        noise = torch.randn(len(states), generator=draw, device=draw.device)
+        return self.view.perturb(states, initial_states, noise)
 
     def encode(self, states: Tensor, initial_states: Tensor | None) -> Tensor:
         """Behaviour ``(sample, horizon, state)`` in the domain's units to what the denoiser sees."""

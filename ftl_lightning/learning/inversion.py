@@ -174,11 +174,12 @@ class InversionModule(pl.LightningModule):
         share = torch.rand(samples, generator=draw, device=self.device).cpu().repeat(runs)
         states, initial = self.demonstrations.windows(rows, self.demonstrations.starts(rows, share, self.early), horizon)
         initial = None if initial is None else initial.to(self.device)
+        states, initial = self.model.perturbed(states.to(self.device), initial, draw)
         s0 = self.model.encode_initial(initial)
         embeddings = self.parametrised
         losses = denoising_loss(
             lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, self.weights, self.model.empty, s0),
-            self.model.encode(states.to(self.device), initial),
+            self.model.encode(states, initial),
             noise.repeat(runs, 1, 1),
             t.repeat(runs),
             self.model.alpha_bar,

@@ -50,6 +50,7 @@ class PretrainingModule(pl.LightningModule):
             weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         view: name of the domain's view that behaviour is seen with, see :class:`ftl_lightning.domains.domain.View`; empty for as
             it stands in files.
+        perturb: learn from presents that the view perturbs, here and in inversion.
         compile: compile the denoiser for training (worth it on GPUs).
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and noise, timesteps and condition dropout as a function of the step.
@@ -74,6 +75,7 @@ class PretrainingModule(pl.LightningModule):
         prediction: str = "epsilon",
         loss: str = "epsilon",
         view: str = "",
+        perturb: bool = False,
         compile: bool = False,
         output: str | None = None,
         seed: int = 0,
@@ -116,6 +118,7 @@ class PretrainingModule(pl.LightningModule):
             entities=data.domain.entities,
             looks=data.domain.looks,
             view=self.hparams["view"],
+            perturb=self.hparams["perturb"],
             state_columns=data.domain.state_columns,
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
@@ -144,8 +147,9 @@ class PretrainingModule(pl.LightningModule):
 
     def _loss(self, denoiser: Denoiser, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
         """Eq. 1 on a batch, ``(batch,)``."""
-        clean = self.model.encode(batch.states, batch.initial_states)
-        initial = self.model.encode_initial(batch.initial_states)
+        states, seen = self.model.perturbed(batch.states, batch.initial_states, draw)
+        clean = self.model.encode(states, seen)
+        initial = self.model.encode_initial(seen)
         count = len(clean)
         removed = torch.rand(count, generator=draw, device=self.device) < dropout
         concepts = torch.cat((self.model.empty[None], self.model.training_embeddings))

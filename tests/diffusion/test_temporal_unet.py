@@ -33,7 +33,13 @@ def unet(**options: object) -> TemporalUNet:
 
 @pytest.mark.parametrize(
     "options",
-    [{"initial_encoder": "flat"}, {"initial_encoder": "entities"}, {"film": True}, {"clock": 4, "broadcast": True}],
+    [
+        {"initial_encoder": "flat"},
+        {"initial_encoder": "entities"},
+        {"initial_encoder": "set"},
+        {"film": True},
+        {"clock": 4, "broadcast": True},
+    ],
     ids=str,
 )
 def test_shape_and_every_part_of_the_condition_matters(options: dict[str, object]) -> None:
@@ -63,7 +69,7 @@ def test_exchanging_entities_changes_nothing_unless_the_encoder_is_flat() -> Non
     x, t, concepts, index, initial = inputs()
     swapped = initial.clone()
     swapped[:, [4, 5, 7, 8]] = initial[:, [7, 8, 4, 5]]
-    for encoder, same in (("entities", True), ("flat", False)):
+    for encoder, same in (("entities", True), ("set", True), ("flat", False)):
         net = unet(initial_encoder=encoder)
         out = net(x, t, concepts, index, initial)
         assert torch.allclose(out, net(x, t, concepts, index, swapped), atol=1e-6) == same
@@ -96,8 +102,9 @@ def test_a_concept_tells_entities_apart_by_their_looks() -> None:
     [
         ({"horizon": 12}, {}, "horizon: expected a multiple of 8"),
         ({}, {"width": 12}, "width: expected a multiple of 8"),
-        ({}, {"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities"),
+        ({}, {"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities, set"),
         ({"entities": ()}, {"initial_encoder": "entities"}, "expected flat"),
+        ({"entities": ()}, {"initial_encoder": "set"}, "expected flat"),
     ],
 )
 def test_sizes_that_do_not_fit(sizes: dict[str, object], options: dict[str, object], expected: str) -> None:

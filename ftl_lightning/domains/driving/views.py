@@ -10,6 +10,8 @@ from ftl_lightning.errors import UserError
 
 SECONDS = torch.tensor([decision_seconds(name) for name in SCENARIOS])
 """Between two decisions, by the number of the scenario."""
+NEAR = 20.0
+"""Metres; distances far beyond look alike, or a gap of some metres would be lost beside the hundred that can be seen."""
 _PAIRS = ((1, 3, 5), (2, 4, 6))
 """Columns of a direction and the one across."""
 
@@ -51,7 +53,10 @@ def _observe_from_ego(initial_states: Tensor) -> Tensor:
     """The controlled vehicle where it is ``(7)``, and the others seen from it, those that are none at 0 ``(4 * 7)``."""
     vehicles = _vehicles(initial_states)
     ego, others = vehicles[:, 0], vehicles[:, 1:]
-    seen = _seen_from(others, ego) * others[..., :1]
+    seen = _seen_from(others, ego)
+    presence, place, velocity, heading = seen.split((1, 2, 2, 2), dim=-1)
+    near = place * NEAR / (NEAR + place.norm(dim=-1, keepdim=True))
+    seen = torch.cat((presence, near, velocity - _speed(ego)[:, None], heading), dim=-1) * presence
     return torch.cat((ego, seen.flatten(1)), dim=-1)
 
 
@@ -103,6 +108,18 @@ def _observe_without_place(initial_states: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(seen[:, :3]), speed, torch.zeros_like(seen[:, :3]), seen[:, STATE:]), dim=-1)
 
 
+PERTURBATION = 4.0
+"""Standard deviation of the present's speed in m/s."""
+
+
+def _perturb(states: Tensor, initial_states: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Other speeds of the controlled vehicle in the present, from where it goes on as it did."""
+    ego = _vehicles(initial_states)[:, 0]
+    speed = (_speed(ego)[:, 0] + PERTURBATION * noise).clamp(min=0)
+    now = torch.cat((ego[:, :3], speed[:, None] * ego[:, 5:], ego[:, 5:]), dim=-1)
+    return torch.cat((now[:, None], states[:, 1:]), dim=1), torch.cat((now, initial_states[:, STATE:]), dim=-1)
+
+
 VIEWS = {
     "map": View(
         encode=lambda states, initial_states: states,
@@ -114,8 +131,8 @@ VIEWS = {
         decode=lambda states, initial_states: _on_the_map(states, _vehicles(initial_states)[:, 0]),
         observe=_observe_from_ego,
     ),
-    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, alike=_PAIRS),
-    "blind": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_without_place, alike=_PAIRS),
+    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, perturb=_perturb, alike=_PAIRS),
+    "blind": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_without_place, perturb=_perturb, alike=_PAIRS),
 }
 """``map`` is the paper's. In ``ego`` the next state is the same number on every road where the vehicle drives straight on. In
 ``steps`` every state of a plan is, where the plans of ``ego`` spread over a hundred metres, beside which a metre is lost.
