@@ -82,7 +82,8 @@ def test_generate_writes_what_invert_reads(model: Path, capsys: pytest.CaptureFi
         (["generate", "driving", "--task=motorway"], "driving task: expected one of highway"),
         (["generate", "driving", "--task=merge", "--workers=0"], "workers: expected 1 or more"),
         (["fit", *FIT, *SMALL, *QUIET, "--data.samples_per_concept=101"], "expected at most 100 episodes"),
-        (["fit", *FIT, *SMALL, *QUIET, "--model.view=mirror"], "model.view: expected one of '', 'map', 'ego', 'steps'"),
+        (["fit", *FIT, *SMALL, *QUIET, "--model.view=map", "--model.perturb=true"], "model.perturb: expected a view that can"),
+        (["fit", *FIT, *SMALL, *QUIET, "--model.view=mirror"], "model.view: expected one of '', 'map', 'steps'"),
     ):
         assert main(arguments) == 2
         assert expected in capsys.readouterr().err

@@ -35,17 +35,26 @@ def test_decoding_undoes_encoding(name: str) -> None:
 
 
 def test_from_the_vehicle_all_straight_roads_are_alike() -> None:
-    view = VIEWS["ego"]
-    plain = view.encode(straight_on(), scene())
-    turned = view.encode(straight_on(2.0, 300, 40), scene(2.0, 300, 40))
-    torch.testing.assert_close(turned, plain, atol=1e-4, rtol=1e-4)
-    assert plain[0, 1].tolist() == pytest.approx([1, 8, 0, 8, 0, 1, 0], abs=1e-5)
+    view = VIEWS["steps"]
     seen, seen_turned = view.observe(scene()), view.observe(scene(2.0, 300, 40))
     torch.testing.assert_close(seen_turned[:, 7:], seen[:, 7:], atol=1e-4, rtol=1e-4)
     assert seen[0, 7:14].tolist() == pytest.approx([1, 10 * 20 / 30, 0, 4 - 8, 0, 1, 0], abs=1e-5)  # 10 m away, 4 m/s slower
     assert (seen[0, 14:] == 0).all()  # who is not there is nowhere, wherever the vehicle is
     assert (seen_turned[0, 14:] == 0).all()
     assert seen_turned[0, 1:3].tolist() == [300, 40]
+
+
+def test_a_perturbed_present_has_another_speed_and_the_way_back_from_it() -> None:
+    view, start, states = VIEWS["steps"], scene(), straight_on()
+    assert view.perturb is not None
+    other, seen = view.perturb(states, start, torch.tensor([0.5]))
+    assert seen[0, :7].tolist() == pytest.approx(vehicle(0, 0, 8 + 0.5 * 4, 0))
+    assert torch.equal(seen[0, 7:], start[0, 7:])
+    assert torch.equal(other[0, 0], seen[0, :7])
+    assert torch.equal(other[0, 1:], states[0, 1:])
+    assert view.encode(other, seen)[0, 1, 3] == -2  # brakes by what it was too fast
+    stopped, _ = view.perturb(states, start, torch.tensor([-9.0]))
+    assert stopped[0, 0, 3:5].tolist() == [0, 0]
 
 
 def test_in_steps_every_state_of_a_straight_drive_is_the_same() -> None:

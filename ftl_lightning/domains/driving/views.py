@@ -41,14 +41,6 @@ def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
     return torch.cat((presence, *(_turned(part, cos, -sin) for part in parts)), dim=-1)
 
 
-def _on_the_map(states: Tensor, ego: Tensor) -> Tensor:
-    """The inverse."""
-    cos, sin = ego[:, None, 5], ego[:, None, 6]
-    presence, *parts = states.split((1, 2, 2, 2), dim=-1)
-    place, velocity, heading = (_turned(part, cos, sin) for part in parts)
-    return torch.cat((presence, place + ego[:, None, 1:3], velocity, heading), dim=-1)
-
-
 def _observe_from_ego(initial_states: Tensor) -> Tensor:
     """The controlled vehicle where it is ``(7)``, and the others seen from it, those that are none at 0 ``(4 * 7)``."""
     vehicles = _vehicles(initial_states)
@@ -101,13 +93,6 @@ def _decode_steps(steps: Tensor, initial_states: Tensor) -> Tensor:
     return torch.stack(states[1:], dim=1)
 
 
-def _observe_without_place(initial_states: Tensor) -> Tensor:
-    """The same without where on the map the controlled vehicle is and where it heads, only its speed."""
-    seen = _observe_from_ego(initial_states)
-    speed = seen[:, 3:5].norm(dim=-1, keepdim=True)
-    return torch.cat((torch.zeros_like(seen[:, :3]), speed, torch.zeros_like(seen[:, :3]), seen[:, STATE:]), dim=-1)
-
-
 PERTURBATION = 4.0
 """Standard deviation of the present's speed in m/s."""
 
@@ -126,14 +111,6 @@ VIEWS = {
         decode=lambda states, initial_states: states,
         observe=lambda initial_states: _vehicles(initial_states).flatten(1),
     ),
-    "ego": View(
-        encode=lambda states, initial_states: _seen_from(states, _vehicles(initial_states)[:, 0]),
-        decode=lambda states, initial_states: _on_the_map(states, _vehicles(initial_states)[:, 0]),
-        observe=_observe_from_ego,
-    ),
     "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, perturb=_perturb, alike=_PAIRS),
-    "blind": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_without_place, perturb=_perturb, alike=_PAIRS),
 }
-"""``map`` is the paper's. In ``ego`` the next state is the same number on every road where the vehicle drives straight on. In
-``steps`` every state of a plan is, where the plans of ``ego`` spread over a hundred metres, beside which a metre is lost.
-"""
+"""``map`` is the paper's. In ``steps`` a plan is the same numbers on any road where the vehicle drives on as before."""
