@@ -42,14 +42,18 @@ def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
 
 
 def _observe_from_ego(initial_states: Tensor) -> Tensor:
-    """The controlled vehicle where it is ``(7)``, and the others seen from it, those that are none at 0 ``(4 * 7)``."""
+    """The controlled vehicle's speed, and the others seen from it, those that are none at 0 ``(7 + 4 * 7)``.
+
+    Not its place on the map: that tells the four training scenarios apart without a concept, and says nothing on a new road.
+    """
     vehicles = _vehicles(initial_states)
     ego, others = vehicles[:, 0], vehicles[:, 1:]
     seen = _seen_from(others, ego)
     presence, place, velocity, heading = seen.split((1, 2, 2, 2), dim=-1)
     near = place * NEAR / (NEAR + place.norm(dim=-1, keepdim=True))
     seen = torch.cat((presence, near, velocity - _speed(ego)[:, None], heading), dim=-1) * presence
-    return torch.cat((ego, seen.flatten(1)), dim=-1)
+    none = torch.zeros_like(ego[:, :3])
+    return torch.cat((none, ego[:, 3:5].norm(dim=-1, keepdim=True), none, seen.flatten(1)), dim=-1)
 
 
 def _speed(states: Tensor) -> Tensor:
