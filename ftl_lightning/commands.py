@@ -125,8 +125,7 @@ def sample(
         raise UserError(f"figure: expected a name that ends in .png, .svg or .pdf, found {figure!r}")
     if initial:
         given = Demonstrations.load(initial)
-        rows = torch.arange(len(given))
-        _, starts = given.windows(rows, torch.zeros_like(rows), 1)
+        starts = given.first_initial_states
         count = len(given)
     elif domain.initial_states is None:
         starts = None

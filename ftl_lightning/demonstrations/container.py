@@ -120,6 +120,12 @@ class Demonstrations:
             initial = initial[rows, starts] if initial.dim() == 3 else initial[rows]
         return self.states[rows[:, None], times], initial
 
+    @property
+    def first_initial_states(self) -> Tensor | None:
+        """What a plan from each demonstration's start is conditioned on ``(demo, initial state)``, or ``None``."""
+        initial = self.initial_states
+        return initial[:, 0] if initial is not None and initial.dim() == 3 else initial
+
     def named(self, concept: str) -> Self:
         """The same, with a name for the concept of those that have none."""
         return replace(self, concepts=tuple(text or concept for text in self.concepts))

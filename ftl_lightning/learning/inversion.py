@@ -127,8 +127,7 @@ class InversionModule(pl.LightningModule):
             raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
         self.demonstrations: Demonstrations = data.demonstrations
         self.early = data.domain.early
-        initial = self.demonstrations.initial_states
-        self.model.encode_initial(None if initial is None else initial[:, 0])  # a wrong size is told before anything is learned
+        self.model.encode_initial(self.demonstrations.first_initial_states)  # a wrong size is told before anything is learned
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
         # A generator for each concept, so that its start does not depend on what is learned beside it.

@@ -1,9 +1,11 @@
 """Navigation through the command line: pretraining, inversion, closed loop, sampling, mistakes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ftl_lightning.cli import main
@@ -98,3 +100,16 @@ def test_demonstrations_without_initial_states_are_refused(model: Path, capsys: 
     np.savez("plain.npz", states=np.zeros((2, 150, 13), dtype=np.float32))
     assert main(["invert", *INVERT, f"--model.pretrained={model}", "--data.demonstrations=plain.npz", *QUIET]) == 2
     assert "key 'initial_states': expected 52 numbers each (the pretrained model's), found none" in capsys.readouterr().err
+
+
+def test_demonstrations_whose_first_initial_states_alone_are_known(model: Path) -> None:
+    assert main(["generate", "agent", "--task=go to red bowl", "--count=3", "--out=whole.safetensors"]) == 0
+    whole = Demonstrations.load("whole.safetensors")
+    assert whole.initial_states is not None
+    first = whole.initial_states[:, 0]
+    replace(whole, initial_states=first).save("first.safetensors")
+    assert torch.equal(whole.first_initial_states, first)  # type: ignore[arg-type]
+    assert torch.equal(Demonstrations.load("first.safetensors").first_initial_states, first)  # type: ignore[arg-type]
+    options = ["--data.steps=2", "--model.samples=2", "--evaluation.suites=[paper]", "--evaluation.closed_loop=false"]
+    own = ["--data.demonstrations=first.safetensors"]
+    assert main(["invert", *INVERT, f"--model.pretrained={model}", *own, *options, *QUICK, *QUIET]) == 0

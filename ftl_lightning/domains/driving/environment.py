@@ -14,7 +14,9 @@ NAMES = tuple(SCENARIOS)
 STATE = len(FEATURES)
 OBSERVED = VEHICLES * STATE
 INITIAL = OBSERVED + 2
-"""Columns of an initial state: what is observed, and what no model sees: the scenario's number and the seed of its start."""
+"""Columns of an initial state: what is observed, and what no network sees: the scenario's number and the seed of its start. A view
+reads the number for the time between two decisions.
+"""
 MAX_STEPS = 30
 SEEDS = 2**24
 """Seeds are below, so that float32 holds them exactly."""

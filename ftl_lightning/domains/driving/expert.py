@@ -22,8 +22,6 @@ class Search:
         gamma: discount; rewards are in [0, 1].
         frequency: Hz of the simulation while searching.
         hold: steps that each decision is kept while searching.
-        floor: reward that counts as none: what every decision earns tells nothing, and deep sequences of it would beat short ones
-            of better decisions.
         sight: metres; vehicles farther away are left out while searching.
     """
 
@@ -31,7 +29,6 @@ class Search:
     gamma: float
     frequency: int = 15
     hold: int = 1
-    floor: float = 0.0
     sight: float = math.inf
 
 
@@ -72,7 +69,7 @@ def plan(env: AbstractEnv, name: str) -> int:
             total, below, ended = earned, depth, False
             for _ in range(search.hold):
                 reward, ended = advance(env, action)
-                total += search.gamma**below * min(max((reward - search.floor) / (1 - search.floor), 0.0), 1.0)
+                total += search.gamma**below * min(max(reward, 0.0), 1.0)
                 below += 1
                 if ended:
                     break
