@@ -99,7 +99,7 @@ def sample(
     from ftl_lightning.diffusion.samplers import SAMPLERS
     from ftl_lightning.domains.domain import load_domain
     from ftl_lightning.errors import UserError
-    from ftl_lightning.evaluation.closed_loop import Following, roll_out, sampled_plans
+    from ftl_lightning.evaluation.closed_loop import Following, planner, roll_out, sampled_plans
     from ftl_lightning.evaluation.tensorboard import gif
     from ftl_lightning.learning.generative_model import GenerativeModel
     from ftl_lightning.seeding import generator
@@ -187,7 +187,7 @@ def sample(
             temperature,
             [generator("cpu", seed, 1, episode) for episode in range(count)],
         )
-        policy = Following(plan, domain.closed_loop.act, replan)
+        policy = Following(plan, planner(model, domain.closed_loop), replan)
         rollout = roll_out(domain.closed_loop, starts, policy)
         if goal:
             for name, values in domain.closed_loop.judge(goal, rollout.observations, rollout.infos).items():

@@ -159,6 +159,11 @@ def sampled_plans(
     return plan
 
 
+def planner(model: GenerativeModel, loop: ClosedLoop) -> Callable[[Tensor, int, Tensor], Tensor]:
+    """What follows a model's plans: the domain's planner, or that of the model's view."""
+    return model.view.act if model.view is not None and model.view.act is not None else loop.act
+
+
 def fixed_plans(plans: Tensor) -> Plan:
     """Plans ``(episode, horizon, state)`` that are made once, such as those of reference policies."""
     return lambda observations, rows: plans[rows]

@@ -22,7 +22,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import SAMPLERS
 from ftl_lightning.domains.domain import Domain, EvaluationTask, Policy, Suite, load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.closed_loop import Following, Rollout, fixed_plans, roll_out, sampled_plans
+from ftl_lightning.evaluation.closed_loop import Following, Rollout, fixed_plans, planner, roll_out, sampled_plans
 from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
@@ -263,7 +263,7 @@ class Evaluator(pl.Callback):
             draws,
         )
         assert domain.closed_loop is not None
-        policy = Following(plan, domain.closed_loop.act, self.replan)
+        policy = Following(plan, planner(model, domain.closed_loop), self.replan)
         executed = _executed(judged, policy, domain)
         firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
         return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(executed, firsts, strict=True)]

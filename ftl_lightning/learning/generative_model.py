@@ -171,7 +171,7 @@ class GenerativeModel(nn.Module):
         assert self.view is not None
         assert self.view.perturb is not None
         assert initial_states is not None
-        noise = torch.randn(len(states), generator=draw, device=draw.device)
+        noise = torch.randn((len(states), 2), generator=draw, device=draw.device)
         return self.view.perturb(states, initial_states, noise)
 
     def encode(self, states: Tensor, initial_states: Tensor | None) -> Tensor:

@@ -169,6 +169,9 @@ def test_the_planner_takes_what_comes_nearest_without_a_crash() -> None:
     fast, slow = (np.array([1, 0, y, 0, 0, 0, 0]) for y in (-999.0, 999.0))
     ahead, behind = follow([fast] * 3)[0], follow([slow] * 3)[0]
     assert ahead[-1, 2] < behind[-1, 2] - 3  # farther up the page
+    quick, gentle = (np.array([metres, 0, metres, 0]) for metres in (99.0, 0.0))  # as drives, on whatever road
+    assert np.array_equal(follow([quick] * 3)[0], ahead)
+    assert np.array_equal(follow([gentle] * 3)[0], behind)
     idle = follow([np.array([1.0])] * 3)[0]
     assert behind[-1, 2] >= idle[-1, 2] - 1e-3
 
@@ -201,7 +204,7 @@ def test_actions_that_are_none() -> None:
     env = DrivingEnvironment()
     env.reset(seed=0)
     for wrong in (np.zeros(3), np.full(7, np.nan)):
-        with pytest.raises(UserError, match="driving action: expected 7 finite numbers, or 1"):
+        with pytest.raises(UserError, match="driving action: expected 7 finite numbers, 4 or 1"):
             env.step(wrong)
 
 

@@ -4,8 +4,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, arrived, make, observe
 from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
 from ftl_lightning.errors import UserError
@@ -17,6 +19,7 @@ INITIAL = OBSERVED + 2
 """Columns of an initial state: what is observed, and what no network sees: the scenario's number and the seed of its start. A view
 reads the number for the time between two decisions.
 """
+DRIVE = 4
 MAX_STEPS = 30
 SEEDS = 2**24
 """Seeds are below, so that float32 holds them exactly."""
@@ -25,10 +28,11 @@ SEEDS = 2**24
 class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """Any scenario, from a start that its number and seed decide.
 
-    An observation is an initial state (37 numbers). An action is either the state (7 numbers) that the controlled vehicle should
-    be in a step later, or the number of one of the scenario's decisions, for policies that decide themselves. Each decision is
-    tried for a step; the one that comes nearest to the wish (Euclidean, in raw units) without a crash is taken, at random among
-    equals, and to brake if all crash. A decision that would crash is replaced by a random one that does not.
+    An observation is an initial state (37 numbers). An action is the state (7 numbers) that the controlled vehicle should be in a
+    step later; or the drive there (4, see :func:`~ftl_lightning.domains.driving.motion.drive`), for those who do not know where
+    the road turns; or the number of one of the scenario's decisions, for policies that decide themselves. Each decision is tried
+    for a step; the one that comes nearest to the wish (Euclidean, in raw units) without a crash is taken, at random among equals,
+    and to brake if all crash. A decision that would crash is replaced by a random one that does not.
 
     The information of the last step tells what happened: ``crashed``, ``arrived`` (where the scenario wants the vehicle, and no
     crash), ``passed`` (the count of the paper's code), ``return`` (sum of rewards) and ``length``.
@@ -86,17 +90,18 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
             UserError: for an action of another size, or with numbers that are not finite.
         """
         wish = np.asarray(action, dtype=np.float64)
-        if wish.shape not in ((STATE,), (1,)) or not np.isfinite(wish).all():
-            raise UserError(f"driving action: expected {STATE} finite numbers, or 1, found {wish.tolist()}")
+        if wish.shape not in ((STATE,), (DRIVE,), (1,)) or not np.isfinite(wish).all():
+            raise UserError(f"driving action: expected {STATE} finite numbers, {DRIVE} or 1, found {wish.tolist()}")
+        now = observe(self._env)[0].astype(np.float64)
         tried = self._tried()
-        safe = [number for number, (_, _, _, state) in enumerate(tried) if state is not None]
+        safe = {number: state for number, (_, _, _, state) in enumerate(tried) if state is not None}
         if not safe:
             chosen = self._slower
         elif len(wish) == 1:
-            chosen = int(wish[0]) if int(wish[0]) in safe else int(self.np_random.choice(safe))
+            chosen = int(wish[0]) if int(wish[0]) in safe else int(self.np_random.choice(list(safe)))
         else:
-            far = np.array([np.linalg.norm(np.asarray(tried[number][3]) - wish) for number in safe])
-            chosen = int(self.np_random.choice(np.array(safe)[far <= far.min() + 1e-6]))
+            far = self._far(now, np.stack(list(safe.values())), wish)
+            chosen = int(self.np_random.choice(np.array(list(safe))[far <= far.min() + 1e-6]))
         after, reward, ended, _ = tried[chosen]
         restore(self._env, after)
         self._return += reward
@@ -113,6 +118,14 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
             state = None if self._env.vehicle.crashed else observe(self._env)[0].astype(np.float64)
             found.append((save(self._env), reward, ended, state))
         return found
+
+    @staticmethod
+    def _far(now: NDArray[np.float64], states: NDArray[np.float64], wish: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far states ``(decision, 7)`` that follow the present ``(7,)`` are from the wish ``(decision,)``."""
+        if len(wish) == DRIVE:
+            states = drive(torch.from_numpy(now).expand(len(states), -1), torch.from_numpy(states)).numpy()
+        distances: NDArray[np.float64] = np.linalg.norm(states - wish, axis=1)
+        return distances
 
     @property
     def _slower(self) -> int:

@@ -5,11 +5,15 @@ from torch import Tensor
 
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.environment import INITIAL, OBSERVED, STATE
+from ftl_lightning.domains.driving.motion import drive, speed, turn, turned, way
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, VEHICLES, decision_seconds
+from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
 
 SECONDS = torch.tensor([decision_seconds(name) for name in SCENARIOS])
 """Between two decisions, by the number of the scenario."""
+KNOWN = torch.tensor([name in TRAINING_CONCEPTS for name in SCENARIOS])
+"""Whether it is a road of pretraining, likewise."""
 NEAR = 20.0
 """Metres; distances far beyond look alike, or a gap of some metres would be lost beside the hundred that can be seen."""
 _PAIRS = ((1, 3, 5), (2, 4, 6))
@@ -27,38 +31,36 @@ def _vehicles(initial_states: Tensor) -> Tensor:
     return initial_states[:, :OBSERVED].unflatten(-1, (VEHICLES, STATE))
 
 
-def _turned(pairs: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """``(..., 2)`` turned by an angle."""
-    x, y = pairs.unbind(-1)
-    return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
-
-
 def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
     """States ``(sample, n, 7)`` seen from a vehicle ``(sample, 7)``: places from it, directions from its own."""
     cos, sin = ego[:, None, 5], ego[:, None, 6]
     presence, place, velocity, heading = states.split((1, 2, 2, 2), dim=-1)
     parts = (place - ego[:, None, 1:3], velocity, heading)
-    return torch.cat((presence, *(_turned(part, cos, -sin) for part in parts)), dim=-1)
+    return torch.cat((presence, *(turned(part, cos, -sin) for part in parts)), dim=-1)
+
+
+def _near(places: Tensor) -> Tensor:
+    """``(..., n)`` with what is far squashed."""
+    return places * NEAR / (NEAR + places.norm(dim=-1, keepdim=True))
 
 
 def _observe_from_ego(initial_states: Tensor) -> Tensor:
-    """The controlled vehicle's speed, and the others seen from it, those that are none at 0 ``(7 + 4 * 7)``.
+    """The controlled vehicle's place, speed and heading, and the others seen from it, those that are none at 0 ``(7 + 4 * 7)``.
 
-    Not its place on the map: that tells the four training scenarios apart without a concept, and says nothing on a new road.
+    Place and heading are known on the roads of pretraining alone, else 0: on a new road they say nothing that was ever learned.
     """
     vehicles = _vehicles(initial_states)
     ego, others = vehicles[:, 0], vehicles[:, 1:]
     seen = _seen_from(others, ego)
     presence, place, velocity, heading = seen.split((1, 2, 2, 2), dim=-1)
-    near = place * NEAR / (NEAR + place.norm(dim=-1, keepdim=True))
-    seen = torch.cat((presence, near, velocity - _speed(ego)[:, None], heading), dim=-1) * presence
-    none = torch.zeros_like(ego[:, :3])
-    return torch.cat((none, ego[:, 3:5].norm(dim=-1, keepdim=True), none, seen.flatten(1)), dim=-1)
+    seen = torch.cat((presence, _near(place), velocity - speed(ego)[:, None], heading), dim=-1) * presence
+    own = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(initial_states)
+    return torch.cat((own[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), own[:, 4:], seen.flatten(1)), dim=-1)
 
 
-def _speed(states: Tensor) -> Tensor:
-    """Velocity ``(sample, 2)`` of states ``(sample, 7)``, along and across their own headings."""
-    return _turned(states[:, 3:5], states[:, 5], -states[:, 6])
+def _known(initial_states: Tensor) -> Tensor:
+    """Whether the place on the map is ``(sample, 1)``: the road is one of pretraining, and it was not hidden."""
+    return (initial_states[:, :1] > 0) & KNOWN[initial_states[:, OBSERVED].long(), None]
 
 
 def _seconds(step: int, initial_states: Tensor) -> Tensor:
@@ -74,11 +76,8 @@ def _encode_steps(states: Tensor, initial_states: Tensor) -> Tensor:
     """
     found, before = [], _vehicles(initial_states)[:, 0]
     for step, state in enumerate(states.unbind(dim=1)):
-        turn = _turned(state[:, 5:], before[:, 5], -before[:, 6])
-        way = _turned(state[:, 1:3] - before[:, 1:3], before[:, 5], -before[:, 6])
-        half = torch.atan2(turn[:, 1], turn[:, 0]) / 2
-        way = _turned(way, half.cos(), -half.sin()) - _seconds(step, initial_states) * _speed(before)
-        found.append(torch.cat((state[:, :1], way, _speed(state) - _speed(before), turn), dim=-1))
+        ahead = way(before, state) - _seconds(step, initial_states) * speed(before)
+        found.append(torch.cat((state[:, :1], ahead, speed(state) - speed(before), turn(before, state)), dim=-1))
         before = state
     return torch.stack(found, dim=1)
 
@@ -89,12 +88,18 @@ def _decode_steps(steps: Tensor, initial_states: Tensor) -> Tensor:
     for step, change in enumerate(steps.unbind(dim=1)):
         before = states[-1]
         angle = torch.atan2(change[:, 6], change[:, 5])
-        heading = _turned(before[:, 5:], angle.cos(), angle.sin())
-        way = change[:, 1:3] + _seconds(step, initial_states) * _speed(before)
-        way = _turned(_turned(way, (angle / 2).cos(), (angle / 2).sin()), before[:, 5], before[:, 6])
-        velocity = _turned(change[:, 3:5] + _speed(before), heading[:, 0], heading[:, 1])
-        states.append(torch.cat((change[:, :1], before[:, 1:3] + way, velocity, heading), dim=-1))
+        heading = turned(before[:, 5:], angle.cos(), angle.sin())
+        ahead = change[:, 1:3] + _seconds(step, initial_states) * speed(before)
+        ahead = turned(turned(ahead, (angle / 2).cos(), (angle / 2).sin()), before[:, 5], before[:, 6])
+        velocity = turned(change[:, 3:5] + speed(before), heading[:, 0], heading[:, 1])
+        states.append(torch.cat((change[:, :1], before[:, 1:3] + ahead, velocity, heading), dim=-1))
     return torch.stack(states[1:], dim=1)
+
+
+def _act(plans: Tensor, step: int, observations: Tensor) -> Tensor:
+    """The drive between two states of plans ``(episode, horizon, 7)``."""
+    after = min(step + 1, plans.shape[1] - 1)
+    return drive(plans[:, after - 1], plans[:, after])
 
 
 PERTURBATION = 4.0
@@ -102,11 +107,16 @@ PERTURBATION = 4.0
 
 
 def _perturb(states: Tensor, initial_states: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Other speeds of the controlled vehicle in the present, from where it goes on as it did."""
+    """On an unknown road other speeds of the controlled vehicle in the present, from where it goes on as it did.
+
+    Half of the time a road is unknown.
+    """
     ego = _vehicles(initial_states)[:, 0]
-    speed = (_speed(ego)[:, 0] + PERTURBATION * noise).clamp(min=0)
-    now = torch.cat((ego[:, :3], speed[:, None] * ego[:, 5:], ego[:, 5:]), dim=-1)
-    return torch.cat((now[:, None], states[:, 1:]), dim=1), torch.cat((now, initial_states[:, STATE:]), dim=-1)
+    known = _known(initial_states) & (noise[:, 1:] > 0)
+    other = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
+    now = torch.cat((ego[:, :3], other * ego[:, 5:], ego[:, 5:]), dim=-1)
+    seen = torch.cat((ego[:, :1] * known, now[:, 1:], initial_states[:, STATE:]), dim=-1)
+    return torch.cat((now[:, None], states[:, 1:]), dim=1), seen
 
 
 VIEWS = {
@@ -115,6 +125,6 @@ VIEWS = {
         decode=lambda states, initial_states: states,
         observe=lambda initial_states: _vehicles(initial_states).flatten(1),
     ),
-    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, perturb=_perturb, alike=_PAIRS),
+    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, perturb=_perturb, act=_act, alike=_PAIRS),
 }
 """``map`` is the paper's. In ``steps`` a plan is the same numbers on any road where the vehicle drives on as before."""
