@@ -130,9 +130,9 @@ class View:
         encode: ``(states (sample, horizon, state), initial states (sample, m)) -> (sample, horizon, state)``.
         decode: its inverse.
         observe: ``initial states (sample, m) -> (sample, what the model is conditioned on)``.
-        perturb: ``(states (sample, horizon, state), initial states (sample, m), noise (sample, 2)) -> both``, with normal noise, as if the
-            present had been a little different; ``None`` where that is not known. A model that has learned the ways back from there
-            does not get lost where its demonstrations never were.
+        perturb: ``(states (sample, horizon, state), initial states (sample, m), normal noise (sample, 2)) -> both``, as if the
+            present had been a little different; ``None`` where that is not known. A model that has learned the ways back from
+            there does not get lost where its demonstrations never were.
         act: as of :class:`ClosedLoop`, for a planner that looks at behaviour likewise; ``None`` for the domain's.
         alike: groups of columns of a state, in the same order: those in the same place of each share a scale.
     """
