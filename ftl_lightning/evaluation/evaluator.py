@@ -27,7 +27,7 @@ from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import EVALUATION_SEED, generator
-from ftl_lightning.tensor_file import content_hash, file_hash
+from ftl_lightning.tensor_file import bytes_hash, content_hash, file_hash
 
 SUCCESS = "success"
 CLOSED = "closed loop"
@@ -134,6 +134,14 @@ def _executed(judged: Sequence[Judged], policy: Policy, domain: Domain) -> list[
     initial = torch.cat([one.initial_states for one in judged if one.initial_states is not None])
     parts = roll_out(domain.closed_loop, initial, policy).split([len(one.states) for one in judged])
     return [one.executed(part, domain) for one, part in zip(judged, parts, strict=True)]
+
+
+_ROLLOUTS: dict[tuple[str, str, str, int, str, str], Rollout | None] = {}
+"""What reference policies did, by their names and all that it depends on: the cells of an ablation compare with the same."""
+
+
+def _hash(initial_states: Tensor) -> str:
+    return bytes_hash(initial_states.numpy().tobytes())
 
 
 class Evaluator(pl.Callback):
@@ -383,13 +391,19 @@ class Evaluator(pl.Callback):
             if loop is not None:
                 own = _executed(own, Following(fixed_plans(torch.cat(plans)), loop.act, loop.steps), domain)
             found[name] = own
-        for name, make in loop.policies.items() if loop is not None else ():
+        if loop is None:
+            return found
+        for name, make in loop.policies.items():
             found[name] = []
             for one in self.judged:
                 assert one.initial_states is not None
                 known = module.demonstrated(one.task.learned) if one.task.learned else None
-                if (policy := make(one.task.goal, one.initial_states, known, self.seed)) is not None:
-                    found[name] += _executed([one], policy, domain)
+                key = (name, domain.name, one.task.goal, self.seed, _hash(one.initial_states), known.hash if known else "")
+                if key not in _ROLLOUTS:
+                    policy = make(one.task.goal, one.initial_states, known, self.seed)
+                    _ROLLOUTS[key] = policy and roll_out(loop, one.initial_states, policy)
+                if (rollout := _ROLLOUTS[key]) is not None:
+                    found[name].append(one.executed(rollout, domain))
         return found
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:

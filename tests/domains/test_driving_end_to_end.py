@@ -17,7 +17,7 @@ from tests.conftest import CONF
 FIT = ["--config", str(CONF / "driving.yaml")]
 INVERT = ["--config", str(CONF / "invert" / "driving.yaml")]
 SMALL = [
-    "--model.denoiser_args={width: 8, multipliers: [1, 2]}",
+    "--model.denoiser_args={hidden_dim: 16, depth: 2}",
     "--data.samples_per_concept=6",
     "--data.validation_per_concept=2",
     "--data.batch_size=16",

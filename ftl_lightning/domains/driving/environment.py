@@ -1,6 +1,6 @@
 """Closed loop: an environment whose actions are wishes for the next state; a look-ahead planner turns them into decisions."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -20,9 +20,19 @@ INITIAL = OBSERVED + 2
 reads the number for the time between two decisions.
 """
 DRIVE = 4
+"""Numbers of a drive."""
 MAX_STEPS = 30
 SEEDS = 2**24
 """Seeds are below, so that float32 holds them exactly."""
+
+
+class _Tried(NamedTuple):
+    """What came of a decision: the simulation, reward, whether the episode ends, and unless it crashed the state ``(7,)``."""
+
+    after: Snapshot
+    reward: float
+    ended: bool
+    state: NDArray[np.float64] | None
 
 
 class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -70,6 +80,7 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
             name, start = origin(np.asarray(given))
         if name != self._name:
             self._env, self._name = make(name), name
+        super().reset(seed=start)  # of the draws among equal decisions
         self._env.reset(seed=start)
         self._seed, self._return, self._length = start, 0.0, 0
         seen = self._observation()
@@ -93,12 +104,15 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         if wish.shape not in ((STATE,), (DRIVE,), (1,)) or not np.isfinite(wish).all():
             raise UserError(f"driving action: expected {STATE} finite numbers, {DRIVE} or 1, found {wish.tolist()}")
         now = observe(self._env)[0].astype(np.float64)
-        tried = self._tried()
-        safe = {number: state for number, (_, _, _, state) in enumerate(tried) if state is not None}
+        before = save(self._env)
+        tried = {int(wish[0]): self._try(int(wish[0]), before)} if len(wish) == 1 else {}
+        if not any(one.state is not None for one in tried.values()):  # a decision that does not crash needs no other
+            tried = {decision: self._try(decision, before) for decision in range(self._env.action_space.n)}
+        safe = {decision: one.state for decision, one in tried.items() if one.state is not None}
         if not safe:
             chosen = self._slower
         elif len(wish) == 1:
-            chosen = int(wish[0]) if int(wish[0]) in safe else int(self.np_random.choice(list(safe)))
+            chosen = int(self.np_random.choice(list(safe)))
         else:
             far = self._far(now, np.stack(list(safe.values())), wish)
             chosen = int(self.np_random.choice(np.array(list(safe))[far <= far.min() + 1e-6]))
@@ -109,15 +123,12 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         info = self._outcome() if ended or self._length >= MAX_STEPS else {}
         return self._observation(), reward, ended, self._length >= MAX_STEPS, info
 
-    def _tried(self) -> list[tuple[Snapshot, float, bool, NDArray[np.float64] | None]]:
-        """Of each decision what comes of it: the simulation, reward, whether the episode ends, and unless it crashes the state."""
-        now, found = save(self._env), []
-        for decision in range(self._env.action_space.n):
-            restore(self._env, now)
-            reward, ended = advance(self._env, decision)
-            state = None if self._env.vehicle.crashed else observe(self._env)[0].astype(np.float64)
-            found.append((save(self._env), reward, ended, state))
-        return found
+    def _try(self, decision: int, before: Snapshot) -> "_Tried":
+        """What comes of a decision."""
+        restore(self._env, before)
+        reward, ended = advance(self._env, decision)
+        state = None if self._env.vehicle.crashed else observe(self._env)[0].astype(np.float64)
+        return _Tried(save(self._env), reward, ended, state)
 
     @staticmethod
     def _far(now: NDArray[np.float64], states: NDArray[np.float64], wish: NDArray[np.float64]) -> NDArray[np.float64]:
