@@ -57,7 +57,7 @@ def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
     assert read_rows(path).equals(rows)
 
 
-@pytest.mark.parametrize(("name", "tables"), [("agent", 5)])
+@pytest.mark.parametrize(("name", "tables"), [("agent", 5), ("driving", 4)])
 def test_a_notebook_shows_the_committed_results(name: str, tables: int, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (checkout / "results").symlink_to(ROOT / "results")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))

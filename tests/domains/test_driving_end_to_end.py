@@ -1,6 +1,7 @@
 """Driving through the command line: pretraining, inversion, closed loop, mistakes."""
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -8,11 +9,16 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.diffusion.samplers import SAMPLERS
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.environment import origin
+from ftl_lightning.domains.driving.environment import STATE, origin
+from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.shipped import training_set
-from ftl_lightning.seeding import VALIDATION_SEED
-from tests.conftest import CONF
+from ftl_lightning.domains.driving.views import VIEWS
+from ftl_lightning.evaluation.closed_loop import planner
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.seeding import VALIDATION_SEED, generator
+from tests.conftest import CONF, ROOT
 
 FIT = ["--config", str(CONF / "driving.yaml")]
 INVERT = ["--config", str(CONF / "invert" / "driving.yaml")]
@@ -69,6 +75,42 @@ def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
     }
     oracle = rows[(rows["method"] == "expert (oracle)") & (rows["metric"] == "closed loop strict success")]
     assert oracle["value"].tolist() == [1.0]
+
+
+def test_cells_share_what_reference_policies_did(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inverting again, with another K, drives none of them again."""
+    made: list[str] = []
+
+    def recorded(name: str, make: Any) -> Any:
+        return lambda goal, *rest: (made.append(name), make(goal, *rest))[1]
+
+    monkeypatch.setattr(DOMAIN.closed_loop, "policies", {name: recorded(name, make) for name, make in POLICIES.items()})
+    options = ["--data.steps=2", "--model.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
+    for components in (1, 2):
+        run = ["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, "--seed_everything=5"]
+        assert main([*run, f"--model.components={components}", "--evaluation.samples=1"]) == 0
+    assert sorted(made) == sorted(POLICIES)
+    rows = pd.read_csv("logs/driving/invert/results.csv", keep_default_na=False)
+    assert set(rows[rows["K"] > 0]["K"]) == {1, 2}
+    assert set(rows[rows["K"] == 0]["method"]) == set(POLICIES)
+
+
+def test_the_shipped_model_knows_the_training_scenarios() -> None:
+    """On held-out episodes its next states are nearer than those of a vehicle that keeps its speed."""
+    shipped = GenerativeModel.load(ROOT / "pretrained" / "driving")
+    assert DOMAIN.closed_loop is not None
+    assert planner(shipped, DOMAIN.closed_loop) is VIEWS["steps"].act
+    for name in ("highway", "merge"):
+        held = training_set(10, VALIDATION_SEED).select(name)
+        rows = [(row, time) for row, length in enumerate(held.lengths.tolist()) for time in range(length - 1)]
+        assert held.initial_states is not None
+        now = torch.stack([held.initial_states[row, time] for row, time in rows])
+        following = torch.stack([held.states[row, time + 1] for row, time in rows])
+        concept, draw = [shipped.concept(name)[None]], [generator("cpu", 0)]
+        plans = shipped.sample(concept, [torch.tensor([1.2])], len(rows), SAMPLERS["dpm_solver"], 5, 0.0, draw, now)[0]
+        kept = now[:, :STATE].clone()
+        kept[:, 1:3] += kept[:, 3:5]  # decisions are a second apart
+        assert (plans[:, 1] - following).norm(dim=1).mean() < 0.9 * (kept - following).norm(dim=1).mean()
 
 
 def test_generate_writes_what_invert_reads(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
