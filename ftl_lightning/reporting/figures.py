@@ -32,37 +32,30 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     published = {
         found.setting: found
         for found in domain.published
-        if not found.task and found.omega == domain.published_omega and found.metric == metric
+        if not found.task and found.omega == domain.published_omega and found.metric == metric and found.components == 2
     }
     references = rows[rows["omega"] == ""]
     policies = sorted(set(references["method"]))
-    drawn = False
+
+    def once(label: str) -> str | None:
+        """For the legend, which names everything once, wherever it is seen first."""
+        return None if label in axes.get_legend_handles_labels()[1] else label
+
     for place, setting in enumerate(settings):
         found = published.get(setting)
         if found:
-            axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label=None if drawn else "paper")
-            drawn = True
+            axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label=once("paper"))
         for index, method in enumerate(methods, start=1):
             number = summarise(ours[(ours["setting"] == setting) & (ours["method"] == method)])
             if number:
-                label, colour = method if place == 0 else None, COLOURS[(index - 1) % len(COLOURS)]
-                axes.bar(
-                    place + index * width,
-                    number.mean,
-                    width,
-                    yerr=number.error,
-                    color=colour,
-                    capsize=2,
-                    label=label,
-                )
+                colour, where = COLOURS[(index - 1) % len(COLOURS)], place + index * width
+                axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=once(method))
         span = (place - width / 2, place + (len(methods) + 0.5) * width)
         for index, policy in enumerate(policies):
             reference = summarise(references[(references["setting"] == setting) & (references["method"] == policy)])
             if reference:
-                _, known = axes.get_legend_handles_labels()
                 line = LINES[index % len(LINES)]
-                label = "" if policy in known else policy
-                axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
+                axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=once(policy))  # type: ignore[arg-type]
     axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
     axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, K = 2, omega = {domain.omega}")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))

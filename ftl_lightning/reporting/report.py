@@ -4,6 +4,7 @@ from pathlib import Path
 
 from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.evaluator import CLOSED
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.tables import ACCURACY, EXECUTED, tables
@@ -19,7 +20,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     Args:
         results: a results file, or a folder of them.
         out: folder; each domain gets one of its own.
-        readme: a Markdown file whose part between two marks is replaced by the accuracy tables.
+        readme: a Markdown file whose part between two marks is replaced by the main tables.
 
     Returns:
         All tables as Markdown.
@@ -36,11 +37,14 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
             write_text(out / name / f"{table.name}.md", table.markdown())
             write_text(out / name / f"{table.name}.tex", table.latex())
         measured = set(rows.loc[(rows["domain"] == name) & (rows["K"] == 2), "metric"])
-        for metric in sorted(measured & {ACCURACY, EXECUTED, *(one.metric for one in domain.published)}):
+        executed = {EXECUTED, f"{CLOSED} {domain.closed_loop.headline}"} if domain.closed_loop else set()
+        for metric in sorted(measured & {ACCURACY, *executed, *(one.metric for one in domain.published)}):
             with atomic(out / name / f"{metric.replace(' ', '_')}.png") as temporary:
                 accuracy_bars(domain, rows, metric).savefig(temporary, dpi=120)
         everything += [table.markdown() for table in found]
-        headline += [table.markdown() for table in found if table.name in ("accuracy", "closed_loop", "concept_count")]
+        # Where episodes alone are judged, all that happened in them.
+        shown = ("accuracy", "closed_loop" if domain.succeeded else "outcomes", "concept_count")
+        headline += [table.markdown() for table in found if table.name in shown]
     if readme:
         _splice(readme, "\n".join(headline))
     return "\n".join(everything)

@@ -5,6 +5,7 @@ import pytest
 from ftl_lightning.cli import main
 from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows
+from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END
 from ftl_lightning.reporting.tables import difference, summarise, tables
 from tests.conftest import ROOT
@@ -51,6 +52,20 @@ def test_a_number_tells_error_over_tasks_from_spread_over_seeds(tmp_path: Path) 
     assert number.error == pytest.approx(0.2)  # task means 0.3 and 0.7
     assert number.spread == pytest.approx(0.2 / 2**0.5)  # seed means 0.4 and 0.6
     assert str(number) == "0.50 ± 0.20 (seeds 0.14)"
+
+
+def test_a_figure_names_everything_once_and_shows_the_papers_number_of_two_components(tmp_path: Path) -> None:
+    driving = {"domain": "driving", "omega": "learned", "metric": "closed loop success"}
+    everywhere, once = "FTL-IGM (steps)", "FTL-IGM (map)"
+    rows = [
+        row(setting, "a", 0.5, method=method, **driving)
+        for setting, method in (("training concept", everywhere), ("new initial state", everywhere), ("new initial state", once))
+    ]
+    append_rows(tmp_path / "r.csv", rows)
+    axes = accuracy_bars(load_domain("driving"), read_rows(tmp_path / "r.csv"), "closed loop success").axes[0]
+    assert sorted(axes.get_legend_handles_labels()[1]) == sorted([everywhere, once, "paper"])
+    heights = {bars.get_label(): [bar.get_height() for bar in bars] for bars in axes.containers if hasattr(bars, "patches")}
+    assert heights["paper"] == [0.24]
 
 
 def test_tables_stand_beside_the_papers_numbers(results: Path) -> None:

@@ -64,4 +64,4 @@ POLICIES = {
     "nearest demonstration": _nearest,
     "expert (oracle)": _expert,
 }
-"""All but the first pass the planner's veto of crashes."""
+"""All pass the planner's veto of crashes."""
