@@ -84,7 +84,8 @@ def test_cells_share_what_reference_policies_did(model: Path, monkeypatch: pytes
     def recorded(name: str, make: Any) -> Any:
         return lambda goal, *rest: (made.append(name), make(goal, *rest))[1]
 
-    monkeypatch.setattr(DOMAIN.closed_loop, "policies", {name: recorded(name, make) for name, make in POLICIES.items()})
+    for name, make in list(POLICIES.items()):
+        monkeypatch.setitem(POLICIES, name, recorded(name, make))
     options = ["--data.steps=2", "--model.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
     for components in (1, 2):
         run = ["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, "--seed_everything=5"]
