@@ -7,141 +7,35 @@ model and :class:`Generates`.
 import itertools
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
-from torchmetrics import MeanMetric
 
-from ftl_lightning import __version__
-from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import SAMPLERS
-from ftl_lightning.domains.domain import Domain, EvaluationTask, Policy, Suite, load_domain
+from ftl_lightning.domains.domain import Domain, EvaluationTask, Suite, load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.closed_loop import Following, Rollout, fixed_plans, planner, roll_out, sampled_plans
-from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.evaluation.closed_loop import Following, planner, sampled_plans
+from ftl_lightning.evaluation.generates import Generates
+from ftl_lightning.evaluation.judged import ACCURACY, CLOSED, Judged, executed, share, standard_error
+from ftl_lightning.evaluation.references import references
+from ftl_lightning.evaluation.results import append_rows
+from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import EVALUATION_SEED, generator
-from ftl_lightning.tensor_file import bytes_hash, content_hash, file_hash
 
-SUCCESS = "success"
-CLOSED = "closed loop"
-WON, LOST = "won against ", "lost against "
-"""Metrics of the share of episodes in which only the method succeeds, or only a reference policy from the same initial state."""
 OWN = "own demonstrations"
 """The setting of learned concepts that no suite asks for."""
-
-
-@runtime_checkable
-class Generates(Protocol):
-    """What an evaluated module offers: the model, names of the method and of learned concepts, and embeddings."""
-
-    model: GenerativeModel
-    hparams: Any
-
-    @property
-    def method(self) -> str: ...
-
-    @property
-    def concepts(self) -> tuple[str, ...]: ...
-
-    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None: ...
-
-    def demonstrated(self, concept: str) -> Demonstrations | None: ...
-
-    def concept_embeddings(self) -> dict[str, Tensor]: ...
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Generated behaviour of one task.
-
-    Attributes:
-        task: what was asked.
-        states: plans ``(sample, horizon, state)``.
-        right: whether each is right ``(sample,)``, or ``None`` in domains that judge episodes alone.
-        initial_states: that they start from ``(sample, m)``, or ``None``.
-        rollout: what happened when they were executed, if they were.
-        followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
-        outcomes: the domain's judgement of that, by name ``(sample,)``.
-    """
-
-    task: EvaluationTask
-    states: Tensor
-    right: Tensor | None
-    initial_states: Tensor | None = None
-    rollout: Rollout | None = None
-    followed: Tensor | None = None
-    outcomes: Mapping[str, Tensor] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, task: EvaluationTask, states: Tensor, initial_states: Tensor | None, domain: Domain) -> Self:
-        """Judge states by the task's goal."""
-        right = domain.succeeded(task.goal, states, initial_states) if domain.succeeded else None
-        return cls(task, states, right, initial_states)
-
-    def executed(self, rollout: Rollout, domain: Domain) -> Self:
-        """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
-        assert domain.closed_loop is not None
-        outcomes = domain.closed_loop.judge(self.task.goal, rollout.observations, rollout.infos)
-        return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Every metric's value: ``accuracy`` of plans and, after ``closed loop``, what happened when they were executed."""
-        plans = {} if self.right is None else {"accuracy": share(self.right)}
-        return plans | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
-
-
-def share(values: Tensor) -> float:
-    """Share of true values, or the mean of numbers."""
-    metric = MeanMetric()
-    metric.update(values.float())
-    return float(metric.compute())
-
-
-def _paired(one: Judged, other: Judged, domain: Domain) -> dict[str, Tensor]:
-    """In which episodes ``(sample,)`` one succeeds and another, from the same initial state, does not, and the reverse."""
-    assert domain.closed_loop is not None
-    ours, theirs = (judged.outcomes[domain.closed_loop.headline] for judged in (one, other))
-    return {WON: ours & ~theirs, LOST: theirs & ~ours}
-
-
-def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Hyper-parameters without those that Lightning's command line adds for itself."""
-    return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
 
 
 def _key(task: EvaluationTask) -> tuple[int, ...]:
     """What a task adds to a seed."""
     return (zlib.crc32(task.name.encode()), *((1,) if task.initial == "demonstrated" else ()))
-
-
-def standard_error(values: Sequence[float]) -> float:
-    """Standard error of the mean over tasks; 0 for a single one."""
-    count = len(values)
-    return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
-
-
-def _executed(judged: Sequence[Judged], policy: Policy, domain: Domain) -> list[Judged]:
-    """The same tasks with their episodes, which run all side by side."""
-    assert domain.closed_loop is not None
-    initial = torch.cat([one.initial_states for one in judged if one.initial_states is not None])
-    parts = roll_out(domain.closed_loop, initial, policy).split([len(one.states) for one in judged])
-    return [one.executed(part, domain) for one, part in zip(judged, parts, strict=True)]
-
-
-_ROLLOUTS: dict[tuple[str, str, str, int, str, str], Rollout | None] = {}
-"""What reference policies did, by their names and all that it depends on: the cells of an ablation compare with the same."""
-
-
-def _hash(initial_states: Tensor) -> str:
-    return bytes_hash(initial_states.numpy().tobytes())
 
 
 class Evaluator(pl.Callback):
@@ -272,9 +166,9 @@ class Evaluator(pl.Callback):
         )
         assert domain.closed_loop is not None
         policy = Following(plan, planner(model, domain.closed_loop), self.replan)
-        executed = _executed(judged, policy, domain)
+        done = executed(judged, policy, domain)
         firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
-        return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(executed, firsts, strict=True)]
+        return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(done, firsts, strict=True)]
 
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Tell mistakes before hours of training, not after."""
@@ -299,11 +193,12 @@ class Evaluator(pl.Callback):
             for name in own[0]:
                 values = [each[name] for each in own]
                 metrics[f"{stage}/{name}/{setting}"] = sum(values) / len(values)
-                metrics[f"{stage}/standard error{'' if name == 'accuracy' else f' of {name}'}/{setting}"] = standard_error(values)
+                metrics[f"{stage}/standard error{'' if name == ACCURACY else f' of {name}'}/{setting}"] = standard_error(values)
         each = {
             f"{stage}/{name}/{one.task.setting}/{one.task.name}": value for one in self.judged for name, value in one.values.items()
         }
         module.log_dict(metrics | each, batch_size=1)
+        configured = configuration(module, trainer.datamodule, self.settings)  # type: ignore[attr-defined]
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 self._draw(logger, domain, trainer.global_step)
@@ -311,10 +206,11 @@ class Evaluator(pl.Callback):
                     log_projector(logger, module.concept_embeddings(), trainer.global_step)
                     self._projected = True
                 if stage == "test":
-                    log_hparams(logger, self._configuration(module, trainer.datamodule), metrics)  # type: ignore[attr-defined]
+                    log_hparams(logger, configured, metrics)
         if stage == "test" and self.judged:
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
-            append_rows(path, self._rows(module, trainer.datamodule))  # type: ignore[attr-defined]
+            found = references(self.judged, domain, module.demonstrated, self.seed)
+            append_rows(path, rows(module, domain, self.judged, found, configured))
             for name, value in metrics.items():
                 print(f"{name.removeprefix('test/')}: {value:.2f}")
             print(f"rows written to {path}")
@@ -332,79 +228,8 @@ class Evaluator(pl.Callback):
                 log_animation(logger, f"{CLOSED}/{one.task.setting}/{one.task.name}", pictures, step)
 
     def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:
-        """16 hexadecimal digits that everything configured decides: model, data, evaluation and the pretrained weights."""
-        return content_hash([__version__, self._configuration(module, data)])
-
-    def _configuration(self, module: Generates, data: pl.LightningDataModule) -> dict[str, Any]:
-        own = data.hparams.get("demonstrations")
-        return {
-            **{f"model/{key}": value for key, value in _public(module.hparams) if key not in ("pretrained", "output")},
-            **{f"data/{key}": value for key, value in _public(data.hparams) if key != "demonstrations"},
-            **{f"evaluation/{key}": value for key, value in self.settings.items()},
-            "model/pretrained": module.model.hash,
-            **({"data/demonstrations": file_hash(own)} if own else {}),
-        }
-
-    def _rows(self, module: Generates, data: pl.LightningDataModule) -> list[Row]:
-        domain = load_domain(module.model.config.domain)
-        hparams = module.hparams
-        ours = {
-            "method": module.method,
-            "K": hparams.get("components", 0),
-            "omega": str(hparams.get("omega", hparams.get("guidance"))),
-            "model_hash": module.model.hash,
-            "config_hash": self.config_hash(module, data),
-        }
-        nobody = {"K": 0, "omega": "", "model_hash": "", "config_hash": content_hash([__version__, self.samples, self.seed])}
-
-        def rows(one: Judged, what: dict[str, Any]) -> list[Row]:
-            subject = {"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]}
-            return [
-                Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in one.values.items()
-            ]
-
-        referees = self._referees(module, domain)
-        references = [row for name, judged in referees.items() for one in judged for row in rows(one, nobody | {"method": name})]
-        compared = [
-            Row(
-                **{"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]},
-                **ours,
-                n=len(one.states),
-                metric=f"{what}{name}",
-                value=round(share(only), 6),
-            )
-            for name in (domain.closed_loop.policies if domain.closed_loop else ())
-            for other in referees.get(name, ())
-            for one in self.judged
-            if one.task == other.task
-            for what, only in _paired(one, other, domain).items()
-        ]
-        return [row for one in self.judged for row in rows(one, ours)] + compared + references
-
-    def _referees(self, module: Generates, domain: Domain) -> dict[str, list[Judged]]:
-        """What reference policies do on the tasks that were judged, from the same initial states."""
-        loop = None if all(one.rollout is None for one in self.judged) else domain.closed_loop
-        found = {}
-        for name, draw in domain.references.items():
-            plans = [draw(one.task.goal, len(one.states), one.initial_states, self.seed) for one in self.judged]
-            own = [Judged.of(one.task, states, one.initial_states, domain) for one, states in zip(self.judged, plans, strict=True)]
-            if loop is not None:
-                own = _executed(own, Following(fixed_plans(torch.cat(plans)), loop.act, loop.steps), domain)
-            found[name] = own
-        if loop is None:
-            return found
-        for name, make in loop.policies.items():
-            found[name] = []
-            for one in self.judged:
-                assert one.initial_states is not None
-                known = module.demonstrated(one.task.learned) if one.task.learned else None
-                key = (name, domain.name, one.task.goal, self.seed, _hash(one.initial_states), known.hash if known else "")
-                if key not in _ROLLOUTS:
-                    policy = make(one.task.goal, one.initial_states, known, self.seed)
-                    _ROLLOUTS[key] = policy and roll_out(loop, one.initial_states, policy)
-                if (rollout := _ROLLOUTS[key]) is not None:
-                    found[name].append(one.executed(rollout, domain))
-        return found
+        """What the results file knows this evaluation by."""
+        return config_hash(configuration(module, data, self.settings))
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.evaluator import CLOSED
+from ftl_lightning.evaluation.judged import ACCURACY, CLOSED
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.reporting.figures import accuracy_bars
-from ftl_lightning.reporting.tables import ACCURACY, EXECUTED, tables
+from ftl_lightning.reporting.tables import EXECUTED, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain, Published
-from ftl_lightning.evaluation.evaluator import CLOSED, LOST, OWN, SUCCESS, WON, standard_error
+from ftl_lightning.evaluation.evaluator import OWN
+from ftl_lightning.evaluation.judged import ACCURACY, CLOSED, LOST, SUCCESS, WON, standard_error
 from ftl_lightning.evaluation.results import latest
 
 MISSING = "-"
-ACCURACY = "accuracy"
 EXECUTED = f"{CLOSED} {SUCCESS}"
 
 

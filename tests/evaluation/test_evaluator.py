@@ -10,7 +10,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ftl_lightning.domains.domain import EvaluationTask, load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.evaluator import Evaluator, Judged, standard_error
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows
 from ftl_lightning.learning.generative_model import GenerativeModel
 

@@ -1,0 +1,29 @@
+"""What an evaluated module offers."""
+
+from typing import Any, Protocol, runtime_checkable
+
+from torch import Tensor
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.learning.generative_model import GenerativeModel
+
+
+@runtime_checkable
+class Generates(Protocol):
+    """The model, names of the method and of learned concepts, and embeddings."""
+
+    model: GenerativeModel
+    hparams: Any
+
+    @property
+    def method(self) -> str: ...
+
+    @property
+    def concepts(self) -> tuple[str, ...]: ...
+
+    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None: ...
+
+    def demonstrated(self, concept: str) -> Demonstrations | None: ...
+
+    def concept_embeddings(self) -> dict[str, Tensor]: ...

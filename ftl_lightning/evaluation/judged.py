@@ -1,0 +1,87 @@
+"""Generated behaviour and what it was judged to be: the one place where metrics are computed from judgements."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from ftl_lightning.domains.domain import Domain, EvaluationTask, Policy
+from ftl_lightning.evaluation.closed_loop import Rollout, roll_out
+
+ACCURACY = "accuracy"
+SUCCESS = "success"
+CLOSED = "closed loop"
+WON, LOST = "won against ", "lost against "
+"""Metrics of the share of episodes in which only the method succeeds, or only a reference policy from the same initial state."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Generated behaviour of one task.
+
+    Attributes:
+        task: what was asked.
+        states: plans ``(sample, horizon, state)``.
+        right: whether each is right ``(sample,)``, or ``None`` in domains that judge episodes alone.
+        initial_states: that they start from ``(sample, m)``, or ``None``.
+        rollout: what happened when they were executed, if they were.
+        followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
+        outcomes: the domain's judgement of that, by name ``(sample,)``.
+    """
+
+    task: EvaluationTask
+    states: Tensor
+    right: Tensor | None
+    initial_states: Tensor | None = None
+    rollout: Rollout | None = None
+    followed: Tensor | None = None
+    outcomes: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, task: EvaluationTask, states: Tensor, initial_states: Tensor | None, domain: Domain) -> Self:
+        """Judge states by the task's goal."""
+        right = domain.succeeded(task.goal, states, initial_states) if domain.succeeded else None
+        return cls(task, states, right, initial_states)
+
+    def executed(self, rollout: Rollout, domain: Domain) -> Self:
+        """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
+        assert domain.closed_loop is not None
+        outcomes = domain.closed_loop.judge(self.task.goal, rollout.observations, rollout.infos)
+        return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Every metric's value: ``accuracy`` of plans and, after ``closed loop``, what happened when they were executed."""
+        plans = {} if self.right is None else {ACCURACY: share(self.right)}
+        return plans | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
+
+
+def share(values: Tensor) -> float:
+    """Share of true values, or the mean of numbers."""
+    metric = MeanMetric()
+    metric.update(values.float())
+    return float(metric.compute())
+
+
+def paired(one: Judged, other: Judged, domain: Domain) -> dict[str, Tensor]:
+    """In which episodes ``(sample,)`` one succeeds and another, from the same initial state, does not, and the reverse."""
+    assert domain.closed_loop is not None
+    ours, theirs = (judged.outcomes[domain.closed_loop.headline] for judged in (one, other))
+    return {WON: ours & ~theirs, LOST: theirs & ~ours}
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """Standard error of the mean over tasks; 0 for a single one."""
+    count = len(values)
+    return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
+
+
+def executed(judged: Sequence[Judged], policy: Policy, domain: Domain) -> list[Judged]:
+    """The same tasks with their episodes, which run all side by side."""
+    assert domain.closed_loop is not None
+    initial = torch.cat([one.initial_states for one in judged if one.initial_states is not None])
+    parts = roll_out(domain.closed_loop, initial, policy).split([len(one.states) for one in judged])
+    return [one.executed(part, domain) for one, part in zip(judged, parts, strict=True)]

@@ -1,0 +1,87 @@
+"""What an evaluation adds to the results file, and the configuration that its numbers are known by."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import lightning.pytorch as pl
+
+from ftl_lightning import __version__
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.generates import Generates
+from ftl_lightning.evaluation.judged import Judged, paired, share
+from ftl_lightning.evaluation.results import Row
+from ftl_lightning.tensor_file import content_hash, file_hash
+
+
+def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Hyper-parameters without those that Lightning's command line adds for itself."""
+    return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
+
+
+def configuration(module: Generates, data: pl.LightningDataModule, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything that was configured, by its place in a configuration file.
+
+    Args:
+        module: what generates.
+        data: what it learned from.
+        settings: the evaluator's.
+    """
+    own = data.hparams.get("demonstrations")
+    return {
+        **{f"model/{key}": value for key, value in _public(module.hparams) if key not in ("pretrained", "output")},
+        **{f"data/{key}": value for key, value in _public(data.hparams) if key != "demonstrations"},
+        **{f"evaluation/{key}": value for key, value in settings.items()},
+        "model/pretrained": module.model.hash,
+        **({"data/demonstrations": file_hash(own)} if own else {}),
+    }
+
+
+def config_hash(configured: Mapping[str, Any]) -> str:
+    """16 hexadecimal digits that everything configured decides."""
+    return content_hash([__version__, configured])
+
+
+def rows(
+    module: Generates,
+    domain: Domain,
+    judged: Sequence[Judged],
+    references: Mapping[str, Sequence[Judged]],
+    configured: Mapping[str, Any],
+) -> list[Row]:
+    """The method's numbers, its comparison with policies from the same initial states, and the reference lines' numbers.
+
+    Args:
+        module: what generated.
+        domain: that it generated for.
+        judged: what it did.
+        references: what reference policies did, by name.
+        configured: see :func:`configuration`.
+    """
+    hparams = module.hparams
+    ours = {
+        "method": module.method,
+        "K": hparams.get("components", 0),
+        "omega": str(hparams.get("omega", hparams.get("guidance"))),
+        "model_hash": module.model.hash,
+        "config_hash": config_hash(configured),
+    }
+    alike = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
+    nobody = {"K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
+
+    def of(one: Judged, what: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
+        subject = {"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]}
+        return [Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in values.items()]
+
+    compared = [
+        row
+        for name in (domain.closed_loop.policies if domain.closed_loop else ())
+        for other in references.get(name, ())
+        for one in judged
+        if one.task == other.task
+        for row in of(one, ours, {f"{what}{name}": share(only) for what, only in paired(one, other, domain).items()})
+    ]
+    return [
+        *(row for one in judged for row in of(one, ours, one.values)),
+        *compared,
+        *(row for name, found in references.items() for one in found for row in of(one, nobody | {"method": name}, one.values)),
+    ]
