@@ -101,16 +101,16 @@ def sample(
     from ftl_lightning.errors import UserError
     from ftl_lightning.evaluation.closed_loop import Following, planner, roll_out, sampled_plans
     from ftl_lightning.evaluation.tensorboard import gif
-    from ftl_lightning.learning.generative_model import GenerativeModel
+    from ftl_lightning.learning.pretrained import load_model
     from ftl_lightning.seeding import generator
     from ftl_lightning.tensor_file import atomic
 
-    model = GenerativeModel.load(pretrained)
+    model = load_model(pretrained)
     domain = load_domain(model.config.domain)
     if count < 1:
         raise UserError(f"count: expected 1 or more, found {count}")
-    if not 1 <= steps <= model.config.diffusion_steps:
-        raise UserError(f"steps: expected 1 to {model.config.diffusion_steps} (the model's T), found {steps}")
+    if model.max_steps is not None and not 1 <= steps <= model.max_steps:
+        raise UserError(f"steps: expected 1 to {model.max_steps} (the model's T), found {steps}")
     if seed < 0 or temperature < 0:
         raise UserError(f"seed, temperature: expected 0 or more, found {min(seed, temperature)}")
     if goal and not domain.reads(goal):

@@ -113,6 +113,13 @@ class PretrainingData(pl.LightningDataModule):
         states, initial = self.training.windows(rows, starts, self.horizon)
         return Batch(states, concepts, initial)
 
+    def first_windows(self) -> Batch:
+        """One window from the start of the first demonstration of each training concept, in their order."""
+        concepts = self.domain.training_concepts
+        rows = torch.tensor([self.training.concepts.index(text) for text in concepts])
+        states, initial = self.training.windows(rows, torch.zeros_like(rows), self.horizon)
+        return Batch(states, torch.arange(len(concepts)), initial)
+
     def train_dataloader(self) -> DataLoader[Batch]:
         steps = Steps(self, self.steps_per_epoch)
         return DataLoader(steps, batch_size=None, collate_fn=self.batch)  # type: ignore[arg-type]

@@ -177,6 +177,7 @@ class Domain:
             :meth:`~ftl_lightning.demonstrations.container.Demonstrations.starts`; 3 where a plan reaches over the whole
             behaviour, so that the first one matters most, 1 where it is short.
         closed_loop: how plans are executed; ``None`` where they cannot be.
+        sentence: how a task is told to a language model, in the paper's words.
         published: the paper's numbers for this domain.
         omega: the fixed guidance weight of two learned components in our main tables, as text.
         published_omega: that of the paper's main figures.
@@ -202,6 +203,7 @@ class Domain:
     state_columns: tuple[int, ...] = ()
     early: float = 1.0
     closed_loop: ClosedLoop | None = None
+    sentence: Callable[[str], str] = lambda goal: goal
     published: tuple[Published, ...] = ()
     omega: str = "1.2"
     published_omega: str = "1.2"

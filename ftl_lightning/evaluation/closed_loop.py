@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ftl_lightning.diffusion.samplers import Sampler
 from ftl_lightning.domains.domain import ClosedLoop, Policy
-from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.concept_model import ConceptModel
 
 _LOG = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ class Following:
 
 
 def sampled_plans(
-    model: GenerativeModel,
+    model: ConceptModel,
     concepts: Sequence[Tensor],
     weights: Sequence[Tensor],
     sampler: Sampler,
@@ -153,13 +153,13 @@ def sampled_plans(
 
     def plan(observations: Tensor, rows: list[int]) -> Tensor:
         own, omega, draws = ([values[row] for row in rows] for values in (concepts, weights, generators))
-        seen = observations.to(model.alpha_bar.device)
+        seen = observations.to(model.device)
         return model.sample(own, omega, 1, sampler, steps, temperature, draws, seen)[:, 0].cpu()  # type: ignore[arg-type]
 
     return plan
 
 
-def planner(model: GenerativeModel, loop: ClosedLoop) -> Callable[[Tensor, int, Tensor], Tensor]:
+def planner(model: ConceptModel, loop: ClosedLoop) -> Callable[[Tensor, int, Tensor], Tensor]:
     """What follows a model's plans: the domain's planner, or that of the model's view."""
     return model.view.act if model.view is not None and model.view.act is not None else loop.act
 

@@ -26,7 +26,7 @@ from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.results import append_rows
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
-from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 
 OWN = "own demonstrations"
@@ -138,7 +138,7 @@ class Evaluator(pl.Callback):
                 self.steps,
                 self.temperature,
                 [generator("cpu", self.seed, *_key(task)) for task in tasks],
-                torch.cat(given).to(model.alpha_bar.device) if given else None,
+                torch.cat(given).to(model.device) if given else None,
             ).cpu()
             for task, own in zip(tasks, states, strict=True):
                 judged[task] = Judged.of(task, own, starts[task], domain)
@@ -149,7 +149,7 @@ class Evaluator(pl.Callback):
         self,
         judged: Sequence[Judged],
         composed: Mapping[EvaluationTask, tuple[Tensor, Tensor]],
-        model: GenerativeModel,
+        model: ConceptModel,
         domain: Domain,
     ) -> list[Judged]:
         """With the plans that the model makes on the way."""
@@ -174,8 +174,8 @@ class Evaluator(pl.Callback):
         """Tell mistakes before hours of training, not after."""
         if not isinstance(pl_module, Generates):
             raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(pl_module).__name__}")
-        total = len(pl_module.model.alpha_bar)
-        if not 1 <= self.steps <= total:
+        total = pl_module.model.max_steps
+        if total is not None and not 1 <= self.steps <= total:
             raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.steps}")
         self._tasks(load_domain(pl_module.model.config.domain), pl_module.concepts)
 

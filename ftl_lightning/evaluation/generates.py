@@ -6,14 +6,14 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import EvaluationTask
-from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.concept_model import ConceptModel
 
 
 @runtime_checkable
 class Generates(Protocol):
     """The model, names of the method and of learned concepts, and embeddings."""
 
-    model: GenerativeModel
+    model: ConceptModel
     hparams: Any
 
     @property

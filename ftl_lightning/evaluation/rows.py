@@ -61,7 +61,7 @@ def rows(
     ours = {
         "method": module.method,
         "K": hparams.get("components", 0),
-        "omega": str(hparams.get("omega", hparams.get("guidance"))),
+        "omega": str(hparams.get("omega", hparams.get("guidance", "none"))),
         "model_hash": module.model.hash,
         "config_hash": config_hash(configured),
     }

@@ -1,31 +1,25 @@
-"""Inversion: learning concepts from a few demonstrations through the frozen model (Eq. 2 of the paper)."""
+"""Inversion: learning concepts from a few demonstrations by gradient descent through the frozen model (Eq. 2 of the paper)."""
 
 import zlib
-from pathlib import Path
 from typing import Any, Literal
 
-import lightning.pytorch as pl
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import composed_epsilon
-from ftl_lightning.concepts.concept import Concept, Origin
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.datamodule import InversionData
-from ftl_lightning.diffusion.prediction import loss_weights
-from ftl_lightning.diffusion.schedule import denoising_loss
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.domains.domain import EvaluationTask
 from ftl_lightning.errors import UserError
+from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import check_signature, sign
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
 
 FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
 
 
-class InversionModule(pl.LightningModule):
+class InversionModule(Adaptation):
     """Learns K embeddings and their weights for every concept of an :class:`InversionData`, all in one batch.
 
     Its only parameters are ``embeddings (run, K, n)`` and, unless omega is fixed, ``weights (run, K)``, where the runs are
@@ -54,6 +48,7 @@ class InversionModule(pl.LightningModule):
         seed: decides starts, noise and timesteps.
     """
 
+    learns = True
     strict_loading = False
 
     def __init__(
@@ -74,7 +69,7 @@ class InversionModule(pl.LightningModule):
         output: str | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(pretrained, 1.0 if omega == "learned" else omega, output)
         self.save_hyperparameters()
         if components < 1:
             raise UserError(f"model.components: expected 1 or more, found {components}")
@@ -85,7 +80,6 @@ class InversionModule(pl.LightningModule):
         for name, value in (("restarts", restarts), ("samples", samples)):
             if value < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
-        self.model = GenerativeModel.load(pretrained)
         self.restarts = restarts
         self.off_span = off_span
         self.seed = seed
@@ -93,41 +87,25 @@ class InversionModule(pl.LightningModule):
         # Rows span the training embeddings, whose mean is the origin of the concept space.
         basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
         self.register_buffer("basis", basis, persistent=False)
-        self.register_buffer("loss_weights", loss_weights(loss, self.model.alpha_bar), persistent=False)
+        if loss not in LOSSES:
+            raise UserError(f"model.loss: expected one of {', '.join(LOSSES)}, found {loss!r}")
         self.basis: Tensor
-        self.loss_weights: Tensor
         self.embeddings: nn.Parameter
         self.weights: nn.Parameter | Tensor
-        self.concepts: tuple[str, ...] = ()
-        self._found: dict[str, Concept] = {}
 
     @property
     def method(self) -> str:
         """The method's name in tables."""
-        config = self.model.config
-        seen = [part for part in (config.view, config.denoiser_args.get("initial_encoder")) if part]
         form = {1.0: "free", 0.0: "span"}.get(self.off_span, f"near span {self.off_span:g}")
         weight = self.hparams["training_omega"]
-        parts = [*seen, form, *([] if weight is None else [f"training weight {weight:g}"])]
-        return f"FTL-IGM ({', '.join(parts)})"
+        parts = [*self.model.traits, form, *([] if weight is None else [f"training weight {weight:g}"])]
+        return f"{self.model.name} ({', '.join(parts)})"
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
         if "embeddings" in self._parameters:
             return
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
-        if not isinstance(data, InversionData):
-            raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
-        if data.domain.name != self.model.config.domain:
-            raise UserError(
-                f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain.name!r}"
-            )
-        self.concepts = data.concepts
-        if len({file_name(name) for name in self.concepts}) < len(self.concepts):
-            raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
-        self.demonstrations: Demonstrations = data.demonstrations
-        self.early = data.domain.early
-        self.model.encode_initial(self.demonstrations.first_initial_states)  # a wrong size is told before anything is learned
+        super().configure_model()
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
         # A generator for each concept, so that its start does not depend on what is learned beside it.
@@ -156,34 +134,18 @@ class InversionModule(pl.LightningModule):
         return inside + self.off_span * (self.embeddings - inside)
 
     def _losses(self, samples: int, draw: torch.Generator) -> Tensor:
-        """Eq. 2 for every run and sample, ``(run, samples)``. Timesteps are stratified; runs share timesteps, noise and, as a
-        share of a demonstration's length, the windows' starts.
+        """The model's loss (ours is Eq. 2) for every run and sample, ``(run, samples)``. Runs share what is random in it and, as
+        a share of a demonstration's length, the windows' starts.
         """
         runs = len(self.embeddings)
-        horizon = self.model.config.horizon
-        total = len(self.model.alpha_bar)
-        jitter = torch.rand(samples, generator=draw, device=self.device)
-        spread = (torch.arange(samples, device=self.device) + jitter) / samples
-        if (power := self.hparams["timestep_power"]) != 1:
-            spread = 1 - spread**power
-        t = (spread * total).long().clamp(max=total - 1)
-        t = t[torch.randperm(samples, generator=draw, device=self.device)]
-        noise = torch.randn((samples, horizon, self.model.config.state_dim), generator=draw, device=self.device)
+        noise = self.model.noise(samples, self.hparams["timestep_power"], draw)
         rows = self._rows(samples).flatten()
         share = torch.rand(samples, generator=draw, device=self.device).cpu().repeat(runs)
-        states, initial = self.demonstrations.windows(rows, self.demonstrations.starts(rows, share, self.early), horizon)
+        starts = self.demonstrations.starts(rows, share, self.domain.early)
+        states, initial = self.demonstrations.windows(rows, starts, self.model.window)
         initial = None if initial is None else initial.to(self.device)
         states, initial = self.model.perturbed(states.to(self.device), initial, draw)
-        s0 = self.model.encode_initial(initial)
-        embeddings = self.parametrised
-        losses = denoising_loss(
-            lambda x, t: composed_epsilon(self.model.denoiser, x, t, embeddings, self.weights, self.model.empty, s0),
-            self.model.encode(states, initial),
-            noise.repeat(runs, 1, 1),
-            t.repeat(runs),
-            self.model.alpha_bar,
-        )
-        return losses.unflatten(0, (runs, samples)) * self.loss_weights[t]
+        return self.model.losses(states, initial, self.parametrised, self.weights, noise, self.hparams["loss"])
 
     def training_step(self, step: int) -> Tensor:
         losses = self._losses(self.hparams["samples"], generator(self.device, self.seed, 1, self.global_step))
@@ -193,22 +155,6 @@ class InversionModule(pl.LightningModule):
         self.log("train/loss", mean, prog_bar=True)
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         return losses.mean(dim=1).sum()
-
-    # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
-    def validation_step(self, step: int) -> None:
-        self._log_loss("val/loss")
-
-    def test_step(self, step: int) -> None:
-        self._log_loss("test/loss")
-
-    def _log_loss(self, name: str) -> None:
-        self.log(name, sum(concept.origin.loss for concept in self._found.values()) / len(self._found), batch_size=1)
-
-    def train(self, mode: bool = True) -> "InversionModule":
-        """Switch modes; the pretrained model stays in evaluation mode."""
-        super().train(mode)
-        self.model.eval()
-        return self
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Adam with cosine decay; weights have a rate of their own."""
@@ -251,71 +197,11 @@ class InversionModule(pl.LightningModule):
         weights = self.weights.detach().unflatten(0, (-1, self.restarts))
         found = {}
         for index, name in enumerate(self.concepts):
-            own = self.demonstrations.select(name)
-            origin = Origin(
-                name=name,
-                domain=self.model.config.domain,
-                encoder=self.model.config.encoder,
-                pretrained=self.model.hash,
-                demonstrations=own.hash,
-                count=len(own),
-                weights="learned" if self.hparams["omega"] == "learned" else "fixed",
-                loss=losses[index, best[index]].item(),
-            )
+            kind = "learned" if self.hparams["omega"] == "learned" else "fixed"
+            origin = self.origin(name, kind, losses[index, best[index]].item())
             found[name] = Concept(embeddings[index, best[index]].cpu(), weights[index, best[index]].cpu(), origin)
         return found
 
-    @property
-    def folder(self) -> Path:
-        """Where the learned concepts are written."""
-        return Path(self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
-
-    def on_train_end(self) -> None:
-        """Write every concept to a file of its own."""
-        self._found = self.learned()
-        for name, concept in self._found.items():
-            path = self.folder / f"{file_name(name)}.safetensors"
-            concept.save(path)
-            weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
-            print(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
-
-    def on_validation_start(self) -> None:
-        self._found = self.learned()
-
-    def on_test_start(self) -> None:
-        if not self._found:  # else training in the same process has just ended
-            self._found = self.learned()
-
-    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
-        """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
+    def training_weight(self, task: EvaluationTask) -> float:
         omega = self.hparams["training_omega"] if task.learned else None
-        if omega is None:
-            omega = 1.0 if self.hparams["omega"] == "learned" else self.hparams["omega"]
-        embeddings = [self.model.concept(text) for text in task.texts]
-        weights = [omega] * len(task.texts)
-        if task.learned:
-            if task.learned not in self._found or (task.component or 0) > self.hparams["components"]:
-                return None
-            concept = self._found[task.learned]
-            chosen = slice(None) if task.component is None else slice(task.component - 1, task.component)
-            embeddings += concept.embeddings[chosen].to(self.device)
-            weights += concept.weights[chosen].tolist()
-        return torch.stack(embeddings), torch.tensor(weights, device=self.device)
-
-    def demonstrated(self, concept: str) -> Demonstrations | None:
-        """What a concept was learned from."""
-        return self.demonstrations.select(concept)
-
-    def concept_embeddings(self) -> dict[str, Tensor]:
-        """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""
-        learned = {
-            f"{name} [component {number}]": embedding
-            for name, concept in self._found.items()
-            for number, embedding in enumerate(concept.embeddings, start=1)
-        }
-        return self.model.named_embeddings() | learned
-
-
-def file_name(concept: str) -> str:
-    """A concept's name as a file name: letters, digits and dots kept, the rest underscores."""
-    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
+        return super().training_weight(task) if omega is None else omega

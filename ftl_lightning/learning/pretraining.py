@@ -1,17 +1,18 @@
-"""Pretraining: a denoiser conditioned on concepts, with condition dropout (Eq. 1 of the paper)."""
+"""Pretraining: a model of behaviour given concepts is fitted to a domain's demonstrations. Ours is Eq. 1 of the paper."""
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from torch import Tensor, nn
+from torch import Tensor
 
-from ftl_lightning.concepts.composition import Denoiser
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
@@ -22,71 +23,77 @@ from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.domain import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import check_signature, sign
-from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig, load_view
+from ftl_lightning.learning.concept_model import ConceptModel, load_view
+from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
 
-class PretrainingModule(pl.LightningModule):
-    """Trains a denoiser on a domain's pairs of behaviour and concept.
+class Pretraining(pl.LightningModule, ABC):
+    """Fits a model to a domain's demonstrations; what the model is and what it minimises, a method says.
 
-    ``model`` holds the running average of the denoiser's weights, which is what is validated, exported and inverted; the
-    published code uses the raw weights. Sizes come from the data module, so layers are built when a trainer attaches both.
+    ``model`` holds the running average of the weights, which is what is validated, exported and adapted; the published code uses
+    the raw weights, which are ``raw``'s. Sizes come from the data module, so layers are built when a trainer attaches both.
 
     Args:
-        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
-        denoiser_args: its arguments other than the sizes.
-        paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
-        diffusion_steps: T.
-        condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
-            (the published code draws once a batch).
         learning_rate: of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
         warmup_steps: of the learning rate.
         weight_decay: of AdamW.
         ema_decay: of the running average; it starts lower.
         guidance: weight omega with which training concepts are generated in evaluation.
-        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
-            which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
-        loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
-            weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         view: name of the domain's view that behaviour is seen with, see :class:`ftl_lightning.domains.domain.View`; empty for as
             it stands in files.
         perturb: learn from presents that the view perturbs, here and in inversion.
-        compile: compile the denoiser for training (worth it on GPUs).
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
-        seed: decides initial weights, and noise, timesteps and condition dropout as a function of the step.
+        seed: decides initial weights, and what is random in the loss as a function of the step.
     """
 
-    method = "FTL-IGM"
+    method: str
+    """The method's name in tables."""
     concepts: tuple[str, ...] = ()
     """Names of learned concepts; pretraining learns none."""
+    stride: int = 1
+    """States of a window from one that is learned from to the next."""
 
     def __init__(
         self,
-        denoiser: str = "MLPDenoiser",
-        denoiser_args: Mapping[str, Any] | None = None,
-        paper_size: bool = False,
-        diffusion_steps: int = 100,
-        condition_dropout: float = 0.1,
-        learning_rate: float = 1e-3,
+        learning_rate: float = 6e-4,
         warmup_steps: int = 200,
         weight_decay: float = 0.01,
         ema_decay: float = 0.999,
-        guidance: float = 1.2,
-        prediction: str = "epsilon",
-        loss: str = "epsilon",
+        guidance: float = 1.0,
         view: str = "",
         perturb: bool = False,
-        compile: bool = False,
         output: str | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
-        self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         self.seed = seed
         self.guidance = guidance
-        self.model: GenerativeModel
-        self.denoiser: nn.Module
+        self.model: ConceptModel
+        self.raw: ConceptModel
+
+    @abstractmethod
+    def build(
+        self,
+        shared: Mapping[str, Any],
+        data: PretrainingData,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None,
+    ) -> ConceptModel:
+        """The method's model with fresh weights.
+
+        Args:
+            shared: what every model's configuration says.
+            data: what it learns from.
+            normalization, initial_normalization: of that.
+            embeddings: of the encoder ``(1 + training concepts, n)``, the empty text first.
+        """
+
+    @abstractmethod
+    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """What is minimised, on a batch ``(batch,)``; ``model`` is in training mode while fitting."""
 
     def configure_model(self) -> None:
         """Build the layers once the data are known. Does nothing the second time."""
@@ -102,66 +109,48 @@ class PretrainingModule(pl.LightningModule):
         else:
             windows = data.every_window()
             assert windows.initial_states is not None
-            states, initial = view.encode(windows.states, windows.initial_states), view.observe(windows.initial_states)
-        config = ModelConfig(
-            domain=data.domain.name,
-            horizon=data.horizon,
-            state_dim=len(data.domain.state_names),
-            initial_state_dim=0 if initial is None else initial.shape[-1],
-            concept_dim=embeddings.shape[-1],
-            training_concepts=data.domain.training_concepts,
-            encoder=data.encoder.identity,
-            denoiser=self.hparams["denoiser"],
-            denoiser_args=self.denoiser_args,
-            diffusion_steps=self.hparams["diffusion_steps"],
-            prediction=self.hparams["prediction"],
-            entities=data.domain.entities,
-            looks=data.domain.looks,
-            view=self.hparams["view"],
-            perturb=self.hparams["perturb"],
-            state_columns=data.domain.state_columns,
-            training={
+            states, initial = windows.states[:, :: self.stride], view.observe(windows.initial_states)
+            states = view.encode(states, windows.initial_states)
+        shared = {
+            "domain": data.domain.name,
+            "horizon": data.horizon,
+            "state_dim": len(data.domain.state_names),
+            "initial_state_dim": 0 if initial is None else initial.shape[-1],
+            "concept_dim": embeddings.shape[-1],
+            "training_concepts": data.domain.training_concepts,
+            "encoder": data.encoder.identity,
+            "entities": data.domain.entities,
+            "looks": data.domain.looks,
+            "view": self.hparams["view"],
+            "perturb": self.hparams["perturb"],
+            "state_columns": data.domain.state_columns,
+            "training": {
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
                 "data": {key: value for key, value in data.hparams.items() if not key.startswith("_")},
                 "max_steps": self.trainer.max_steps,
             },
-        )
+        }
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             normalization = Normalization.fit(states, view.alike if view else ())
             beside = None if initial is None else Normalization.fit(initial, data.domain.entities)
-            if beside is not None and data.domain.state_columns:
+            if beside is not None and data.domain.state_columns and view is None:  # a view has another scale
                 beside.share(data.domain.state_columns, normalization)
-            self.model = GenerativeModel(config, normalization, embeddings, beside)
-        self.denoiser = copy.deepcopy(self.model.denoiser)
+            self.model = self.build(shared, data, normalization, embeddings, beside)
+        self.raw = copy.deepcopy(self.model)
         self.model.requires_grad_(False).eval()
-        self._trained = torch.compile(self.denoiser) if self.hparams["compile"] else self.denoiser
 
-    def train(self, mode: bool = True) -> "PretrainingModule":
+    def train(self, mode: bool = True) -> "Pretraining":
         """Switch modes; the average is always in evaluation mode."""
         super().train(mode)
         if "model" in self._modules:
             self.model.eval()
         return self
 
-    def _loss(self, denoiser: Denoiser, batch: Batch, draw: torch.Generator, dropout: float) -> Tensor:
-        """Eq. 1 on a batch, ``(batch,)``."""
-        states, seen = self.model.perturbed(batch.states, batch.initial_states, draw)
-        clean = self.model.encode(states, seen)
-        initial = self.model.encode_initial(seen)
-        count = len(clean)
-        removed = torch.rand(count, generator=draw, device=self.device) < dropout
-        concepts = torch.cat((self.model.empty[None], self.model.training_embeddings))
-        index = torch.where(removed, 0, batch.concepts + 1)
-        t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
-        noise = torch.randn(clean.shape, generator=draw, device=self.device)
-        losses = denoising_loss(lambda x, t: denoiser(x, t, concepts, index, initial), clean, noise, t, self.model.alpha_bar)
-        return losses * loss_weights(self.hparams["loss"], self.model.alpha_bar)[t]
-
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
-        loss = self._loss(self._trained, batch, draw, self.hparams["condition_dropout"]).mean()
+        loss = self.losses(self.raw, batch, draw).mean()
         if not loss.isfinite():
             raise UserError(
                 f"training: the loss became {loss.item()} at step {self.global_step}; the last checkpoint before it is kept; "
@@ -175,12 +164,12 @@ class PretrainingModule(pl.LightningModule):
         super().optimizer_step(*arguments, **options)
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.model.denoiser.parameters()), list(self.denoiser.parameters()), 1 - decay)
+            torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
         # The same noise every time, so that the curve shows the model and not the draw.
         draw = generator(self.device, self.seed)
-        self.log(name, self._loss(self.model.denoiser, batch, draw, 0.0).mean(), prog_bar=True, batch_size=len(batch.states))
+        self.log(name, self.losses(self.model, batch, draw).mean(), prog_bar=True, batch_size=len(batch.states))
 
     def validation_step(self, batch: Batch) -> None:
         self._evaluation_step(batch, "val/loss")
@@ -193,7 +182,7 @@ class PretrainingModule(pl.LightningModule):
         total = int(self.trainer.estimated_stepping_batches)
         warmup = min(self.hparams["warmup_steps"], max(total // 10, 1))
         optimizer = torch.optim.AdamW(
-            self.denoiser.parameters(),
+            self.raw.parameters(),
             lr=self.hparams["learning_rate"],
             weight_decay=self.hparams["weight_decay"],
             fused=True,
@@ -234,5 +223,83 @@ class PretrainingModule(pl.LightningModule):
 
     def _signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
-        keys = ("domain", "horizon", "state_dim", "initial_state_dim", "encoder", "denoiser", "denoiser_args", "diffusion_steps")
-        return {key: getattr(self.model.config, key) for key in keys}
+        different = ("training", "training_concepts", "entities", "looks", "view", "perturb", "state_columns", "prediction")
+        return {key: value for key, value in asdict(self.model.config).items() if key not in different}
+
+
+class PretrainingModule(Pretraining):
+    """Trains a denoiser on a domain's pairs of behaviour and concept.
+
+    Args:
+        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
+        denoiser_args: its arguments other than the sizes.
+        paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
+        diffusion_steps: T.
+        condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
+            (the published code draws once a batch).
+        learning_rate, warmup_steps, weight_decay, ema_decay, guidance, view, perturb, output, seed: see :class:`Pretraining`.
+        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
+            which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+        loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
+            weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        compile: compile the denoiser for training (worth it on GPUs).
+    """
+
+    method = "FTL-IGM"
+
+    def __init__(
+        self,
+        denoiser: str = "MLPDenoiser",
+        denoiser_args: Mapping[str, Any] | None = None,
+        paper_size: bool = False,
+        diffusion_steps: int = 100,
+        condition_dropout: float = 0.1,
+        learning_rate: float = 1e-3,
+        warmup_steps: int = 200,
+        weight_decay: float = 0.01,
+        ema_decay: float = 0.999,
+        guidance: float = 1.2,
+        prediction: str = "epsilon",
+        loss: str = "epsilon",
+        view: str = "",
+        perturb: bool = False,
+        compile: bool = False,
+        output: str | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(learning_rate, warmup_steps, weight_decay, ema_decay, guidance, view, perturb, output, seed)
+        self.save_hyperparameters()
+        self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
+
+    def build(
+        self,
+        shared: Mapping[str, Any],
+        data: PretrainingData,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None,
+    ) -> GenerativeModel:
+        names = ("denoiser", "diffusion_steps", "prediction")
+        config = DiffusionConfig(**shared, denoiser_args=self.denoiser_args, **{name: self.hparams[name] for name in names})
+        return GenerativeModel(config, normalization, embeddings, initial_normalization)
+
+    def configure_model(self) -> None:
+        super().configure_model()
+        if self.hparams["compile"] and isinstance(self.raw, GenerativeModel):
+            self.raw.denoiser.compile()
+
+    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Eq. 1; while fitting, concepts are dropped."""
+        assert isinstance(model, GenerativeModel)
+        states, seen = model.perturbed(batch.states, batch.initial_states, draw)
+        clean = model.encode(states, seen)
+        initial = model.encode_initial(seen)
+        count = len(clean)
+        dropout = self.hparams["condition_dropout"] if model.training else 0.0
+        removed = torch.rand(count, generator=draw, device=self.device) < dropout
+        concepts = torch.cat((model.empty[None], model.training_embeddings))
+        index = torch.where(removed, 0, batch.concepts + 1)
+        t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
+        noise = torch.randn(clean.shape, generator=draw, device=self.device)
+        losses = denoising_loss(lambda x, t: model.denoiser(x, t, concepts, index, initial), clean, noise, t, model.alpha_bar)
+        return losses * loss_weights(self.hparams["loss"], model.alpha_bar)[t]

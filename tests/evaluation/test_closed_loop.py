@@ -13,7 +13,7 @@ from ftl_lightning.diffusion.samplers import ddpm
 from ftl_lightning.domains.domain import ClosedLoop
 from ftl_lightning.evaluation.closed_loop import Following, fixed_plans, roll_out, sampled_plans
 from ftl_lightning.evaluation.tensorboard import gif
-from ftl_lightning.learning.generative_model import GenerativeModel, ModelConfig
+from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
 
@@ -99,7 +99,7 @@ def test_fixed_plans_are_chosen_by_episode() -> None:
 
 def model() -> GenerativeModel:
     torch.manual_seed(0)
-    config = ModelConfig(
+    config = DiffusionConfig(
         domain="agent",
         horizon=16,
         state_dim=1,

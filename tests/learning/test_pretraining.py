@@ -116,7 +116,7 @@ def test_condition_dropout_is_drawn_per_sample() -> None:
     module.trainer = trainer
     trainer._data_connector.attach_datamodule(module, datamodule=data)
     module.configure_model()
-    module.denoiser.register_forward_pre_hook(spy)
+    module.raw.denoiser.register_forward_pre_hook(spy)
     trainer.fit(module, datamodule=data)
     assert 140 < (seen[0] == 0).sum() < 260  # neither none nor all, as once a batch would give
 

@@ -23,6 +23,7 @@ from ftl_lightning.domains.agent.scenes import (
     target,
 )
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.agent.views import VIEWS
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.errors import UserError
 
@@ -143,6 +144,7 @@ DOMAIN = Domain(
     succeeded=progressed,
     render=render,
     initial_states=scenes,
+    views=VIEWS,
     entities=_ENTITIES,
     looks=tuple(range(3, len(_ENTITIES[0]))),
     state_columns=tuple(range(STATE)),

@@ -1,0 +1,155 @@
+"""Adapting a frozen pretrained model to new concepts from a few demonstrations, whatever the method."""
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.datamodule import InversionData
+from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.pretrained import load_model
+
+
+class Adaptation(pl.LightningModule, ABC):
+    """What ``invert`` asks of a method: the concepts of an :class:`InversionData`, and what generates an evaluation task.
+
+    The pretrained model is frozen and stays in evaluation mode. Concepts are written to files when they are found.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        omega: guidance weight of training concepts that are generated or composed with a learned one.
+        output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
+    """
+
+    learns = False
+    """Whether concepts are learned by gradient descent, for which there are training steps."""
+
+    def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
+        super().__init__()
+        self.model = load_model(pretrained)
+        self._omega, self._output = omega, output
+        self.concepts: tuple[str, ...] = ()
+        self._found: dict[str, Concept] = {}
+
+    @property
+    @abstractmethod
+    def method(self) -> str:
+        """The method's name in tables."""
+
+    @abstractmethod
+    def learned(self) -> dict[str, Concept]:
+        """The concepts by name."""
+
+    def configure_model(self) -> None:
+        """Take the demonstrations over and check that they fit the model."""
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(data, InversionData):
+            raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
+        if data.domain.name != self.model.config.domain:
+            raise UserError(
+                f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain.name!r}"
+            )
+        self.concepts = data.concepts
+        if len({file_name(name) for name in self.concepts}) < len(self.concepts):
+            raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
+        self.domain = data.domain
+        self.demonstrations: Demonstrations = data.demonstrations
+        self.model.encode_initial(self.demonstrations.first_initial_states)  # a wrong size is told before anything is learned
+
+    def origin(self, name: str, weights: str, loss: float) -> Origin:
+        """Where a concept comes from; ``weights`` is ``'fixed'`` or ``'learned'``."""
+        own = self.demonstrations.select(name)
+        return Origin(
+            name=name,
+            domain=self.model.config.domain,
+            encoder=self.model.config.encoder,
+            pretrained=self.model.hash,
+            demonstrations=own.hash,
+            count=len(own),
+            weights=weights,
+            loss=loss,
+        )
+
+    # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
+    def validation_step(self, step: int) -> None:
+        self._log_loss("val/loss")
+
+    def test_step(self, step: int) -> None:
+        self._log_loss("test/loss")
+
+    def _log_loss(self, name: str) -> None:
+        self.log(name, sum(concept.origin.loss for concept in self._found.values()) / len(self._found), batch_size=1)
+
+    def train(self, mode: bool = True) -> "Adaptation":
+        """Switch modes; the pretrained model stays in evaluation mode."""
+        super().train(mode)
+        self.model.eval()
+        return self
+
+    @property
+    def folder(self) -> Path:
+        """Where the learned concepts are written."""
+        return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
+
+    def find(self) -> None:
+        """Write every concept to a file of its own."""
+        self._found = self.learned()
+        for name, concept in self._found.items():
+            path = self.folder / f"{file_name(name)}.safetensors"
+            concept.save(path)
+            weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
+            print(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
+
+    def on_train_end(self) -> None:
+        self.find()
+
+    def on_validation_start(self) -> None:
+        self._found = self.learned()
+
+    def on_test_start(self) -> None:
+        if self._found:  # training in the same process has just ended
+            return
+        if self.learns:
+            self._found = self.learned()
+        else:
+            self.find()
+
+    def training_weight(self, task: EvaluationTask) -> float:
+        """Guidance weight of a task's training concepts."""
+        return self._omega
+
+    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
+        """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
+        embeddings = [self.model.concept(text) for text in task.texts]
+        weights = [self.training_weight(task)] * len(task.texts)
+        if task.learned:
+            concept = self._found.get(task.learned)
+            if concept is None or (task.component or 0) > len(concept.weights):
+                return None
+            chosen = slice(None) if task.component is None else slice(task.component - 1, task.component)
+            embeddings += concept.embeddings[chosen].to(self.device)
+            weights += concept.weights[chosen].tolist()
+        return torch.stack(embeddings), torch.tensor(weights, device=self.device)
+
+    def demonstrated(self, concept: str) -> Demonstrations | None:
+        """What a concept was learned from."""
+        return self.demonstrations.select(concept)
+
+    def concept_embeddings(self) -> dict[str, Tensor]:
+        """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""
+        learned = {
+            f"{name} [component {number}]": embedding
+            for name, concept in self._found.items()
+            for number, embedding in enumerate(concept.embeddings, start=1)
+        }
+        return self.model.named_embeddings() | learned
+
+
+def file_name(concept: str) -> str:
+    """A concept's name as a file name: letters, digits and dots kept, the rest underscores."""
+    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)

@@ -1,0 +1,178 @@
+"""Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details'): the next state from state and concept."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
+from ftl_lightning.learning.concept_model import ConceptModel, Noise, TextConceptModel
+from ftl_lightning.learning.pretraining import Pretraining
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloningConfig(StepConfig):
+    """What the cloning network needs to be built.
+
+    Attributes:
+        hidden_dim: width of the hidden layer.
+        members: networks that differ in their initial weights. Each is deterministic; samples take turns among them (the paper
+            averages over seeds).
+    """
+
+    hidden_dim: int = 512
+    members: int = 1
+
+
+class ParallelMLP(nn.Module):
+    """Networks of one hidden layer (ReLU), side by side in one batch.
+
+    Args:
+        members: how many.
+        inputs, hidden, outputs: their sizes.
+    """
+
+    def __init__(self, members: int, inputs: int, hidden: int, outputs: int) -> None:
+        super().__init__()
+        layers = [[nn.Linear(inputs, hidden), nn.Linear(hidden, outputs)] for _ in range(members)]
+        self.weights = nn.ParameterList(torch.stack([one[depth].weight.detach().T for one in layers]) for depth in range(2))
+        self.biases = nn.ParameterList(torch.stack([one[depth].bias.detach()[None] for one in layers]) for depth in range(2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(member or 1, batch, inputs)`` to ``(member, batch, outputs)``."""
+        hidden = torch.relu(x @ self.weights[0] + self.biases[0])
+        return hidden @ self.weights[1] + self.biases[1]
+
+
+class CloningModel(TextConceptModel):
+    """A deterministic policy of the concept and, where there is one, the state; composing adds concepts.
+
+    Args:
+        config, normalization, embeddings, initial_normalization: see :class:`TextConceptModel`.
+    """
+
+    kind = "bc"
+    name = "BC"
+    Config = CloningConfig
+    config: CloningConfig
+
+    def __init__(
+        self,
+        config: CloningConfig,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None = None,
+    ) -> None:
+        super().__init__(config, normalization, embeddings, initial_normalization)
+        if config.members < 1:
+            raise UserError(f"model.members: expected 1 or more, found {config.members}")
+        inputs = config.concept_dim + config.initial_state_dim
+        self.network = ParallelMLP(config.members, inputs, config.hidden_dim, config.moments * config.state_dim)
+
+    @property
+    def window(self) -> int:
+        return self.config.window
+
+    def predict(self, observed: Tensor | None, concepts: Tensor) -> Tensor:
+        """Transitions ``(member, batch, moments, state)``, normalised.
+
+        Args:
+            observed: ``(member or 1, batch, m)`` or ``None``.
+            concepts: ``(member or 1, batch, n)``.
+        """
+        out: Tensor = self.network(concepts if observed is None else torch.cat((observed, concepts), dim=-1))
+        return out.unflatten(-1, (self.config.moments, self.config.state_dim))
+
+    def errors(self, states: Tensor, initial_states: Tensor | None, concepts: Tensor) -> Tensor:
+        """Squared error of transitions ``(batch,)``, the negative log-likelihood of a normal distribution but for constants.
+
+        Args:
+            states: ``(batch, window, state)`` in the domain's units.
+            initial_states: ``(batch, initial state)`` or ``None``.
+            concepts: ``(batch, n)``.
+        """
+        observed = self.encode_initial(initial_states)
+        predicted = self.predict(None if observed is None else observed[None], concepts[None])
+        target = self.encode(states[:, :: self.config.stride], initial_states)
+        return (predicted - target).square().mean(dim=(0, 2, 3))
+
+    def losses(
+        self,
+        states: Tensor,
+        initial_states: Tensor | None,
+        embeddings: Tensor,
+        weights: Tensor,
+        noise: Noise | None,
+        loss: str,
+    ) -> Tensor:
+        concepts = torch.einsum("rk,rkn->rn", weights, embeddings)
+        each = concepts.repeat_interleave(len(states) // len(concepts), dim=0)
+        return self.errors(states, initial_states, each).unflatten(0, (len(concepts), -1))
+
+    @torch.no_grad()
+    def sample(
+        self,
+        concepts: Sequence[Tensor],
+        weights: Sequence[Tensor],
+        count: int,
+        sampler: Sampler,
+        steps: int,
+        temperature: float,
+        generators: Sequence[torch.Generator],
+        initial_states: Tensor | None = None,
+    ) -> Tensor:
+        """Deterministic: ``sampler``, ``steps``, ``temperature`` and ``generators`` do not matter."""
+        condition = torch.stack([omega @ own for own, omega in zip(concepts, weights, strict=True)])
+        condition = condition.repeat_interleave(count, dim=0)
+        member = torch.arange(len(condition), device=self.device) % count % self.config.members
+        rows = torch.arange(len(condition), device=self.device)
+
+        def predict(observed: Tensor | None) -> Tensor:
+            return self.predict(None if observed is None else observed[None], condition[None])[member, rows]
+
+        return unroll(self, predict, initial_states).unflatten(0, (len(concepts), count))
+
+
+class CloningPretraining(Pretraining):
+    """Fits the policy to transitions of a domain's pairs of behaviour and concept.
+
+    Args:
+        hidden_dim, members: see :class:`CloningConfig`.
+        horizon: states in a plan that is unrolled; ``None`` for the domain's.
+        stride: see :class:`~ftl_lightning.learning.baselines.transitions.StepConfig`; ``data.horizon`` is one more, or 1.
+        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+    """
+
+    method = "BC"
+
+    def __init__(
+        self, hidden_dim: int = 512, members: int = 1, horizon: int | None = None, stride: int = 1, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self.save_hyperparameters()
+        self.stride = stride
+
+    def build(
+        self,
+        shared: Mapping[str, Any],
+        data: PretrainingData,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None,
+    ) -> CloningModel:
+        own = {name: self.hparams[name] for name in ("hidden_dim", "members", "stride")}
+        config = CloningConfig(**dict(shared) | own | {"horizon": self.hparams["horizon"] or data.domain.horizon})
+        expect_window(config, data)
+        return CloningModel(config, normalization, embeddings, initial_normalization)
+
+    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Squared error of what follows."""
+        assert isinstance(model, CloningModel)
+        states, initial = model.perturbed(batch.states, batch.initial_states, draw)
+        return model.errors(states, initial, model.training_embeddings[batch.concepts])

@@ -1,0 +1,63 @@
+"""Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, told in words what the new task is."""
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.encoder import load_encoder
+from ftl_lightning.domains.domain import EvaluationTask, load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.generative_model import GenerativeModel
+
+
+class LanguageAdaptation(Adaptation):
+    """A concept is the embedding of its description; nothing is learned, and demonstrations only say which concepts there are.
+
+    Compositions are described in one sentence, as the domain says it.
+
+    Args:
+        pretrained: folder of our pretrained model.
+        omega: guidance weight of the description.
+        encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`; the one behind the pretrained
+            model, but no table, which knows no new sentences.
+        output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
+        seed: of the evaluation's rows.
+
+    Raises:
+        UserError: for a model of another method or another encoder.
+    """
+
+    method = "language"
+
+    def __init__(
+        self,
+        pretrained: str,
+        omega: float = 1.2,
+        encoder: str = "minilm",
+        revision: str = "main",
+        output: str | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(pretrained, omega, output)
+        self.save_hyperparameters()
+        if not isinstance(self.model, GenerativeModel):
+            raise UserError(f"model.pretrained: expected a diffusion model, found {self.model.kind} in {pretrained}")
+        self._encoder = load_encoder(encoder, load_domain(self.model.config.domain).table, revision)
+        if (found := self._encoder.identity) != self.model.config.encoder:
+            raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {found!r}")
+
+    def _embedding(self, goal: str) -> Tensor:
+        """``(1, n)`` of a task's description."""
+        assert isinstance(self.model, GenerativeModel)
+        return self.model.standardise(self._encoder([self.domain.sentence(goal)]).to(self.device))
+
+    def learned(self) -> dict[str, Concept]:
+        weights = torch.tensor([self._omega])
+        return {name: Concept(self._embedding(name).cpu(), weights, self.origin(name, "fixed", 0.0)) for name in self.concepts}
+
+    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
+        """The description of the whole task, with its weight."""
+        if task.learned and (task.learned not in self._found or task.component is not None):
+            return None
+        return self._embedding(task.goal), torch.tensor([self._omega], device=self.device)

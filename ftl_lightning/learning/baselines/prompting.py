@@ -1,0 +1,34 @@
+"""Adapting an in-context model: its concepts are the demonstrations themselves."""
+
+import torch
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.baselines.in_context import InContextModel
+
+
+class InContextAdaptation(Adaptation):
+    """A concept is its demonstrations, which the transformer reads; nothing is learned.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
+        seed: of the evaluation's rows.
+    """
+
+    method = "in-context"
+
+    def __init__(self, pretrained: str, output: str | None = None, seed: int = 0) -> None:
+        super().__init__(pretrained, 1.0, output)
+        self.save_hyperparameters()
+        if not isinstance(self.model, InContextModel):
+            raise UserError(f"model.pretrained: expected an in-context model, found {self.model.kind} in {pretrained}")
+
+    def learned(self) -> dict[str, Concept]:
+        found = {}
+        assert isinstance(self.model, InContextModel)
+        for name in self.concepts:
+            prompts = self.model.prompts(self.demonstrations.select(name))
+            found[name] = Concept(prompts, torch.ones(len(prompts)), self.origin(name, "fixed", 0.0))
+        return found

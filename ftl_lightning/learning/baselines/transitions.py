@@ -1,0 +1,75 @@
+"""What one-step methods have in common: they learn what follows a state, and unroll it into a plan."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.datamodule import PretrainingData
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepConfig(ModelConfig):
+    """What one-step methods need beside what every model does; their ``horizon`` is that of the plans they unroll.
+
+    Attributes:
+        stride: states of a demonstration from the one that is given to the one that is predicted; between them plans are straight.
+    """
+
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise UserError(f"model.stride: expected 1 or more, found {self.stride}")
+        if self.horizon > 1 + self.stride and not self.state_columns:
+            raise UserError(
+                f"model.horizon: expected at most {1 + self.stride} states (initial states of domain {self.domain} hold no state "
+                f"from which a longer plan could be unrolled), found {self.horizon}"
+            )
+
+    @property
+    def window(self) -> int:
+        """States of a demonstration that a transition spans."""
+        return 1 if self.horizon == 1 else 1 + self.stride
+
+    @property
+    def moments(self) -> int:
+        """States of a transition: the present and the next, or the only one of a domain without time."""
+        return min(self.horizon, 2)
+
+
+def expect_window(config: StepConfig, data: PretrainingData) -> None:
+    """Refuse windows that do not hold a transition.
+
+    Raises:
+        UserError: naming the key.
+    """
+    if data.horizon != config.window:
+        raise UserError(f"data.horizon: expected {config.window} (states that a transition spans), found {data.horizon}")
+
+
+def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], initial_states: Tensor | None) -> Tensor:
+    """Plans ``(batch, horizon, state)`` in the domain's units.
+
+    Args:
+        model: whose transitions they are; its configuration is a :class:`StepConfig`.
+        predict: ``initial states as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
+        initial_states: ``(batch, initial state)`` in the domain's units, or ``None``.
+    """
+    config = model.config
+    assert isinstance(config, StepConfig)
+    first = model.decode(predict(model.encode_initial(initial_states)), initial_states)
+    if config.horizon <= 2:
+        return first
+    assert initial_states is not None
+    states, present = [initial_states[:, config.state_columns], first[:, -1]], initial_states.clone()
+    while len(states) < 1 + -(-(config.horizon - 1) // config.stride):
+        present[:, config.state_columns] = states[-1]
+        states.append(model.decode(predict(model.encode_initial(present)), present)[:, -1])
+    coarse = torch.stack(states, dim=1)
+    at = torch.arange(config.horizon, device=coarse.device) / config.stride
+    before = at.long().clamp(max=len(states) - 2)
+    return torch.lerp(coarse[:, before], coarse[:, before + 1], (at - before)[:, None])

@@ -1,0 +1,158 @@
+"""A conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the concepts it is paired with."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig, Noise
+from ftl_lightning.learning.pretraining import Pretraining
+
+
+@dataclass(frozen=True, kw_only=True)
+class VAEConfig(ModelConfig):
+    """What the networks need to be built; ``concept_dim`` is the size of z.
+
+    Attributes:
+        hidden_dim: width of the encoder's and of the decoder's hidden layer.
+    """
+
+    hidden_dim: int = 512
+
+
+class VAEModel(ConceptModel):
+    """Behaviour from an initial state and z, a normal variable in which a concept is a point; composing adds points.
+
+    Args:
+        config, normalization, embeddings, initial_normalization: see :class:`ConceptModel`.
+    """
+
+    kind = "cvae"
+    name = "CVAE"
+    Config = VAEConfig
+    config: VAEConfig
+
+    def __init__(
+        self,
+        config: VAEConfig,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None = None,
+    ) -> None:
+        super().__init__(config, normalization, embeddings, initial_normalization)
+        plan, beside, z = config.horizon * config.state_dim, config.initial_state_dim, config.concept_dim
+        self.encoder = nn.Sequential(nn.Linear(plan + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, 2 * z))
+        self.decoder = nn.Sequential(nn.Linear(z + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, plan))
+
+    def posterior(self, states: Tensor, initial_states: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Mean and logarithm of the variance of z, ``(batch, z)`` each, of behaviour ``(batch, horizon, state)``."""
+        observed = self.encode_initial(initial_states)
+        plan = self.encode(states, initial_states).flatten(1)
+        mean, log_variance = self.encoder(plan if observed is None else torch.cat((plan, observed), dim=-1)).chunk(2, dim=-1)
+        return mean, log_variance
+
+    def plans(self, z: Tensor, initial_states: Tensor | None) -> Tensor:
+        """Behaviour ``(batch, horizon, state)``, normalised, of ``z (batch, z)``."""
+        observed = self.encode_initial(initial_states)
+        out: Tensor = self.decoder(z if observed is None else torch.cat((z, observed), dim=-1))
+        return out.unflatten(-1, (self.config.horizon, self.config.state_dim))
+
+    def errors(self, states: Tensor, initial_states: Tensor | None, z: Tensor) -> Tensor:
+        """Squared error of the reconstruction ``(batch,)``."""
+        return (self.plans(z, initial_states) - self.encode(states, initial_states)).square().mean(dim=(1, 2))
+
+    def losses(
+        self,
+        states: Tensor,
+        initial_states: Tensor | None,
+        embeddings: Tensor,
+        weights: Tensor,
+        noise: Noise | None,
+        loss: str,
+    ) -> Tensor:
+        z = torch.einsum("rk,rkn->rn", weights, embeddings)
+        each = z.repeat_interleave(len(states) // len(z), dim=0)
+        return self.errors(states, initial_states, each).unflatten(0, (len(z), -1))
+
+    @torch.no_grad()
+    def sample(
+        self,
+        concepts: Sequence[Tensor],
+        weights: Sequence[Tensor],
+        count: int,
+        sampler: Sampler,
+        steps: int,
+        temperature: float,
+        generators: Sequence[torch.Generator],
+        initial_states: Tensor | None = None,
+    ) -> Tensor:
+        """``temperature`` is the variance of the noise that is added to z; ``sampler`` and ``steps`` do not matter."""
+        shape = (count, self.config.concept_dim)
+        noise = torch.stack([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
+        z = torch.stack([omega @ own for own, omega in zip(concepts, weights, strict=True)])[:, None] + temperature**0.5 * noise
+        plans = self.plans(z.flatten(0, 1), initial_states)
+        return self.decode(plans, initial_states).unflatten(0, (len(concepts), count))
+
+
+class VAEPretraining(Pretraining):
+    """Fits encoder and decoder to a domain's behaviour; a training concept is the encoding of its first demonstration.
+
+    Args:
+        latent_dim: size of z.
+        hidden_dim: see :class:`VAEConfig`.
+        beta: weight of the divergence from the prior, per number of the behaviour, beside the squared error.
+        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+    """
+
+    method = "CVAE"
+
+    def __init__(self, latent_dim: int = 20, hidden_dim: int = 512, beta: float = 1.0, **options: Any) -> None:
+        super().__init__(**options)
+        self.save_hyperparameters()
+
+    def build(
+        self,
+        shared: Mapping[str, Any],
+        data: PretrainingData,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None,
+    ) -> VAEModel:
+        latent = self.hparams["latent_dim"]
+        config = VAEConfig(**dict(shared) | {"concept_dim": latent, "hidden_dim": self.hparams["hidden_dim"]})
+        self._first = data.first_windows()
+        return VAEModel(config, normalization, torch.zeros(len(embeddings), latent), initial_normalization)
+
+    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """The negative evidence lower bound, per number of the behaviour (Kingma & Welling, 2014)."""
+        assert isinstance(model, VAEModel)
+        states, initial = model.perturbed(batch.states, batch.initial_states, draw)
+        mean, log_variance = model.posterior(states, initial)
+        noise = torch.randn(mean.shape, generator=draw, device=mean.device)
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
+        numbers = model.config.horizon * model.config.state_dim
+        errors = model.errors(states, initial, mean + (0.5 * log_variance).exp() * noise)
+        return errors + self.hparams["beta"] * divergence / numbers
+
+    def _represent(self) -> None:
+        model = self.model
+        assert isinstance(model, VAEModel)
+        states, _, initial = self._first
+        with torch.no_grad():
+            mean, _ = model.posterior(states.to(self.device), None if initial is None else initial.to(self.device))
+        model.training_embeddings.copy_(mean)
+
+    def on_validation_start(self) -> None:
+        self._represent()
+
+    def on_test_start(self) -> None:
+        self._represent()
+
+    def on_fit_end(self) -> None:
+        self._represent()
+        super().on_fit_end()

@@ -1,0 +1,359 @@
+"""What every method's model has: a concept space, normalisation, a view of behaviour, and the folder it is kept in."""
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.domains.domain import View, load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import FORMAT, bytes_hash, file_hash, load_tensors, save_tensors, serialise, write_text
+
+KIND = "generative model"
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+DIFFUSION = "diffusion"
+"""The kind of a model whose configuration names none."""
+
+
+class Noise(NamedTuple):
+    """Timesteps ``(sample,)`` int64 and noise ``(sample, horizon, state)`` of diffusion."""
+
+    t: Tensor
+    noise: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig(Sizes):
+    """What is needed to build a model before its weights are read, beside the sizes; each method adds what its network needs.
+
+    Attributes:
+        domain: name of the domain.
+        training_concepts: texts, in the order of the model's table of training embeddings.
+        encoder: identity of the text encoder.
+        view: name of the domain's view that the model sees behaviour with; empty for as it is.
+        perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
+        state_columns: columns of the initial state that hold the state a plan starts from.
+        training: how it was trained, for the record.
+    """
+
+    domain: str
+    training_concepts: tuple[str, ...]
+    encoder: str
+    view: str = ""
+    perturb: bool = False
+    state_columns: tuple[int, ...] = ()
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+
+def load_view(domain: str, name: str) -> View | None:
+    """A domain's view by its name; ``None`` for the empty one.
+
+    Raises:
+        UserError: for a name that is none.
+    """
+    if not name:
+        return None
+    views = load_domain(domain).views
+    if name not in views:
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *views)))}, found {name!r}")
+    return views[name]
+
+
+def read_config(folder: str | Path) -> dict[str, Any]:
+    """What the configuration of a pretrained model says, with its ``hash`` and ``kind``.
+
+    Raises:
+        UserError: naming the file, if it is missing or something else.
+    """
+    path = Path(folder) / CONFIG
+    try:
+        content: dict[str, Any] = {"kind": DIFFUSION} | json.loads(path.read_text(encoding="utf-8"))
+        if content.pop("format") != FORMAT:
+            raise ValueError(f"format is not {FORMAT}")
+        if "hash" not in content:
+            raise ValueError("it has no hash")
+    except OSError as error:
+        raise UserError(f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: expected the configuration of a pretrained model, found something else ({error})") from error
+    return content
+
+
+class ConceptModel(nn.Module, ABC):
+    """A model of behaviour given a concept: what adapting, sampling and evaluation ask of every method.
+
+    Args:
+        config: sizes and names.
+        normalization: of states.
+        embeddings: ``(1 + training concepts, n)``, the empty concept first.
+        initial_normalization: of initial states, where the domain has them.
+
+    Attributes:
+        empty: the empty concept ``(n,)`` in the model's concept space.
+        training_embeddings: ``(training concept, n)``, likewise.
+    """
+
+    kind: ClassVar[str]
+    """Which method's model a folder holds."""
+    name: ClassVar[str]
+    """The method's name in tables."""
+    Config: ClassVar[type[ModelConfig]]
+    """Of the class's models."""
+    empty: Tensor
+    training_embeddings: Tensor
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.view = load_view(config.domain, config.view)
+        if config.perturb and (self.view is None or self.view.perturb is None):
+            raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
+        self.normalization = normalization
+        self.initial_normalization = initial_normalization
+        self.register_buffer("empty", embeddings[0].clone())
+        self.register_buffer("training_embeddings", embeddings[1:].clone())
+
+    @abstractmethod
+    def sample(
+        self,
+        concepts: Sequence[Tensor],
+        weights: Sequence[Tensor],
+        count: int,
+        sampler: Sampler,
+        steps: int,
+        temperature: float,
+        generators: Sequence[torch.Generator],
+        initial_states: Tensor | None = None,
+    ) -> Tensor:
+        """Generate behaviour of several compositions in one batch.
+
+        Args:
+            concepts: for each composition ``(K, n)``; K may differ between them.
+            weights: for each composition ``(K,)``.
+            count: samples of each.
+            sampler, steps, temperature: see :mod:`ftl_lightning.diffusion.samplers`.
+            generators: of the noise, one for each composition, so that its samples do not depend on what is sampled beside it.
+            initial_states: ``(composition * count, initial state)`` in the domain's units, or ``None``.
+
+        Returns:
+            ``(composition, count, horizon, state)`` in the domain's units.
+        """
+
+    def noise(self, samples: int, timestep_power: float, draw: torch.Generator) -> Noise | None:
+        """What is random in :meth:`losses`, alike for every run; ``None`` for a method that has nothing random."""
+        return None
+
+    def losses(
+        self,
+        states: Tensor,
+        initial_states: Tensor | None,
+        embeddings: Tensor,
+        weights: Tensor,
+        noise: Noise | None,
+        loss: str,
+    ) -> Tensor:
+        """How badly concepts explain behaviour, for a method that learns them by gradient descent.
+
+        Args:
+            states: ``(run * sample, window, state)`` in the domain's units.
+            initial_states: ``(run * sample, initial state)`` or ``None``.
+            embeddings: ``(run, K, n)``.
+            weights: ``(run, K)``.
+            noise: of :meth:`noise`.
+            loss: whose squared error a diffusion model minimises.
+
+        Returns:
+            ``(run, sample)``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} learns no concepts")
+
+    @property
+    def traits(self) -> tuple[str, ...]:
+        """What tables tell of the model beside the method's name."""
+        return (self.config.view,) if self.config.view else ()
+
+    @property
+    def window(self) -> int:
+        """States of a demonstration that are learned from together."""
+        return self.config.horizon
+
+    @property
+    def max_steps(self) -> int | None:
+        """Most steps that a sampler can make, the T of diffusion; ``None`` for a method without."""
+        return None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self.empty.device
+
+    def concept(self, text: str) -> Tensor:
+        """The embedding ``(n,)`` of a training concept.
+
+        Raises:
+            UserError: for a text that is none.
+        """
+        if text not in self.config.training_concepts:
+            raise UserError(
+                f"concept {text!r}: expected a training concept of the model: {'; '.join(self.config.training_concepts)}"
+            )
+        return self.training_embeddings[self.config.training_concepts.index(text)]
+
+    def named_embeddings(self) -> dict[str, Tensor]:
+        """The training concepts' embeddings ``(n,)`` by text, and the empty one's."""
+        return {"(empty)": self.empty} | dict(zip(self.config.training_concepts, self.training_embeddings, strict=True))
+
+    def check(self, concept: Concept, path: str | Path) -> None:
+        """Refuse a learned concept that belongs to another model.
+
+        Raises:
+            UserError: if encoder, domain or pretrained model differ.
+        """
+        mine = {"encoder": self.config.encoder, "domain": self.config.domain, "pretrained": self.hash}
+        for key, expected in mine.items():
+            if (found := getattr(concept.origin, key)) != expected:
+                raise UserError(
+                    f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
+                )
+
+    def perturbed(self, states: Tensor, initial_states: Tensor | None, draw: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """What to learn from: behaviour and initial states with another present, if the model's configuration says so."""
+        if not self.config.perturb:
+            return states, initial_states
+        assert self.view is not None
+        assert self.view.perturb is not None
+        assert initial_states is not None
+        noise = torch.randn((len(states), 2), generator=draw, device=draw.device)
+        return self.view.perturb(states, initial_states, noise)
+
+    def encode(self, states: Tensor, initial_states: Tensor | None) -> Tensor:
+        """Behaviour ``(sample, horizon, state)`` in the domain's units to what the denoiser sees."""
+        if self.view is not None:
+            assert initial_states is not None
+            states = self.view.encode(states, initial_states)
+        return self.normalization.encode(states)
+
+    def decode(self, normalised: Tensor, initial_states: Tensor | None) -> Tensor:
+        """The inverse of :meth:`encode`."""
+        states = self.normalization.decode(normalised)
+        if self.view is not None:
+            assert initial_states is not None
+            states = self.view.decode(states, initial_states)
+        return states
+
+    def encode_initial(self, initial_states: Tensor | None) -> Tensor | None:
+        """Initial states ``(batch, m)`` as the denoiser sees them, or ``None`` for a model that is not conditioned on any.
+
+        Raises:
+            UserError: if the model needs them and there are none, or their size is another.
+        """
+        if self.initial_normalization is None:
+            return None
+        seen = self.view.observe(initial_states) if self.view and initial_states is not None else initial_states
+        expected = self.config.initial_state_dim
+        if seen is None or seen.shape[-1] != expected:
+            found = "none" if seen is None else str(seen.shape[-1])
+            raise UserError(f"key 'initial_states': expected {expected} numbers each (the pretrained model's), found {found}")
+        return self.initial_normalization.encode(seen)
+
+    @property
+    def hash(self) -> str:
+        """Hash of the weights, the same as :func:`~ftl_lightning.tensor_file.file_hash` of the saved file."""
+        return bytes_hash(serialise(KIND, self._stored(), {"domain": self.config.domain}))
+
+    def _stored(self) -> dict[str, Tensor]:
+        """What the file holds: weights in half precision, everything else as it is."""
+        weights = dict(self.named_parameters())
+        return {name: value.half() if name in weights else value for name, value in self.state_dict().items()}
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision."""
+        folder = Path(folder)
+        save_tensors(folder / WEIGHTS, KIND, self._stored(), {"domain": self.config.domain})
+        header = {"format": FORMAT, "hash": self.hash, "kind": self.kind}
+        write_text(folder / CONFIG, json.dumps(header | asdict(self.config), indent=2) + "\n")
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """Read a folder written by :meth:`save`; the model is frozen and in evaluation mode.
+
+        Raises:
+            UserError: naming the file, if it is missing, damaged, or the two files do not belong together.
+        """
+        path = Path(folder) / CONFIG
+        content = read_config(folder)
+        expected_hash = content.pop("hash")
+        if (found := content.pop("kind")) != cls.kind:
+            raise UserError(f"{path}: key 'kind': expected {cls.kind!r}, found {found!r}, the model of another method")
+        for key in ("training_concepts", "entities", "looks", "state_columns"):
+            content[key] = tuple(tuple(one) if isinstance(one, list) else one for one in content.get(key, ()))
+        try:
+            config = cls.Config(**content)
+        except TypeError as error:
+            raise UserError(f"{path}: expected the configuration of a pretrained model, found something else ({error})") from error
+        weights = Path(folder) / WEIGHTS
+        tensors, _ = load_tensors(weights, KIND)
+        if (found := file_hash(weights)) != expected_hash:
+            raise UserError(
+                f"{weights}: expected the hash {expected_hash} that {CONFIG} names, found {found}; copy both files again"
+            )
+        blank = torch.zeros(config.state_dim)
+        initial = torch.zeros(config.initial_state_dim)
+        model = cls(
+            config,
+            Normalization(blank, blank),
+            torch.zeros(1 + len(config.training_concepts), config.concept_dim),
+            Normalization(initial, initial) if config.initial_state_dim else None,
+        )
+        try:
+            model.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise UserError(f"{weights}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()})") from error
+        return model.requires_grad_(False).eval()
+
+
+class TextConceptModel(ConceptModel):
+    """A model whose concept space is the text encoder's.
+
+    Embeddings are centred on the training concepts and scaled to unit mean square: language models put a large common part into
+    all of them, which hides what tells two concepts apart.
+
+    Args:
+        config, normalization, initial_normalization: see :class:`ConceptModel`.
+        embeddings: the encoder's ``(1 + training concepts, n)``, the empty text first.
+    """
+
+    centre: Tensor
+    spread: Tensor
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        normalization: Normalization,
+        embeddings: Tensor,
+        initial_normalization: Normalization | None = None,
+    ) -> None:
+        centre = embeddings[1:].mean(dim=0)
+        spread = (embeddings[1:] - centre).square().mean().sqrt()
+        super().__init__(config, normalization, (embeddings - centre) / spread, initial_normalization)
+        self.register_buffer("centre", centre)
+        self.register_buffer("spread", spread)
+
+    def standardise(self, embeddings: Tensor) -> Tensor:
+        """The encoder's embeddings ``(..., n)`` to the model's concept space."""
+        return (embeddings - self.centre) / self.spread

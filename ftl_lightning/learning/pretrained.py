@@ -1,0 +1,24 @@
+"""Pretrained models by the folder they are kept in, whatever their method."""
+
+from pathlib import Path
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.baselines.cloning import CloningModel
+from ftl_lightning.learning.baselines.in_context import InContextModel
+from ftl_lightning.learning.baselines.vae import VAEModel
+from ftl_lightning.learning.concept_model import CONFIG, ConceptModel, read_config
+from ftl_lightning.learning.generative_model import GenerativeModel
+
+_CLASSES: tuple[type[ConceptModel], ...] = (GenerativeModel, CloningModel, VAEModel, InContextModel)
+MODELS = {one.kind: one for one in _CLASSES}
+
+
+def load_model(folder: str | Path) -> ConceptModel:
+    """Read a folder that :meth:`~ftl_lightning.learning.concept_model.ConceptModel.save` wrote; the model is frozen.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, of an unknown method, or its files do not belong together.
+    """
+    if (kind := read_config(folder)["kind"]) not in MODELS:
+        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {kind!r}")
+    return MODELS[kind].load(folder)
