@@ -20,6 +20,7 @@ TRAINER_VERBS = {
 COMMANDS = {
     "generate": "draw demonstrations of a task into a file",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
+    "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
     "encode": "make a domain's table of concept embeddings with a language model",

@@ -198,17 +198,52 @@ def sample(
             print(animation)
 
 
-def ablate(stages: list[Stage], results: str, seeds: list[int] = [0]) -> None:  # noqa: B006 (never changed)
+def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
+    """Say in words what a learned concept is made of: its nearest training concepts and their best non-negative combination.
+
+    Args:
+        concept: file of a learned concept.
+        pretrained: folder of the model that it was learned with; empty to look for it in pretrained and logs.
+        nearest: how many of the nearest training concepts are told.
+    """
+    from ftl_lightning.concepts.concept import Concept
+    from ftl_lightning.concepts.explanation import explain as explained
+    from ftl_lightning.errors import UserError
+    from ftl_lightning.learning.pretrained import find_model, load_model
+
+    if nearest < 1:
+        raise UserError(f"nearest: expected 1 or more, found {nearest}")
+    learned = Concept.load(concept)
+    model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"))))
+    model.check(learned, concept)
+    names = model.config.training_concepts
+    print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
+    parts = [(f"component {number}, weight {weight:.2f}", embedding) for number, (weight, embedding) in learned.numbered()]
+    if len(parts) > 1:
+        parts.append(("weighted sum", learned.weights @ learned.embeddings))
+    for name, embedding in parts:
+        print(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
+
+
+def ablate(
+    stages: list[Stage],
+    results: str,
+    seeds: list[int] = [0],  # noqa: B006 (never changed)
+    shard: str = "1/1",
+    executor: Literal["local", "ray"] = "local",
+) -> None:
     """Run every cell of an ablation that the results do not hold yet.
 
     Args:
         stages: verbs with grids of options, in order.
         results: results file that rows are added to.
         seeds: each stage runs once a seed.
+        shard: "3/8" for the third of eight parts; stages that others need are run before.
+        executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
     """
     from ftl_lightning.ablation import run_ablation
 
-    run_ablation(stages, seeds, results)
+    run_ablation(stages, seeds, results, shard, executor)
 
 
 def report(results: str = "results", out: str = "results/report", readme: str = "") -> None:

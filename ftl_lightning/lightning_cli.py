@@ -3,6 +3,7 @@
 import logging
 import warnings
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
@@ -54,17 +55,30 @@ class CommandLine(LightningCLI):
                 raise UserError(f"{path}: expected a checkpoint, found a damaged or foreign file") from error
 
 
+class _Parser(CommandLine):
+    """The same without building anything."""
+
+    def instantiate_classes(self) -> None:
+        """Nothing."""
+
+
 def run(arguments: list[str]) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
-    _command_line(arguments, run=True)
+    _command_line(CommandLine, arguments, run=True)
 
 
 def build(options: list[str]) -> CommandLine:
     """Parse the options of a verb and build trainer, model and data without running anything."""
-    return _command_line(options, run=False)
+    return _command_line(CommandLine, options, run=False)
 
 
-def _command_line(arguments: list[str], run: bool) -> CommandLine:
+def parse(options: list[str]) -> dict[str, Any]:
+    """What the options of a verb come to, by key; nothing is built."""
+    found: dict[str, Any] = _command_line(_Parser, options, run=False).config.as_dict()
+    return found
+
+
+def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> CommandLine:
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
@@ -77,7 +91,7 @@ def _command_line(arguments: list[str], run: bool) -> CommandLine:
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
         logging.getLogger(name).setLevel(logging.WARNING)
     try:
-        return CommandLine(
+        return kind(
             pl.LightningModule,
             pl.LightningDataModule,
             trainer_class=Trainer,

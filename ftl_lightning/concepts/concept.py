@@ -51,6 +51,10 @@ class Concept:
     weights: Tensor
     origin: Origin
 
+    def numbered(self) -> list[tuple[int, tuple[float, Tensor]]]:
+        """Weight and embedding ``(n,)`` of each component, numbered from 1."""
+        return list(enumerate(zip(self.weights.tolist(), self.embeddings, strict=True), start=1))
+
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header."""
         tensors = {"embeddings": self.embeddings, "weights": self.weights}

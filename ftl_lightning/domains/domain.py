@@ -61,6 +61,10 @@ class Suite:
         return tuple(dict.fromkeys(task.setting for task in self.tasks))
 
 
+OURS = "FTL-IGM"
+"""The name of the paper's method; what a method's tables tell of it in brackets is not part of its name."""
+
+
 @dataclass(frozen=True)
 class Published:
     """A number of the paper, to be shown beside ours.
@@ -73,6 +77,7 @@ class Published:
         omega: the fixed weight as text, or ``'learned'``.
         task: name of the evaluation task; ``''`` for the mean of the setting.
         metric: as in a row of the results.
+        method: ours, or a baseline's name.
     """
 
     setting: str
@@ -82,6 +87,7 @@ class Published:
     omega: str = "learned"
     task: str = ""
     metric: str = "accuracy"
+    method: str = OURS
 
 
 Policy = Callable[[Tensor, list[int], int], Tensor]

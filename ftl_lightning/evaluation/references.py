@@ -1,18 +1,18 @@
 """Reference lines: what trivial policies and oracles do on the tasks that were judged, from the same initial states."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.evaluation.closed_loop import Following, Rollout, fixed_plans, roll_out
-from ftl_lightning.evaluation.judged import Judged, executed
+from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.tensor_file import bytes_hash
 
-_ROLLOUTS: dict[tuple[str, str, str, int, str, str], Rollout | None] = {}
-"""What policies did, by their names and all that it depends on: the cells of an ablation compare with the same."""
+_KNOWN: dict[tuple[Any, ...], Any] = {}
+"""What they did, by their names and all that it depends on: the cells of an ablation compare with the same."""
 
 
 def references(
@@ -27,28 +27,42 @@ def references(
         seed: of the policies.
     """
     loop = None if all(one.rollout is None for one in judged) else domain.closed_loop
-    found = {}
-    for name, draw in domain.references.items():
-        plans = [draw(one.task.goal, len(one.states), one.initial_states, seed) for one in judged]
-        own = [Judged.of(one.task, states, one.initial_states, domain) for one, states in zip(judged, plans, strict=True)]
-        if loop is not None:
-            own = executed(own, Following(fixed_plans(torch.cat(plans)), loop.act, loop.steps), domain)
-        found[name] = own
-    if loop is None:
-        return found
-    for name, make in loop.policies.items():
-        found[name] = []
-        for one in judged:
-            assert one.initial_states is not None
-            known = demonstrated(one.task.learned) if one.task.learned else None
-            key = (name, domain.name, one.task.goal, seed, _hash(one.initial_states), known.hash if known else "")
-            if key not in _ROLLOUTS:
-                policy = make(one.task.goal, one.initial_states, known, seed)
-                _ROLLOUTS[key] = policy and roll_out(loop, one.initial_states, policy)
-            if (rollout := _ROLLOUTS[key]) is not None:
-                found[name].append(one.executed(rollout, domain))
+    found = {name: [_planned(name, one, domain, loop, seed) for one in judged] for name in domain.references}
+    for name in loop.policies if loop else ():
+        acted = (_acted(name, one, domain, demonstrated, seed) for one in judged)
+        found[name] = [one for one in acted if one is not None]
     return found
 
 
-def _hash(initial_states: Tensor) -> str:
-    return bytes_hash(initial_states.numpy().tobytes())
+def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int) -> Judged:
+    """A policy that makes its plan once."""
+    key = (name, domain.name, one.task.goal, len(one.states), _hash(one.initial_states), seed)
+    if key not in _KNOWN:
+        _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.initial_states, seed)
+    plans = _KNOWN[key]
+    own = Judged.of(one.task, plans, one.initial_states, domain)
+    if loop is None:
+        return own
+    assert one.initial_states is not None
+    if (*key, "executed") not in _KNOWN:
+        _KNOWN[*key, "executed"] = roll_out(loop, one.initial_states, Following(fixed_plans(plans), loop.act, loop.steps))
+    return own.executed(_KNOWN[*key, "executed"], domain)
+
+
+def _acted(
+    name: str, one: Judged, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], seed: int
+) -> Judged | None:
+    """A policy that acts as it goes; ``None`` where it would take too long."""
+    assert domain.closed_loop is not None
+    assert one.initial_states is not None
+    known = demonstrated(one.task.learned) if one.task.learned else None
+    key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.initial_states), seed)
+    if key not in _KNOWN:
+        policy = domain.closed_loop.policies[name](one.task.goal, one.initial_states, known, seed)
+        _KNOWN[key] = policy and roll_out(domain.closed_loop, one.initial_states, policy)
+    rollout: Rollout | None = _KNOWN[key]
+    return None if rollout is None else one.executed(rollout, domain)
+
+
+def _hash(initial_states: Tensor | None) -> str:
+    return "" if initial_states is None else bytes_hash(initial_states.numpy().tobytes())

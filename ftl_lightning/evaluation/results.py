@@ -1,5 +1,9 @@
 """The results file: one row for every evaluated number."""
 
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -17,7 +21,8 @@ class Row:
     Attributes:
         domain, setting, task, method: what was evaluated.
         K: number of concept components; 0 where nothing was learned.
-        omega: the fixed guidance weight as text, or ``'learned'``.
+        omega: the fixed guidance weight as text, ``'learned'``, or ``'none'`` for a method without; empty for a reference line.
+        demonstrations: that the task's concept was learned from; 0 where nothing was learned.
         seed: of pretraining and inversion.
         n: number of samples or episodes behind the value.
         metric: for example ``'accuracy'``.
@@ -33,6 +38,7 @@ class Row:
     method: str
     K: int
     omega: str
+    demonstrations: int
     seed: int
     n: int
     metric: str
@@ -44,23 +50,57 @@ class Row:
 
 COLUMNS = [field.name for field in fields(Row)]
 _TEXT = {"omega": str, "model_hash": str, "config_hash": str, "version": str}
-_SUBJECT = ["domain", "setting", "task", "method", "K", "omega", "seed", "metric"]
+_SUBJECT = ["domain", "setting", "task", "method", "K", "omega", "demonstrations", "seed", "metric"]
 _KEY = [*_SUBJECT, "n", "config_hash"]
 """What makes a row the same measurement as another, which it then replaces."""
 
 
 def append_rows(path: str | Path, rows: list[Row]) -> None:
     """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all."""
-    table = pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS)
-    if Path(path).is_file():
-        table = pd.concat([read_rows(path), table])
-    with atomic(path) as temporary:
-        table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
+    add_rows(path, pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS))
+
+
+def add_rows(path: str | Path, table: pd.DataFrame) -> None:
+    """The same of rows that were read from another file; processes that add to the same file wait for one another."""
+    path = Path(path)
+    with _alone(path):
+        if path.is_file():
+            table = pd.concat([read_rows(path), table])
+        with atomic(path) as temporary:
+            table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Hold the lock of a file: its folder's, since the file is replaced as a whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = os.open(path.parent, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def latest(rows: pd.DataFrame) -> pd.DataFrame:
     """Of rows about the same that differ only in how they were configured, the one that was measured last."""
     return rows.drop_duplicates(_SUBJECT, keep="last")
+
+
+COMPARISON, CURVES = "comparison", "curves"
+"""Names of results files that are shown apart from ablations: all methods, and numbers of demonstrations and components."""
+
+
+def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
+    """The rows of the files of this name in a folder; without a name, of all that are not shown apart. Maybe none.
+
+    Raises:
+        UserError: as :func:`read_rows`.
+    """
+    path = Path(path)
+    files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
+    own = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES))]
+    return pd.concat([read_rows(file) for file in own], ignore_index=True) if own else pd.DataFrame(columns=COLUMNS)
 
 
 def read_rows(path: str | Path) -> pd.DataFrame:

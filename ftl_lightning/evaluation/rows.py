@@ -68,13 +68,18 @@ def rows(
     alike = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
     nobody = {"K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
 
+    policies = domain.closed_loop.policies if domain.closed_loop else {}
+
     def of(one: Judged, what: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
         subject = {"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]}
+        # Reference plans are drawn without demonstrations; policies are given them.
+        known = module.demonstrated(one.task.learned) if one.task.learned and what["method"] not in domain.references else None
+        subject["demonstrations"] = 0 if known is None else len(known)
         return [Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in values.items()]
 
     compared = [
         row
-        for name in (domain.closed_loop.policies if domain.closed_loop else ())
+        for name in policies
         for other in references.get(name, ())
         for one in judged
         if one.task == other.task

@@ -13,6 +13,7 @@ from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
 from ftl_lightning.diffusion.samplers import Sampler
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss
+from ftl_lightning.domains.domain import OURS
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import DIFFUSION, ModelConfig, Noise, TextConceptModel
 
@@ -65,7 +66,7 @@ class GenerativeModel(TextConceptModel):
     """
 
     kind = DIFFUSION
-    name = "FTL-IGM"
+    name = OURS
     Config = DiffusionConfig
     config: DiffusionConfig
     alpha_bar: Tensor

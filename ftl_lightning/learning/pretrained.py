@@ -1,5 +1,6 @@
 """Pretrained models by the folder they are kept in, whatever their method."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from ftl_lightning.errors import UserError
@@ -22,3 +23,20 @@ def load_model(folder: str | Path) -> ConceptModel:
     if (kind := read_config(folder)["kind"]) not in MODELS:
         raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {kind!r}")
     return MODELS[kind].load(folder)
+
+
+def find_model(model_hash: str, places: Sequence[Path]) -> Path:
+    """The folder of the model with this hash below one of some places.
+
+    Raises:
+        UserError: if there is none.
+    """
+    for place in places:
+        for path in sorted(place.rglob(CONFIG)):
+            try:
+                if read_config(path.parent)["hash"] == model_hash:
+                    return path.parent
+            except UserError:  # the configuration of something else
+                continue
+    told = ", ".join(map(str, places))
+    raise UserError(f"pretrained: expected the model with the hash {model_hash} below {told}, found none; name its folder")

@@ -1,14 +1,22 @@
 """Figures from results."""
 
-import pandas as pd
-from matplotlib.figure import Figure
+from collections.abc import Sequence
 
-from ftl_lightning.domains.domain import Domain
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from sklearn.manifold import TSNE
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.domains.domain import OURS, Domain
 from ftl_lightning.evaluation.results import latest
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.reporting.comparison import METHODS, compared, published, settings
+from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.tables import summarise
 
 PAPER_COLOUR = "#9a9a9a"
-COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3")
+COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3", "#c9a227")
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
 """Of reference policies."""
 
@@ -29,10 +37,10 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     figure = Figure(figsize=(1.9 * max(len(settings), 2) + 3.5, 3.4), layout="constrained")
     axes = figure.subplots()
     width = 0.8 / (len(methods) + 1)
-    published = {
+    theirs = {
         found.setting: found
         for found in domain.published
-        if not found.task and found.omega == domain.published_omega and found.metric == metric and found.components == 2
+        if (found.task, found.omega, found.metric, found.components, found.method) == ("", domain.published_omega, metric, 2, OURS)
     }
     references = rows[rows["omega"] == ""]
     policies = sorted(set(references["method"]))
@@ -42,7 +50,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
         return None if label in axes.get_legend_handles_labels()[1] else label
 
     for place, setting in enumerate(settings):
-        found = published.get(setting)
+        found = theirs.get(setting)
         if found:
             axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label=once("paper"))
         for index, method in enumerate(methods, start=1):
@@ -59,4 +67,87 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
     axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, K = 2, omega = {domain.omega}")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
+
+
+def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
+    """A metric of every setting, ours and the baselines', the paper's numbers as diamonds; bars show standard errors over tasks.
+
+    Args:
+        domain: the domain.
+        results: rows of a comparison.
+        metric: as in a row of the results.
+    """
+    rows = compared(domain, results)
+    rows = rows[rows["metric"] == metric]
+    shown = [setting for setting in settings(domain) if setting in set(rows["setting"])]
+    width = 0.8 / len(METHODS)
+    figure = Figure(figsize=(1.9 * max(len(shown), 2) + 3, 3.4), layout="constrained")
+    axes = figure.subplots()
+    for index, method in enumerate(METHODS):
+        own = rows[rows["family"] == method]
+        for place, setting in enumerate(shown):
+            where = place + (index - (len(METHODS) - 1) / 2) * width
+            label = None if place else method
+            if number := summarise(own[own["setting"] == setting]):
+                axes.bar(where, number.mean, width, yerr=number.error, color=COLOURS[index], capsize=2, label=label)
+            elif label and not own.empty:
+                axes.bar(where, 0, width, color=COLOURS[index], label=label)
+            if found := published(domain, method, setting, metric):
+                named = "the paper's" not in axes.get_legend_handles_labels()[1]
+                axes.plot(where, found.value, "D", color="black", markersize=4, label="the paper's" if named else None)
+    axes.set_xticks(range(len(shown)), shown)
+    axes.set(ylim=(0, 1.05), ylabel=metric, title=domain.name)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
+
+
+def growth(domain: Domain, results: pd.DataFrame) -> Figure:
+    """Accuracy against the number of demonstrations and against K; bars show standard errors over tasks.
+
+    Args:
+        domain: the domain.
+        results: rows of curves.
+    """
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
+        rows = points(domain, results, axis)
+        for colour, setting in zip(COLOURS, dict.fromkeys(rows["setting"]), strict=False):
+            own = rows[rows["setting"] == setting]
+            counts = sorted(set(own[axis]))
+            numbers = [summarise(own[own[axis] == count]) for count in counts]
+            means = [number.mean for number in numbers if number]
+            errors = [number.error or 0.0 for number in numbers if number]
+            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=setting)
+        axes.set(xlabel=axis, ylim=(0, 1.05))
+        axes.set_xticks(sorted(set(rows[axis])))
+        if axis == "demonstrations":
+            axes.set_ylabel(" ".join(set(rows["metric"])))
+            axes.legend(fontsize=8, loc="lower right")
+    figure.suptitle(domain.name, fontsize=10)
+    return figure
+
+
+def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> Figure:
+    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008).
+
+    Args:
+        model: whose concept space it is.
+        concepts: learned with it.
+        seed: of the map.
+    """
+    training = model.config.training_concepts
+    learned = [(concept.origin.name, number, own) for concept in concepts for number, (_, own) in concept.numbered()]
+    embeddings = torch.cat((model.training_embeddings.cpu(), *(own[None] for _, _, own in learned)))
+    perplexity = min(10.0, (len(embeddings) - 1) / 3)
+    places = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes = figure.subplots()
+    axes.scatter(*places[: len(training)].T, color=PAPER_COLOUR, label="training concepts")
+    axes.scatter(*places[len(training) :].T, color=COLOURS[0], marker="^", label="learned components")
+    names = [*training, *(f"{name} [{number}]" for name, number, _ in learned)]
+    for place, name in zip(places, names, strict=True):
+        axes.annotate(name, place, fontsize=6, xytext=(3, 3), textcoords="offset points")
+    axes.set(xticks=[], yticks=[], title=f"{model.config.domain}: concepts, t-SNE")
+    axes.legend(fontsize=8)
     return figure

@@ -2,12 +2,17 @@
 
 from pathlib import Path
 
-from ftl_lightning.domains.domain import load_domain
+import pandas as pd
+from matplotlib.figure import Figure
+
+from ftl_lightning.domains.domain import Domain, load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.judged import ACCURACY, CLOSED
-from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.reporting.figures import accuracy_bars
-from ftl_lightning.reporting.tables import EXECUTED, tables
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, read_rows, read_study
+from ftl_lightning.reporting.comparison import comparison_table, metrics, overview
+from ftl_lightning.reporting.curves import curves_table
+from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, growth
+from ftl_lightning.reporting.tables import EXECUTED, Table, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
@@ -20,7 +25,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     Args:
         results: a results file, or a folder of them.
         out: folder; each domain gets one of its own.
-        readme: a Markdown file whose part between two marks is replaced by the main tables.
+        readme: a Markdown file whose part between two marks is replaced by the comparison's overview, or without a comparison by
+            the main tables.
 
     Returns:
         All tables as Markdown.
@@ -29,25 +35,53 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         UserError: if there are no results, or the Markdown file has no marks.
     """
     rows = read_rows(results)
+    ablations, comparison, curves = (read_study(results, name) for name in ("", COMPARISON, CURVES))
     everything, headline = [], []
     for name in sorted(set(rows["domain"])):
         domain = load_domain(name)
-        found = tables(domain, rows)
-        for table in found:
-            write_text(out / name / f"{table.name}.md", table.markdown())
-            write_text(out / name / f"{table.name}.tex", table.latex())
-        measured = set(rows.loc[(rows["domain"] == name) & (rows["K"] == 2), "metric"])
-        executed = {EXECUTED, f"{CLOSED} {domain.closed_loop.headline}"} if domain.closed_loop else set()
-        for metric in sorted(measured & {ACCURACY, *executed, *(one.metric for one in domain.published)}):
-            with atomic(out / name / f"{metric.replace(' ', '_')}.png") as temporary:
-                accuracy_bars(domain, rows, metric).savefig(temporary, dpi=120)
-        everything += [table.markdown() for table in found]
+        found = _ablations(domain, ablations, out / name)
         # Where episodes alone are judged, all that happened in them.
         shown = ("accuracy", "closed_loop" if domain.succeeded else "outcomes", "concept_count")
-        headline += [table.markdown() for table in found if table.name in shown]
+        headline += [table for table in found if table.name in shown]
+        if name in set(comparison["domain"]):
+            found.append(_written(comparison_table(domain, comparison), out / name))
+            for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
+                _save(comparison_bars(domain, comparison, metric), out / name / f"comparison_{_file(metric)}.png")
+        if name in set(curves["domain"]):
+            found.append(_written(curves_table(domain, curves), out / name))
+            _save(growth(domain, curves), out / name / "curves.png")
+        everything += found
+    if not comparison.empty:
+        headline = [_written(overview(comparison), out)]
+        everything += headline
     if readme:
-        _splice(readme, "\n".join(headline))
-    return "\n".join(everything)
+        _splice(readme, "\n".join(table.markdown() for table in headline))
+    return "\n".join(table.markdown() for table in everything)
+
+
+def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
+    """Tables and figures of our method in all its forms."""
+    found = [_written(table, folder) for table in tables(domain, rows)]
+    measured = set(rows.loc[(rows["domain"] == domain.name) & (rows["K"] == 2), "metric"])
+    executed = {EXECUTED, f"{CLOSED} {domain.closed_loop.headline}"} if domain.closed_loop else set()
+    for metric in sorted(measured & {ACCURACY, *executed, *(one.metric for one in domain.published)}):
+        _save(accuracy_bars(domain, rows, metric), folder / f"{_file(metric)}.png")
+    return found
+
+
+def _written(table: Table, folder: Path) -> Table:
+    write_text(folder / f"{table.name}.md", table.markdown())
+    write_text(folder / f"{table.name}.tex", table.latex())
+    return table
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def _file(metric: str) -> str:
+    return metric.replace(" ", "_")
 
 
 def _splice(path: Path, text: str) -> None:

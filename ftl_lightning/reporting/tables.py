@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from ftl_lightning.domains.domain import Domain, Published
+from ftl_lightning.domains.domain import OURS, Domain, Published
 from ftl_lightning.evaluation.evaluator import OWN
 from ftl_lightning.evaluation.judged import ACCURACY, CLOSED, LOST, SUCCESS, WON, standard_error
 from ftl_lightning.evaluation.results import latest
@@ -93,14 +93,29 @@ def _select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
     return rows
 
 
-def _paper(found: Published | None) -> str:
+def paper(found: Published | None) -> str:
+    """The paper's number with its standard error."""
     if found is None:
         return MISSING
     return f"{found.value:.2f}" + ("" if found.error is None else f" ± {found.error:.2f}")
 
 
+def difference_to(found: Published | None, number: Number | None) -> str:
+    """Ours less the paper's."""
+    return MISSING if found is None or number is None else f"{number.mean - found.value:+.2f}"
+
+
 def _text(number: Number | None) -> str:
     return MISSING if number is None else str(number)
+
+
+def _beside(found: Published | None, numbers: Sequence[Number | None]) -> list[str]:
+    """The paper's number, and each of ours with its difference from it."""
+    return [paper(found), *(text for number in numbers for text in (_text(number), difference_to(found, number)))]
+
+
+def _beside_head(methods: Sequence[str]) -> list[str]:
+    return ["paper", *(head for method in methods for head in (method, "difference"))]
 
 
 def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
@@ -127,9 +142,9 @@ def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
 
 
 def _lookup(domain: Domain, setting: str, task: str, components: int, omega: str, metric: str) -> Published | None:
-    asked = (setting, task, components, omega, metric)
+    asked = (setting, task, components, omega, metric, OURS)
     for found in domain.published:
-        if (found.setting, found.task, found.components, found.omega, found.metric) == asked:
+        if (found.setting, found.task, found.components, found.omega, found.metric, found.method) == asked:
             return found
     return None
 
@@ -149,15 +164,16 @@ def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> Tab
             ours = _select(own, K=2, omega=domain.omega)
             if ours.empty:
                 continue
-            line = [f"- {task}" if task else setting, _paper(_lookup(domain, setting, task, 2, domain.published_omega, metric))]
-            line += [_text(summarise(_select(ours, method=method))) for method in learned]
+            theirs = _lookup(domain, setting, task, 2, domain.published_omega, metric)
+            line = [f"- {task}" if task else setting]
+            line += _beside(theirs, [summarise(_select(ours, method=method)) for method in learned])
             line += [_text(summarise(_select(own, K=0, method=method))) for method in references]
             lines.append(line)
-    theirs = "" if domain.omega == domain.published_omega else f" (the paper's: {domain.published_omega})"
+    other = "" if domain.omega == domain.published_omega else f" (the paper's: {domain.published_omega})"
     caption = (
-        f"{domain.name}: {metric}, K = 2, {_weights(domain.omega)}{theirs}. Mean ± standard error over tasks (spread over seeds)"
+        f"{domain.name}: {metric}, K = 2, {_weights(domain.omega)}{other}. Mean ± standard error over tasks (spread over seeds)"
     )
-    return Table(name, caption, pd.DataFrame(lines, columns=["setting", "paper", *learned, *references], dtype=str))
+    return Table(name, caption, pd.DataFrame(lines, columns=["setting", *_beside_head(learned), *references], dtype=str))
 
 
 def _weights(omega: str) -> str:
@@ -173,15 +189,17 @@ def _outcomes(domain: Domain, every: pd.DataFrame) -> Table:
         [
             setting,
             metric.removeprefix(f"{CLOSED} "),
-            _paper(_lookup(domain, setting, "", 2, domain.published_omega, metric)),
-            *(_text(summarise(_select(ours, setting=setting, metric=metric, method=method))) for method in learned),
+            *_beside(
+                _lookup(domain, setting, "", 2, domain.published_omega, metric),
+                [summarise(_select(ours, setting=setting, metric=metric, method=method)) for method in learned],
+            ),
             *(_text(summarise(_select(executed, setting=setting, metric=metric, K=0, method=method))) for method in references),
         ]
         for setting in _settings(domain)
         for metric in dict.fromkeys(_select(ours, setting=setting)["metric"])
     ]
     caption = f"{domain.name}: what happened in closed loop, K = 2, {_weights(domain.omega)}"
-    return Table("outcomes", caption, pd.DataFrame(lines, columns=["setting", "", "paper", *learned, *references], dtype=str))
+    return Table("outcomes", caption, pd.DataFrame(lines, columns=["setting", "", *_beside_head(learned), *references], dtype=str))
 
 
 def difference(won: int, lost: int, count: int) -> str:
@@ -227,15 +245,15 @@ def _grid(
     name: str,
     caption: str,
     learned: Sequence[str],
-    lines: Sequence[tuple[str, str, str, pd.DataFrame]],
+    lines: Sequence[tuple[str, str, Published | None, pd.DataFrame]],
     heads: tuple[str, str],
 ) -> Table:
     cells = [
-        [first, second, paper, *(_text(summarise(_select(ours, method=method))) for method in learned)]
-        for first, second, paper, ours in lines
+        [first, second, *_beside(theirs, [summarise(_select(ours, method=method)) for method in learned])]
+        for first, second, theirs, ours in lines
         if not ours.empty
     ]
-    return Table(name, caption, pd.DataFrame(cells, columns=[*heads, "paper", *learned], dtype=str))
+    return Table(name, caption, pd.DataFrame(cells, columns=[*heads, *_beside_head(learned)], dtype=str))
 
 
 def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
@@ -246,7 +264,7 @@ def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
         (
             setting,
             str(count),
-            _paper(_lookup(domain, setting, "", count, "learned", metric)),
+            _lookup(domain, setting, "", count, "learned", metric),
             _select(own, setting=setting, K=count),
         )
         for setting in domain.suites["paper"].settings
@@ -265,7 +283,7 @@ def _omega(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
         (
             setting,
             omega,
-            _paper(_lookup(domain, setting, "", 2, omega, metric)),
+            _lookup(domain, setting, "", 2, omega, metric),
             _select(own, setting=setting, omega=omega),
         )
         for setting in settings
@@ -283,7 +301,7 @@ def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
         (
             task.name,
             task.setting,
-            _paper(_lookup(domain, task.setting, task.name, 2, "learned", metric)),
+            _lookup(domain, task.setting, task.name, 2, "learned", metric),
             _select(own, setting=task.setting, task=task.name),
         )
         for task in (suite.tasks if suite else ())

@@ -59,6 +59,7 @@ def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: P
 
 def row(**changes: object) -> Row:
     values = {"domain": "d", "setting": "s", "task": "t", "method": "m", "K": 2, "omega": "1.2", "seed": 0, "n": 50}
+    values |= {"demonstrations": 5}
     values |= {"metric": "accuracy", "value": 0.5, "model_hash": "00e1", "config_hash": "c"}
     return Row(**(values | changes))  # type: ignore[arg-type]
 

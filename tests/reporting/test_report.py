@@ -21,6 +21,7 @@ def row(setting: str, task: str, value: float, seed: int = 0, **changes: object)
         "method": "FTL-IGM (free)",
         "K": 2,
         "omega": "1.2",
+        "demonstrations": 5,
         "seed": seed,
     }
     values |= {"n": 50, "metric": "accuracy", "value": value, "model_hash": "m", "config_hash": f"c{seed}"}

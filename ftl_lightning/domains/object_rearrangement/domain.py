@@ -9,7 +9,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
-from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse
+from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse, sentence
 from ftl_lightning.domains.object_rearrangement.rendering import render
 from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
@@ -76,5 +76,6 @@ DOMAIN = Domain(
         "random scenes": lambda goal, count, initial_states, seed: random_scenes(count, seed)[:, None],
         "generator (oracle)": lambda goal, count, initial_states, seed: generate(goal, count, seed)[:, None],
     },
+    sentence=sentence,
     published=PUBLISHED,
 )

@@ -50,4 +50,16 @@ def _learned_components() -> list[Published]:
     ]
 
 
-PUBLISHED = tuple(_bars() + _concept_count() + _omega() + _learned_components())
+def _baselines() -> list[Published]:
+    """The baselines' columns of the table of guidance weights, and what the text says of language."""
+    rows = (
+        ("BC", "new concept", 0.67, 0.15),
+        ("CVAE", "new concept", 0.08, 0.05),
+        ("language", "training composition", 0.20, 0.07),
+        ("language", "new concept", 0.20, 0.05),
+        ("language", "new + training", 0.13, 0.04),
+    )
+    return [Published(setting, value, error, method=method) for method, setting, value, error in rows]
+
+
+PUBLISHED = tuple(_bars() + _concept_count() + _omega() + _learned_components() + _baselines())

@@ -52,6 +52,19 @@ class Relation:
         return f"{self.shapes[0]} {self.kind} {self.shapes[1]}"
 
 
+def sentence(task: str) -> str:
+    """A task as the paper tells it to a language model (appendix, 'Language')."""
+    return AND.join(_told(relation) for relation in parse(task))
+
+
+def _told(relation: Relation) -> str:
+    if relation.kind == "ring":
+        return f"circle triangle and square in a circle of radius {relation.radius:g}"
+    if relation.kind == "diagonal to":
+        return f"{relation.shapes[0]} right and above diagonally to {relation.shapes[1]}"
+    return str(relation)
+
+
 TRAINING_RELATIONS = tuple(Relation(kind, pair) for kind in ("right of", "above") for pair in ORDERED_PAIRS)
 
 _SHAPE, _KIND = "|".join(SHAPES), "|".join(PAIRWISE)

@@ -1,0 +1,37 @@
+"""How accuracy grows with the number of demonstrations, and with the number of components."""
+
+import pandas as pd
+
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.judged import ACCURACY
+from ftl_lightning.evaluation.results import latest
+from ftl_lightning.reporting.tables import EXECUTED, MISSING, Table, summarise
+
+AXES = {"demonstrations": "K", "K": "demonstrations"}
+"""What grows, and what stays meanwhile."""
+USUAL = {"demonstrations": 5, "K": 2}
+
+
+def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
+    """The rows of a domain's main metric in which what else could grow is as usual.
+
+    Args:
+        domain: the domain.
+        results: rows of the results file.
+        axis: ``'demonstrations'`` or ``'K'``.
+    """
+    rows = latest(results[(results["domain"] == domain.name) & (results["K"] > 0) & (results["demonstrations"] > 0)])
+    metric = ACCURACY if domain.succeeded else EXECUTED
+    return rows[(rows["metric"] == metric) & (rows[AXES[axis]] == USUAL[AXES[axis]])]
+
+
+def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
+    """One line for each setting and each of the two."""
+    lines, grown = [], {axis: points(domain, results, axis) for axis in AXES}
+    counts = sorted({count for axis, rows in grown.items() for count in rows[axis]})
+    for axis, rows in grown.items():
+        for setting in dict.fromkeys(rows["setting"]):
+            numbers = [summarise(rows[(rows["setting"] == setting) & (rows[axis] == count)]) for count in counts]
+            lines.append([setting, axis, *(MISSING if number is None else str(number) for number in numbers)])
+    caption = f"{domain.name}: as demonstrations (with K = 2) and components K (from five demonstrations) grow"
+    return Table("curves", caption, pd.DataFrame(lines, columns=["setting", "of", *map(str, counts)], dtype=str))
