@@ -144,7 +144,7 @@ class CloningPretraining(Pretraining):
 
     Args:
         hidden_dim, members: see :class:`CloningConfig`.
-        horizon: states in a plan that is unrolled; ``None`` for the domain's.
+        plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
         stride: see :class:`~ftl_lightning.learning.baselines.transitions.StepConfig`; ``data.horizon`` is one more, or 1.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
@@ -152,7 +152,7 @@ class CloningPretraining(Pretraining):
     method = "BC"
 
     def __init__(
-        self, hidden_dim: int = 512, members: int = 1, horizon: int | None = None, stride: int = 1, **options: Any
+        self, hidden_dim: int = 512, members: int = 1, plan_horizon: int | None = None, stride: int = 1, **options: Any
     ) -> None:
         super().__init__(**options)
         self.save_hyperparameters()
@@ -167,7 +167,7 @@ class CloningPretraining(Pretraining):
         initial_normalization: Normalization | None,
     ) -> CloningModel:
         own = {name: self.hparams[name] for name in ("hidden_dim", "members", "stride")}
-        config = CloningConfig(**dict(shared) | own | {"horizon": self.hparams["horizon"] or data.domain.horizon})
+        config = CloningConfig(**dict(shared) | own | {"horizon": self.hparams["plan_horizon"] or data.domain.horizon})
         expect_window(config, data)
         return CloningModel(config, normalization, embeddings, initial_normalization)
 

@@ -153,7 +153,7 @@ class InContextPretraining(Pretraining):
     Args:
         tokens, bins, width, layers, heads: see :class:`InContextConfig`.
         prompts: most demonstrations that are given; each step and concept draws one to so many.
-        horizon: states in a plan that is unrolled; ``None`` for the domain's.
+        plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
         stride: see :class:`~ftl_lightning.learning.baselines.transitions.StepConfig`; ``data.horizon`` is one more.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
@@ -168,7 +168,7 @@ class InContextPretraining(Pretraining):
         layers: int = 4,
         heads: int = 4,
         prompts: int = 5,
-        horizon: int | None = None,
+        plan_horizon: int | None = None,
         stride: int = 1,
         **options: Any,
     ) -> None:
@@ -190,7 +190,7 @@ class InContextPretraining(Pretraining):
             raise UserError(f"data.class_path: expected a domain with initial states, found {data.domain.name}: nothing follows")
         own = {name: self.hparams[name] for name in ("tokens", "bins", "width", "layers", "heads", "stride")}
         size = own["tokens"] * (shared["initial_state_dim"] + shared["state_dim"])
-        horizon = self.hparams["horizon"] or data.domain.horizon
+        horizon = self.hparams["plan_horizon"] or data.domain.horizon
         config = InContextConfig(**dict(shared) | own | {"concept_dim": size, "horizon": horizon})
         expect_window(config, data)
         model = InContextModel(config, normalization, torch.zeros(len(embeddings), size), initial_normalization)

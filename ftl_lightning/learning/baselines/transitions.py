@@ -26,8 +26,8 @@ class StepConfig(ModelConfig):
             raise UserError(f"model.stride: expected 1 or more, found {self.stride}")
         if self.horizon > 1 + self.stride and not self.state_columns:
             raise UserError(
-                f"model.horizon: expected at most {1 + self.stride} states (initial states of domain {self.domain} hold no state "
-                f"from which a longer plan could be unrolled), found {self.horizon}"
+                f"model.plan_horizon: expected at most {1 + self.stride} states (initial states of domain {self.domain} hold no "
+                f"state from which a longer plan could be unrolled), found {self.horizon}"
             )
 
     @property

@@ -1,0 +1,253 @@
+"""The baselines: their parts against what they should compute, and each configuration from fit to results."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from ftl_lightning.cli import main
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.samplers import SAMPLERS
+from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.learning.baselines.cloning import CloningConfig, CloningModel, ParallelMLP
+from ftl_lightning.learning.baselines.in_context import InContextConfig, InContextModel
+from ftl_lightning.learning.baselines.language import LanguageAdaptation
+from ftl_lightning.learning.baselines.transitions import StepConfig, unroll
+from ftl_lightning.learning.baselines.vae import VAEConfig, VAEModel
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.seeding import generator
+from tests.conftest import CONF, ROOT
+
+AGENT = {"domain": "agent", "state_dim": 13, "initial_state_dim": 52, "state_columns": tuple(range(13)), "encoder": "e"}
+TEXTS = ("go to red object", "go to bowl")
+
+
+def limits(columns: int) -> Normalization:
+    return Normalization(-torch.ones(columns), torch.ones(columns))
+
+
+def cloning(**changes: object) -> CloningModel:
+    config = {**AGENT, "horizon": 6, "concept_dim": 5, "training_concepts": TEXTS, "view": "steps", "hidden_dim": 8} | changes
+    torch.manual_seed(0)
+    return CloningModel(CloningConfig(**config), limits(13), torch.randn(3, 5), limits(52)).eval()  # type: ignore[arg-type]
+
+
+def transformer() -> InContextModel:
+    sizes = {"tokens": 3, "width": 16, "layers": 1, "heads": 2, "concept_dim": 3 * 65, "horizon": 6}
+    torch.manual_seed(0)
+    config = InContextConfig(**AGENT, **sizes, training_concepts=TEXTS, view="steps")  # type: ignore[arg-type]
+    return InContextModel(config, limits(13), torch.randn(3, 3 * 65), limits(52)).eval()
+
+
+def sampled(
+    model: ConceptModel, concepts: list[torch.Tensor], initial: torch.Tensor, count: int, temperature: float = 0.0
+) -> torch.Tensor:
+    weights = [torch.ones(len(own)) for own in concepts]
+    draws = [generator("cpu", number) for number in range(len(concepts))]
+    return model.sample(concepts, weights, count, SAMPLERS["ddpm"], 1, temperature, draws, initial)
+
+
+def test_networks_side_by_side_are_the_networks_alone() -> None:
+    torch.manual_seed(0)
+    together = ParallelMLP(3, 4, 8, 2)
+    x = torch.randn(5, 4)
+    out = together(x[None])
+    for member in range(3):
+        first, last = nn.Linear(4, 8), nn.Linear(8, 2)
+        for layer, depth in ((first, 0), (last, 1)):
+            layer.weight.data = together.weights[depth][member].T
+            layer.bias.data = together.biases[depth][member, 0]
+        assert torch.allclose(out[member], last(torch.relu(first(x))), atol=1e-6)
+
+
+@pytest.mark.parametrize(("stride", "called"), [(1, 9), (2, 5), (4, 3)])
+def test_plans_are_unrolled_state_by_state_and_straight_between(stride: int, called: int) -> None:
+    model = cloning(horizon=10, stride=stride)
+    seen = []
+
+    def predict(observed: torch.Tensor | None) -> torch.Tensor:
+        assert observed is not None
+        seen.append(observed[:, :13].clone())
+        return torch.stack((torch.zeros(2, 13), torch.full((2, 13), 0.1 * stride)), dim=1)
+
+    initial = torch.randn(2, 52)
+    plans = unroll(model, predict, initial)
+    expected = initial[:, None, :13] + 0.1 * torch.arange(10)[None, :, None]
+    assert torch.allclose(plans, expected, atol=1e-5)
+    assert len(seen) == called
+    assert all(torch.allclose(one, expected[:, stride * step], atol=1e-5) for step, one in enumerate(seen))
+
+
+def test_a_plan_that_no_state_can_be_unrolled_from_is_refused() -> None:
+    with pytest.raises(
+        UserError, match=r"model.plan_horizon: expected at most 2 states \(initial states of domain agent hold no state"
+    ):
+        StepConfig(**(AGENT | {"state_columns": ()}), horizon=3, concept_dim=2, training_concepts=TEXTS)  # type: ignore[arg-type]
+
+
+def test_the_view_in_steps_goes_there_and_back() -> None:
+    domain = load_domain("agent")
+    drives = domain.generate("go to bowl", 2, 0)
+    states, initial = drives.windows(torch.tensor([0, 1]), torch.tensor([0, 7]), 16)
+    assert initial is not None
+    view = domain.views["steps"]
+    steps = view.encode(states, initial)
+    assert torch.allclose(steps[:, 0], torch.zeros(2, 13), atol=1e-6)
+    assert torch.allclose(steps[:, 3], states[:, 3] - states[:, 2])
+    assert torch.allclose(view.decode(steps, initial), states, atol=1e-5)
+
+
+def test_cloning_composes_by_adding_conditions() -> None:
+    model = cloning()
+    one, other = torch.randn(2, 5)
+    initial = torch.randn(4, 52)
+    both = sampled(model, [torch.stack((one, other))], initial, 4)
+    assert torch.allclose(both, sampled(model, [(one + other)[None]], initial, 4), atol=1e-6)
+    assert not torch.allclose(both, sampled(model, [one[None]], initial, 4), atol=1e-3)
+
+
+def test_the_vae_composes_by_adding_and_its_noise_is_the_temperatures() -> None:
+    config = {"domain": "object_rearrangement", "state_dim": 21, "encoder": "e", "horizon": 1, "concept_dim": 4, "hidden_dim": 8}
+    torch.manual_seed(0)
+    config = VAEConfig(**config, training_concepts=("a", "b"))  # type: ignore[arg-type]
+    model = VAEModel(config, limits(21), torch.randn(3, 4)).eval()
+    both = sampled(model, [torch.stack((model.concept("a"), model.concept("b")))], None, 3)  # type: ignore[arg-type]
+    alone = model.plans((model.concept("a") + model.concept("b"))[None], None)
+    assert torch.allclose(both[0], model.decode(alone, None).expand(3, -1, -1), atol=1e-6)
+    assert sampled(model, [model.concept("a")[None]], None, 3, temperature=0.5).std(dim=1).max() > 1e-3  # type: ignore[arg-type]
+
+
+def test_in_context_reads_only_the_demonstrations_that_are_given() -> None:
+    model = transformer()
+    initial = torch.randn(4, 52)
+    three, one = torch.randn(3, 3 * 65), torch.randn(1, 3 * 65)
+    together = sampled(model, [three, one], initial, 2)  # the second is padded to three
+    assert torch.allclose(together[0], sampled(model, [three], initial[:2], 2)[0], atol=1e-5)
+    assert torch.allclose(together[1], sampled(model, [one], initial[2:], 2)[0], atol=1e-5)
+    apart = torch.stack([sampled(model, [one], start[None], 1)[0, 0] for start in initial[2:]])
+    assert torch.allclose(together[1], apart, atol=1e-5)  # queries do not see each other
+    assert not torch.allclose(together[1], sampled(model, [three[:1]], initial[2:], 2)[0], atol=1e-3)
+
+
+def test_bins_are_even_and_hold_what_goes_beyond() -> None:
+    model = transformer()
+    assert model.bins(torch.tensor([-2.0, -1.0, -0.91, -0.89, 0.0, 0.99, 1.0, 3.0])).tolist() == [0, 0, 0, 1, 10, 19, 19, 19]
+
+
+def test_prompts_hold_what_was_seen_and_what_followed() -> None:
+    model = transformer()
+    model.config = replace(model.config, stride=2)
+    drive = load_domain("agent").generate("go to bowl", 1, 0)
+    prompt = model.prompts(drive).unflatten(-1, (3, 65))[0]
+    assert drive.initial_states is not None
+    for token, time in enumerate((0, 2, 4)):
+        assert torch.allclose(prompt[token, :52], drive.initial_states[0, time], atol=1e-5)
+        assert torch.allclose(prompt[token, 52:], drive.states[0, time + 2] - drive.states[0, time], atol=1e-5)
+
+
+TINY = {
+    "object_rearrangement": ["--data.samples_per_concept=20", "--data.validation_per_concept=2", "--data.batch_size=32"],
+    "agent": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
+    "driving": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
+}
+SMALL = {
+    "bc": ["--model.hidden_dim=16"],
+    "cvae": ["--model.hidden_dim=16", "--model.latent_dim=4"],
+    "in_context": ["--model.width=16", "--model.layers=1", "--model.heads=2"],
+}
+QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--evaluation.samples=2", "--evaluation.figures=0"]
+FITS = sorted(path for path in (CONF / "baseline").glob("*/*.yaml") if path.parent.name != "language")
+
+
+@pytest.mark.parametrize("path", FITS, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
+    method, domain = path.parent.name, path.stem
+    members = ["--model.members=2"] if (method, domain) == ("bc", "object_rearrangement") else []
+    options = [*TINY[domain], *SMALL[method], *members, *QUIET, "--data.steps_per_epoch=2", "--trainer.max_steps=2"]
+    assert main(["fit", "--config", str(path), *options, "--model.output=made"]) == 0
+    model = load_model("made")
+    assert load_model("made").hash == model.hash
+    concept = model.concept(model.config.training_concepts[0])
+    assert concept.isfinite().all()
+    assert concept.any()  # a VAE's and a transformer's are made after the fit, not left at zero
+    goal = load_domain(domain).suites["validation"].learned[0]
+    demonstrations = [] if domain == "driving" else ["--data.suite=validation", "--data.demonstrations_per_concept=2"]
+    if domain == "driving":  # its expert takes long; any drives will do
+        drives = load_domain(domain).training_set(2, 0).select("merge")
+        replace(drives, concepts=(goal,) * len(drives)).save("drives.safetensors")
+        demonstrations = ["--data.demonstrations=drives.safetensors"]
+    adapt = [*demonstrations, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
+    executed = [] if domain == "object_rearrangement" else ["--evaluation.closed_loop=false"]
+    config = path.parent / "invert" / path.name
+    assert (
+        main(["invert", "--config", str(config), *adapt, *executed, "--model.output=concepts", "--evaluation.results=r.csv"]) == 0
+    )
+    learned = Concept.load(next(Path("concepts").iterdir()))
+    assert learned.origin.pretrained == model.hash
+    if domain != "driving":  # which judges episodes alone
+        rows = read_rows("r.csv")
+        own = rows[rows["omega"] != ""]
+        assert set(own["method"].str.partition(" (")[0]) == {model.name}
+        assert set(own["demonstrations"]) == {2}
+
+
+def test_a_baselines_window_must_hold_a_transition(capsys: pytest.CaptureFixture[str]) -> None:
+    config = str(CONF / "baseline" / "bc" / "driving.yaml")
+    assert main(["fit", "--config", config, *TINY["driving"], *QUIET, "--data.horizon=5"]) == 2
+    assert "data.horizon: expected 2 (states that a transition spans), found 5" in capsys.readouterr().err
+
+
+def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = str(CONF / "baseline" / "in_context" / "invert" / "agent.yaml")
+    assert main(["invert", "--config", config, f"--model.pretrained={tiny}"]) == 2
+    assert "expected an in-context model, found diffusion" in capsys.readouterr().err
+
+
+LANGUAGE = str(CONF / "baseline" / "language" / "invert" / "agent.yaml")
+
+
+def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[str]) -> None:
+    # In this domain descriptions are the tasks' names, which the table holds: no language model is needed.
+    options = [
+        f"--model.pretrained={ROOT / 'pretrained' / 'agent'}",
+        "--model.encoder=table",
+        "--evaluation.suites=[paper]",
+        *QUIET,
+    ]
+    options += [
+        "--data.demonstrations_per_concept=1",
+        "--evaluation.closed_loop=false",
+        "--model.output=c",
+        "--evaluation.results=r.csv",
+    ]
+    assert main(["invert", "--config", LANGUAGE, *options]) == 0
+    model = load_model(ROOT / "pretrained" / "agent")
+    assert set(read_rows("r.csv").query("omega != ''")["method"]) == {"language"}
+    for path in Path("c").iterdir():
+        concept = Concept.load(path)
+        assert concept.embeddings.shape == (1, model.config.concept_dim)
+        assert concept.weights.tolist() == [pytest.approx(0.6)]
+
+
+def test_a_table_knows_no_new_sentences(tiny: Path) -> None:
+    module = LanguageAdaptation(str(tiny), encoder="table")
+    module.domain = load_domain("object_rearrangement")
+    with pytest.raises(UserError, match="'square right and above diagonally to triangle': not in the table"):
+        module._embedding("square diagonal to triangle")
+
+
+def test_tasks_are_told_in_the_papers_words() -> None:
+    sentence = load_domain("object_rearrangement").sentence
+    assert sentence("circle diagonal to triangle") == "circle right and above diagonally to triangle"
+    assert (
+        sentence("circle, triangle and square in a circle of radius 1.67")
+        == "circle triangle and square in a circle of radius 1.67"
+    )
+    assert sentence("square diagonal to triangle and circle above square").endswith("to triangle and circle above square")
+    assert load_domain("agent").sentence("go to red bowl") == "go to red bowl"
