@@ -22,13 +22,18 @@ def run(name: str, folder: Path) -> list[str]:
     return [output.get("data", {}).get("text/markdown", "") for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
-def test_cells_are_the_product_of_the_grid() -> None:
+def test_cells_are_the_product_of_names_and_grid() -> None:
     stage = Stage(
-        "invert", "c.yaml", {"model.pretrained": "p{seed}"}, {"model.components": [1, 2], "model.omega": [1.2, "learned"]}
+        "invert",
+        "{domain}.yaml",
+        {"domain": ["a", "b"]},
+        {"model.pretrained": "p{seed}/{domain}"},
+        {"model.components": [1, 2], "model.omega": [1.2, "learned"]},
     )
     cells = list(stage.cells(7))
-    assert len(cells) == 4
-    assert cells[1] == ["--config=c.yaml", "--model.pretrained=p7", "--model.components=1", "--model.omega=learned"]
+    assert len(cells) == 8
+    expected = ["--config=b.yaml", "--model.pretrained=p7/b", "--model.components=1", "--model.omega=learned"]
+    assert cells[5].arguments == expected
 
 
 @pytest.fixture
@@ -70,11 +75,102 @@ def test_a_notebook_holds_no_logic(path: Path) -> None:
     assert not any(word in source for source in code for word in ("def ", "class ", ".mean(", ".std("))
 
 
-def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stage = {"verb": "invert", "config": str(CONF / "invert" / "object_rearrangement.yaml")}
-    stages = [stage | {"options": {"model.pretrained": name}} for name in ("nowhere", "elsewhere")]
-    Path("a.yaml").write_text(yaml.safe_dump({"results": "r.csv", "stages": stages}))
-    assert main(["ablate", "--config", "a.yaml"]) == 2
+def plan(path: str, *stages: dict[str, object], **more: object) -> str:
+    """A configuration file of an ablation."""
+    Path(path).write_text(yaml.safe_dump({"results": "r.csv", "stages": list(stages), **more}))
+    return path
+
+
+@pytest.fixture
+def quick(tiny: Path) -> dict[str, object]:
+    """A stage of seconds."""
+    options = {
+        "model.pretrained": str(tiny),
+        "data.steps": 2,
+        "model.samples": 2,
+        "evaluation.samples": 2,
+        "evaluation.steps": 2,
+        "evaluation.figures": 0,
+        "evaluation.suites": ["paper"],
+        "trainer.enable_progress_bar": False,
+        "trainer.accelerator": "cpu",
+        "trainer.logger.init_args.version": None,
+    }
+    return {"verb": "invert", "config": str(CONF / "invert" / "object_rearrangement.yaml"), "options": options}
+
+
+def with_options(stage: dict[str, object], **more: object) -> dict[str, object]:
+    return stage | {"options": stage["options"] | more}  # type: ignore[operator]
+
+
+def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(quick: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
+    failing = with_options(quick, **{"model.learning_rate": 1e30, "data.steps": 20})
+    assert main(["ablate", "--config", plan("a.yaml", failing, quick)]) == 2
     told = capsys.readouterr()
-    assert "2 of 2 cells failed" in told.err
-    assert "elsewhere/config.json" in told.err
+    assert "1 of 2 cells failed" in told.err
+    assert "the loss became" in told.err
+    assert len(read_rows("r.csv")) > 0
+
+
+def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
+    method = {
+        "verb": "invert",
+        "config": f"{CONF}/baseline/{{method}}/invert/driving.yaml",
+        "each": {"method": ["bc", "telepathy"]},
+    }
+    wrong = [
+        with_options(quick, **{"model.pretrained": "nowhere"}),
+        with_options(quick, **{"evaluation.suites": ["paper", "exam"]}),
+        with_options(quick, **{"model.tempo": 3}),
+        with_options(quick, **{"data.domain": "driving", "evaluation.closed_loop": True}),
+        method,
+    ]
+    assert main(["ablate", "--config", plan("a.yaml", quick, *wrong)]) == 2
+    told = capsys.readouterr().err
+    assert "6 of 7 cells cannot run, none was started" in told
+    for part in (
+        "nowhere/config.json: expected a pretrained model",
+        "evaluation.suites: expected some of training, paper, components, validation (domain object_rearrangement), found exam",
+        "tempo",
+        "model.pretrained: expected a model of driving, found one of object_rearrangement",
+        "telepathy/invert/driving.yaml: expected a configuration file, found nothing",
+        "holds bc, cvae, in_context, language",
+        "pretrained/baseline/bc/driving/config.json: expected a pretrained model",
+    ):
+        assert part in told, part
+    assert told.count("\n") == 1
+    assert not Path("r.csv").exists()
+
+
+def test_shards_are_parts_of_the_plan(quick: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
+    stage = quick | {"grid": {"model.omega": [1.0, 1.1, 1.2]}}
+    config = plan("a.yaml", stage, seeds=[0])
+    assert main(["ablate", "--config", config, "--shard", "2/3"]) == 0
+    assert set(read_rows("r.csv").query("K > 0")["omega"]) == {"1.1"}
+    assert "[1/1" in capsys.readouterr().out
+    assert main(["ablate", "--config", config, "--shard", "1/3"]) == 0
+    assert main(["ablate", "--config", config, "--shard", "3/3"]) == 0
+    assert set(read_rows("r.csv").query("K > 0")["omega"]) == {"1.0", "1.1", "1.2"}
+    for shard in ("0/3", "4/3", "half"):
+        assert main(["ablate", "--config", config, "--shard", shard]) == 2
+        assert "shard: expected 'number/shards' such as 3/8" in capsys.readouterr().err
+
+
+def test_a_ray_cluster_of_two_workers_measures_the_same(quick: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray", reason="needs the extra cluster")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    stage = quick | {"grid": {"model.omega": [1.0, 1.2]}}
+    assert main(["ablate", "--config", plan("a.yaml", stage)]) == 0
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        Path("b.yaml").write_text(Path("a.yaml").read_text().replace("r.csv", "s.csv"))
+        failing = with_options(quick, **{"model.learning_rate": 1e30, "data.steps": 20})
+        content = yaml.safe_load(Path("b.yaml").read_text())
+        Path("b.yaml").write_text(yaml.safe_dump(content | {"stages": [*content["stages"], failing]}))
+        assert main(["ablate", "--config", "b.yaml", "--executor", "ray"]) == 2  # the failing cell is told
+    finally:
+        ray.shutdown()
+    one, other = (
+        read_rows(name).sort_values(["method", "omega", "setting", "task"], ignore_index=True) for name in ("r.csv", "s.csv")
+    )
+    assert one.equals(other)
