@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import re
 import tempfile
 import time
@@ -205,6 +206,10 @@ def _executor(name: str) -> Iterator[Run]:
 
     started = not ray.is_initialized()  # else it runs on the cluster that the caller is connected to
     if started:
+        os.environ.setdefault(
+            "RAY_worker_niceness", "0"
+        )  # by default workers stand back for everything else, but they are the work
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         ray.init(log_to_driver=False, include_dashboard=False)
     try:
         yield run

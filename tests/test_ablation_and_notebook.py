@@ -159,6 +159,8 @@ def test_shards_are_parts_of_the_plan(quick: dict[str, object], capsys: pytest.C
 def test_a_ray_cluster_of_two_workers_measures_the_same(quick: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray", reason="needs the extra cluster")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # else they starve beside the other tests
     stage = quick | {"grid": {"model.omega": [1.0, 1.2]}}
     assert main(["ablate", "--config", plan("a.yaml", stage)]) == 0
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)

@@ -1,5 +1,6 @@
 """A learned concept and its file."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Self
@@ -74,3 +75,12 @@ class Concept:
             raise UserError(f"{path}: expected the keys of a concept, found none of {', '.join(missing)}")
         origin = Origin(**{field.name: header[field.name] for field in fields(Origin)})
         return cls(tensors["embeddings"], tensors["weights"], origin)
+
+
+def load_concepts(paths: Iterable[str | Path]) -> list[Concept]:
+    """Read several concepts.
+
+    Raises:
+        UserError: as :meth:`Concept.load`.
+    """
+    return [Concept.load(path) for path in paths]

@@ -7,6 +7,9 @@ import numpy as np
 from scipy.optimize import nnls
 from torch import Tensor
 
+ROUNDING = 1e-6
+"""Weights below this share of the largest are the solver's rounding."""
+
 
 @dataclass(frozen=True)
 class Explanation:
@@ -45,6 +48,6 @@ def explain(embedding: Tensor, names: Sequence[str], training: Tensor, nearest: 
     by_angle, by_weight = np.argsort(-cosines)[:nearest], np.argsort(-weights)
     return Explanation(
         nearest=tuple((names[row], float(cosines[row])) for row in by_angle),
-        combination=tuple((names[row], float(weights[row])) for row in by_weight if weights[row] > 0),
+        combination=tuple((names[row], float(weights[row])) for row in by_weight if weights[row] > ROUNDING * weights.max()),
         explained=float(1 - residual**2 / (target @ target)) if target.any() else 1.0,
     )

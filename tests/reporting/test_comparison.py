@@ -1,0 +1,132 @@
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pandas as pd
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.reporting.comparison import comparison_table, lead, overview
+from ftl_lightning.reporting.curves import curves_table
+from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
+from tests.conftest import ROOT
+
+DOMAIN = load_domain("object_rearrangement")
+METHODS = {"FTL-IGM (free)": (0.9, 0.7), "BC (free)": (0.8, 0.2), "CVAE (free)": (0.1, 0.1), "language": (0.3, 0.1)}
+
+
+def row(method: str, task: str, value: float, **changes: object) -> Row:
+    values: dict[str, object] = {
+        "domain": DOMAIN.name,
+        "setting": "new concept",
+        "task": task,
+        "method": method,
+        "K": 1,
+        "omega": "1.0",
+    }
+    values |= {
+        "demonstrations": 5,
+        "seed": 0,
+        "n": 50,
+        "metric": "accuracy",
+        "value": value,
+        "model_hash": "m",
+        "config_hash": method,
+    }
+    return Row(**(values | changes))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    rows = [row(method, task, value) for method, values in METHODS.items() for task, value in zip("ab", values, strict=True)]
+    rows += [row("random scenes", task, 0.15, K=0, omega="") for task in "ab"]
+    append_rows(tmp_path / "r" / "comparison.csv", rows)
+    grown = [row("FTL-IGM (free)", "a", 0.1 * count, K=2, demonstrations=count) for count in (1, 2, 5)]
+    append_rows(tmp_path / "r" / "curves.csv", [*grown, row("FTL-IGM (free)", "a", 0.7, K=4)])
+    return tmp_path / "r"
+
+
+def test_every_number_stands_beside_the_papers_with_their_difference(results: Path) -> None:
+    table = comparison_table(DOMAIN, read_study(results, "comparison")).cells.set_index("method")
+    assert list(table.index) == ["FTL-IGM", "BC", "CVAE", "language"]
+    assert table.loc["BC"].tolist() == ["new concept", "accuracy", "0.50", "0.30", "-", "0.67 ± 0.15", "-0.17"]
+    assert table.loc["FTL-IGM", ["paper", "difference"]].tolist() == ["0.82 ± 0.09", "-0.02"]
+
+
+def test_the_lead_is_taken_task_for_task() -> None:
+    rows = pd.DataFrame(
+        [
+            {"family": family, "task": task, "seed": 0, "value": value}
+            for family, values in (("FTL-IGM", (0.9, 0.7)), ("BC", (0.8, 0.2)), ("CVAE", (0.1, 0.1)))
+            for task, value in zip("ab", values, strict=True)
+        ]
+    )
+    assert lead(rows, "accuracy") == pytest.approx((0.3, 0.2))  # 0.1 and 0.5 ahead of BC
+    assert lead(rows, "closed loop crash") == pytest.approx((-0.7, 0.1))  # of crashes CVAE has the fewest
+    one = pd.DataFrame(
+        [
+            {"family": f, "task": "a", "seed": s, "value": v}
+            for f, vs in (("FTL-IGM", (0.5, 0.7)), ("BC", (0.4, 0.5)))
+            for s, v in enumerate(vs)
+        ]
+    )
+    assert lead(one, "accuracy") == pytest.approx((0.15, 0.05))  # a single task: seed for seed
+    assert lead(rows[rows["family"] != "FTL-IGM"], "accuracy") is None
+
+
+def test_the_overview_fits_on_one_screen_and_says_who_is_ahead(results: Path) -> None:
+    cells = overview(read_study(results, "comparison")).cells
+    assert len(cells) == 1
+    line = cells.iloc[0]
+    assert line["FTL-IGM"] == "0.80 ± 0.10 [0.82]"
+    assert line["in-context"] == "-"
+    assert line["lead"] == "+0.30 ± 0.20, ahead"
+
+
+def test_figures_show_measured_bars_and_the_papers_diamonds(results: Path) -> None:
+    axes = comparison_bars(DOMAIN, read_study(results, "comparison")).axes[0]
+    bars = {c.get_label(): [bar.get_height() for bar in c] for c in axes.containers if hasattr(c, "patches")}
+    assert bars["BC"] == [pytest.approx(0.5)]
+    assert sorted(line.get_ydata()[0] for line in axes.lines if line.get_marker() == "D") == [0.08, 0.20, 0.67, 0.82]
+    left, right = growth(DOMAIN, read_study(results, "curves")).axes
+    assert left.containers[0].lines[0].get_ydata().tolist() == pytest.approx([0.1, 0.2, 0.5])
+    assert right.containers[0].lines[0].get_xdata().tolist() == [2, 4]
+    plt.close("all")
+
+
+def test_curves_keep_the_other_axis_as_usual(results: Path) -> None:
+    cells = curves_table(DOMAIN, read_study(results, "curves")).cells.set_index("of")
+    assert cells.loc["demonstrations", ["1", "2", "4", "5"]].tolist() == ["0.10", "0.20", "-", "0.50"]
+    assert cells.loc["K", ["1", "2", "4", "5"]].tolist() == ["-", "0.50", "0.70", "-"]
+
+
+def test_ablations_comparison_and_curves_are_not_mixed(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    append_rows(results / "own.csv", [row("FTL-IGM (free)", "a", 0.33, K=2, omega="1.2")])
+    assert set(read_study(results)["value"]) == {0.33}
+    assert len(read_study(results, "comparison")) == 10
+    assert len(read_rows(results)) == 15
+    assert read_study(results, "nothing").empty
+    assert main(["report", f"--results={results}", "--out=out"]) == 0
+    written = {path.name for path in Path("out").rglob("*")}
+    assert written >= {
+        "overview.md",
+        "comparison.md",
+        "comparison.tex",
+        "comparison_accuracy.png",
+        "curves.md",
+        "curves.png",
+        "accuracy.md",
+    }
+    assert "0.33" in (Path("out") / DOMAIN.name / "accuracy.md").read_text()
+
+
+def test_the_map_of_concepts_names_them_all() -> None:
+    model = load_model(ROOT / "pretrained" / "agent")
+    origin = Origin("go to green cone", "agent", "e", "p", "d", 5, "fixed", 0.1)
+    concept = Concept(torch.randn(2, model.config.concept_dim), torch.ones(2), origin)
+    texts = {text.get_text() for text in concept_map(model, [concept]).axes[0].texts}
+    assert texts == {*model.config.training_concepts, "go to green cone [1]", "go to green cone [2]"}
