@@ -52,6 +52,7 @@ class Evaluator(pl.Callback):
         replan: steps that a plan is followed before a new one is made; the paper's number is 1.
         figures: how many samples of a task a TensorBoard figure shows; 0 for no figures.
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
+        references: also measure reference policies when testing; the same for every method, they are needed once a seed.
         seed: of the samples.
     """
 
@@ -66,6 +67,7 @@ class Evaluator(pl.Callback):
         replan: int = 8,
         figures: int = 16,
         results: str | None = None,
+        references: bool = True,
         seed: int = 0,
     ) -> None:
         if sampler not in SAMPLERS:
@@ -90,6 +92,7 @@ class Evaluator(pl.Callback):
         self.samples, self.sampler, self.steps, self.temperature = samples, SAMPLERS[sampler], steps, temperature
         self.figures = figures
         self.results = results
+        self.references = references
         self.seed = seed
         self.judged: list[Judged] = []
         self._projected = False
@@ -209,7 +212,7 @@ class Evaluator(pl.Callback):
                     log_hparams(logger, configured, metrics)
         if stage == "test" and self.judged:
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
-            found = references(self.judged, domain, module.demonstrated, self.seed)
+            found = references(self.judged, domain, module.demonstrated, self.seed) if self.references else {}
             append_rows(path, rows(module, domain, self.judged, found, configured))
             for name, value in metrics.items():
                 print(f"{name.removeprefix('test/')}: {value:.2f}")
