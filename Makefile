@@ -5,7 +5,7 @@ EXTRAS := dev,notebooks,cluster
 DOMAIN := object_rearrangement
 LOGS := logs/$(DOMAIN)
 
-.PHONY: install minilm run test lint format report ablation benchmark
+.PHONY: install minilm run test lint format report ablation comparison benchmark
 
 install: .venv/installed
 
@@ -37,6 +37,9 @@ format: install
 
 ablation: install # every number in results/, three seeds
 	$(BIN)/python -m ftl_lightning ablate --config conf/ablation/$(DOMAIN).yaml
+
+comparison: minilm # ours and the four baselines in three domains, with the models that ship
+	$(BIN)/python -m ftl_lightning ablate --config conf/ablation/comparison.yaml
 
 report: install # tables and figures of results/, and the table in the README
 	$(BIN)/python -m ftl_lightning report --readme README.md

@@ -206,9 +206,7 @@ def _executor(name: str) -> Iterator[Run]:
 
     started = not ray.is_initialized()  # else it runs on the cluster that the caller is connected to
     if started:
-        os.environ.setdefault(
-            "RAY_worker_niceness", "0"
-        )  # by default workers stand back for everything else
+        os.environ.setdefault("RAY_worker_niceness", "0")  # by default workers stand back for everything else
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         ray.init(log_to_driver=False, include_dashboard=False)
     try:

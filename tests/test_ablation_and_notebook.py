@@ -69,6 +69,21 @@ def test_a_notebook_shows_the_committed_results(name: str, tables: int, checkout
     assert sum("| paper |" in text for text in run(name, checkout)) == tables
 
 
+@pytest.mark.parametrize(("name", "tables"), [("comparison", 4), ("curves", 3), ("concepts", 0)])
+def test_a_notebook_beyond_one_domain_shows_the_committed_results(
+    name: str, tables: int, checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("results", "pretrained"):
+        (checkout / folder).symlink_to(ROOT / folder)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(checkout)}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("| --- |" in output.get("data", {}).get("text/markdown", "") for output in outputs) == tables
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
+    assert name != "concepts" or sum(output.get("text", "").count("best combination") for output in outputs) >= 16 * 2
+
+
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_a_notebook_holds_no_logic(path: Path) -> None:
     code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]

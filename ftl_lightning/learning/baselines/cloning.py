@@ -11,8 +11,9 @@ from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampler
 from ftl_lightning.errors import UserError
+from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
-from ftl_lightning.learning.concept_model import ConceptModel, Noise, TextConceptModel
+from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
 from ftl_lightning.learning.pretraining import Pretraining
 
 
@@ -50,7 +51,7 @@ class ParallelMLP(nn.Module):
         return hidden @ self.weights[1] + self.biases[1]
 
 
-class CloningModel(TextConceptModel):
+class CloningModel(AdditiveModel, TextConceptModel):
     """A deterministic policy of the concept and, where there is one, the state; composing adds concepts.
 
     Args:
@@ -102,19 +103,6 @@ class CloningModel(TextConceptModel):
         target = self.encode(states[:, :: self.config.stride], initial_states)
         return (predicted - target).square().mean(dim=(0, 2, 3))
 
-    def losses(
-        self,
-        states: Tensor,
-        initial_states: Tensor | None,
-        embeddings: Tensor,
-        weights: Tensor,
-        noise: Noise | None,
-        loss: str,
-    ) -> Tensor:
-        concepts = torch.einsum("rk,rkn->rn", weights, embeddings)
-        each = concepts.repeat_interleave(len(states) // len(concepts), dim=0)
-        return self.errors(states, initial_states, each).unflatten(0, (len(concepts), -1))
-
     @torch.no_grad()
     def sample(
         self,
@@ -128,8 +116,7 @@ class CloningModel(TextConceptModel):
         initial_states: Tensor | None = None,
     ) -> Tensor:
         """Deterministic: ``sampler``, ``steps``, ``temperature`` and ``generators`` do not matter."""
-        condition = torch.stack([omega @ own for own, omega in zip(concepts, weights, strict=True)])
-        condition = condition.repeat_interleave(count, dim=0)
+        condition = added(concepts, weights).repeat_interleave(count, dim=0)
         member = torch.arange(len(condition), device=self.device) % count % self.config.members
         rows = torch.arange(len(condition), device=self.device)
 

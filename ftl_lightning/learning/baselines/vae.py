@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampler
-from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig, Noise
+from ftl_lightning.learning.baselines.additive import AdditiveModel, added
+from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
 from ftl_lightning.learning.pretraining import Pretraining
 
 
@@ -25,7 +26,7 @@ class VAEConfig(ModelConfig):
     hidden_dim: int = 512
 
 
-class VAEModel(ConceptModel):
+class VAEModel(AdditiveModel):
     """Behaviour from an initial state and z, a normal variable in which a concept is a point; composing adds points.
 
     Args:
@@ -62,22 +63,9 @@ class VAEModel(ConceptModel):
         out: Tensor = self.decoder(z if observed is None else torch.cat((z, observed), dim=-1))
         return out.unflatten(-1, (self.config.horizon, self.config.state_dim))
 
-    def errors(self, states: Tensor, initial_states: Tensor | None, z: Tensor) -> Tensor:
+    def errors(self, states: Tensor, initial_states: Tensor | None, concepts: Tensor) -> Tensor:
         """Squared error of the reconstruction ``(batch,)``."""
-        return (self.plans(z, initial_states) - self.encode(states, initial_states)).square().mean(dim=(1, 2))
-
-    def losses(
-        self,
-        states: Tensor,
-        initial_states: Tensor | None,
-        embeddings: Tensor,
-        weights: Tensor,
-        noise: Noise | None,
-        loss: str,
-    ) -> Tensor:
-        z = torch.einsum("rk,rkn->rn", weights, embeddings)
-        each = z.repeat_interleave(len(states) // len(z), dim=0)
-        return self.errors(states, initial_states, each).unflatten(0, (len(z), -1))
+        return (self.plans(concepts, initial_states) - self.encode(states, initial_states)).square().mean(dim=(1, 2))
 
     @torch.no_grad()
     def sample(
@@ -94,7 +82,7 @@ class VAEModel(ConceptModel):
         """``temperature`` is the variance of the noise that is added to z; ``sampler`` and ``steps`` do not matter."""
         shape = (count, self.config.concept_dim)
         noise = torch.stack([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
-        z = torch.stack([omega @ own for own, omega in zip(concepts, weights, strict=True)])[:, None] + temperature**0.5 * noise
+        z = added(concepts, weights)[:, None] + temperature**0.5 * noise
         plans = self.plans(z.flatten(0, 1), initial_states)
         return self.decode(plans, initial_states).unflatten(0, (len(concepts), count))
 
