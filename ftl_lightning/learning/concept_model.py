@@ -179,8 +179,11 @@ class ConceptModel(nn.Module, ABC):
 
         Returns:
             ``(run, sample)``.
+
+        Raises:
+            UserError: for a method that learns none.
         """
-        raise NotImplementedError(f"{type(self).__name__} learns no concepts")
+        raise UserError(f"model.pretrained: expected a model that concepts are learned through, found one of {self.name}")
 
     @property
     def traits(self) -> tuple[str, ...]:

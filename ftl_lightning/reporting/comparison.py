@@ -17,6 +17,11 @@ def family(method: str) -> str:
     return method.partition(" (")[0]
 
 
+def reference_lines(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
+    """The latest rows of what stands beside all methods: chance, trivial policies and oracles."""
+    return latest(results[(results["domain"] == domain.name) & (results["omega"] == "")])
+
+
 def compared(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
     """The latest rows of a domain's methods, with a column ``family``."""
     rows = latest(results[(results["domain"] == domain.name) & (results["omega"] != "")])
@@ -46,15 +51,16 @@ def settings(domain: Domain) -> list[str]:
 
 def comparison_table(domain: Domain, results: pd.DataFrame) -> Table:
     """One line for each setting, metric and method: measured, its errors, the paper's number, and the difference."""
-    rows = compared(domain, results)
+    rows, references = compared(domain, results), reference_lines(domain, results)
     lines = []
     for setting in settings(domain):
         for metric in metrics(domain):
-            for method in METHODS:
-                own = rows[(rows["setting"] == setting) & (rows["metric"] == metric) & (rows["family"] == method)]
-                number, theirs = summarise(own), published(domain, method, setting, metric)
+            own, around = (found[(found["setting"] == setting) & (found["metric"] == metric)] for found in (rows, references))
+            numbers = [(method, summarise(own[own["family"] == method])) for method in METHODS]
+            numbers += [(name, summarise(around[around["method"] == name])) for name in sorted(set(around["method"]))]
+            for method, number in numbers:
                 if number:
-                    lines.append([setting, metric, method, *beside(number, theirs)])
+                    lines.append([setting, metric, method, *beside(number, published(domain, method, setting, metric))])
     caption = f"{domain.name}: all methods, learned from five demonstrations"
     return Table("comparison", caption, pd.DataFrame(lines, columns=["setting", "metric", "method", *BESIDE], dtype=str))
 
@@ -93,15 +99,20 @@ def overview(results: pd.DataFrame) -> Table:
     lines = []
     for name in sorted(set(results["domain"])):
         domain = load_domain(name)
-        rows = compared(domain, results)
+        rows, references = compared(domain, results), reference_lines(domain, results)
         for setting in settings(domain):
             for metric in metrics(domain):
                 own = rows[(rows["setting"] == setting) & (rows["metric"] == metric)]
                 if not own.empty:
                     cells = [_cell(domain, own, method, setting, metric) for method in METHODS]
-                    lines.append([name, f"{setting}, {metric}", *cells, _lead(lead(own, metric))])
-    caption = "Ours and the baselines, mean ± standard error over tasks [the paper's]; last, ours less the best baseline"
-    return Table("overview", caption, pd.DataFrame(lines, columns=["domain", "setting, metric", *METHODS, "lead"], dtype=str))
+                    around = references[(references["setting"] == setting) & (references["metric"] == metric)]
+                    lines.append([name, f"{setting}, {metric}", *cells, _lead(lead(own, metric)), _around(around)])
+    caption = "Ours and the baselines, mean ± standard error over tasks [the paper's]; then ours less the best baseline"
+    return Table(
+        "overview",
+        caption,
+        pd.DataFrame(lines, columns=["domain", "setting, metric", *METHODS, "lead", "reference lines"], dtype=str),
+    )
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric: str) -> str:
@@ -110,6 +121,11 @@ def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric:
         return MISSING
     error = "" if number.error is None else f" ± {number.error:.2f}"
     return f"{number.mean:.2f}{error}" + ("" if theirs is None else f" [{theirs.value:.2f}]")
+
+
+def _around(rows: pd.DataFrame) -> str:
+    means = rows.groupby("method")["value"].mean().sort_values()
+    return ", ".join(f"{method} {mean:.2f}" for method, mean in means.items()) or MISSING
 
 
 def _lead(found: tuple[float, float] | None) -> str:

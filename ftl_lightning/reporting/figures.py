@@ -11,7 +11,7 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import OURS, Domain
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.reporting.comparison import METHODS, compared, published, settings
+from ftl_lightning.reporting.comparison import METHODS, compared, published, reference_lines, settings
 from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.tables import summarise
 
@@ -71,7 +71,8 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting, ours and the baselines', the paper's numbers as diamonds; bars show standard errors over tasks.
+    """A metric of every setting, ours and the baselines', the paper's numbers as diamonds, reference lines; bars show standard errors over
+    tasks.
 
     Args:
         domain: the domain.
@@ -96,6 +97,15 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
             if found := published(domain, method, setting, metric):
                 named = "the paper's" not in axes.get_legend_handles_labels()[1]
                 axes.plot(where, found.value, "D", color="black", markersize=4, label="the paper's" if named else None)
+    references = reference_lines(domain, results)
+    references = references[references["metric"] == metric]
+    for index, policy in enumerate(sorted(set(references["method"]))):
+        own = references[references["method"] == policy]
+        for place in (place for place, setting in enumerate(shown) if setting in set(own["setting"])):
+            label = None if policy in axes.get_legend_handles_labels()[1] else policy
+            mean = own.loc[own["setting"] == shown[place], "value"].mean()
+            span, line = (place - 0.45, place + 0.45), LINES[index % len(LINES)]
+            axes.hlines(mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
     axes.set_xticks(range(len(shown)), shown)
     axes.set(ylim=(0, 1.05), ylabel=metric, title=domain.name)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))

@@ -52,7 +52,7 @@ def results(tmp_path: Path) -> Path:
 
 def test_every_number_stands_beside_the_papers_with_their_difference(results: Path) -> None:
     table = comparison_table(DOMAIN, read_study(results, "comparison")).cells.set_index("method")
-    assert list(table.index) == ["FTL-IGM", "BC", "CVAE", "language"]
+    assert list(table.index) == ["FTL-IGM", "BC", "CVAE", "language", "random scenes"]
     assert table.loc["BC"].tolist() == ["new concept", "accuracy", "0.50", "0.30", "-", "0.67 ± 0.15", "-0.17"]
     assert table.loc["FTL-IGM", ["paper", "difference"]].tolist() == ["0.82 ± 0.09", "-0.02"]
 
@@ -85,6 +85,7 @@ def test_the_overview_fits_on_one_screen_and_says_who_is_ahead(results: Path) ->
     assert line["FTL-IGM"] == "0.80 ± 0.10 [0.82]"
     assert line["in-context"] == "-"
     assert line["lead"] == "+0.30 ± 0.20, ahead"
+    assert line["reference lines"] == "random scenes 0.15"
 
 
 def test_figures_show_measured_bars_and_the_papers_diamonds(results: Path) -> None:
