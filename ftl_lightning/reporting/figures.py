@@ -71,8 +71,9 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting, ours and the baselines', the paper's numbers as diamonds, reference lines; bars show standard errors over
-    tasks.
+    """A metric of every setting, ours and the baselines', with the paper's numbers as diamonds and reference lines.
+
+    Bars show standard errors over tasks.
 
     Args:
         domain: the domain.
