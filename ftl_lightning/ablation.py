@@ -97,7 +97,8 @@ def run_ablation(
         seeds: each stage runs once a seed.
         results: results file.
         shard: ``'3/8'`` for the third of eight parts of the plan, for as many machines or processes.
-        executor: ``'local'``, one cell after another in this process; ``'ray'``, as many side by side as the cluster has room for.
+        executor: ``'local'``, one cell after another in this process; ``'ray'``, as many side by side as a cluster has room for,
+            the one that ``RAY_ADDRESS`` names, whose machines share this folder, or one of this machine's processors.
 
     Raises:
         UserError: before anything runs, for cells that cannot; at the end, naming the cells that failed.
@@ -194,8 +195,8 @@ def _executor(name: str) -> Iterator[Run]:
         raise UserError("executor: 'ray' needs its extra; run: pip install 'ftl-lightning[cluster]'") from error
 
     def run(cells: Sequence[Cell], known: set[str]) -> Iterator[tuple[Cell, Outcome]]:
-        remote = ray.remote(num_cpus=1, max_retries=0)(attempt)
-        waiting = {remote.remote(cell, known): cell for cell in cells}
+        remote = ray.remote(num_cpus=1, max_retries=0)(_attempt_in)
+        waiting = {remote.remote(str(Path.cwd()), cell, known): cell for cell in cells}
         while waiting:
             (ready, *_), _ = ray.wait(list(waiting), num_returns=1)
             try:
@@ -238,6 +239,12 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
             return Outcome(error=repr(error))
         rows = read_rows(path) if path.is_file() else None
     return Outcome(rows, note="done" if rows is None else f"{len(rows)} rows")
+
+
+def _attempt_in(folder: str, cell: Cell, known: set[str]) -> Outcome:
+    """Run a cell in a folder, which all machines of a cluster share."""
+    os.chdir(folder)
+    return attempt(cell, known)
 
 
 def _hash(line: "CommandLine") -> str:
