@@ -100,7 +100,7 @@ class PretrainingData(pl.LightningDataModule):
 
     def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
         concepts = torch.tensor([self.domain.training_concepts.index(demonstrations.concepts[row]) for row in rows.tolist()])
-        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw), self.domain.early)
+        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw), self.domain.start_power(self.horizon))
         states, initial = demonstrations.windows(rows, starts, self.horizon)
         return Batch(states, concepts, initial)
 

@@ -214,6 +214,10 @@ class Domain:
     omega: str = "1.2"
     published_omega: str = "1.2"
 
+    def start_power(self, window: int) -> float:
+        """:attr:`early` for windows that reach over the whole behaviour, 1 for shorter ones: all times of it are alike to them."""
+        return self.early if window >= self.horizon else 1.0
+
     @property
     def table(self) -> Path:
         """The shipped table of concept embeddings, in the domain's folder."""

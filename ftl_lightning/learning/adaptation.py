@@ -26,12 +26,17 @@ class Adaptation(pl.LightningModule, ABC):
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
     """
 
+    kinds: tuple[str, ...]
+    """Of models that can be adapted so."""
     learns = False
     """Whether concepts are learned by gradient descent, for which there are training steps."""
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
         self.model = load_model(pretrained)
+        if self.model.kind not in self.kinds:
+            expected = " or ".join(self.kinds)
+            raise UserError(f"model.pretrained: expected a model of kind {expected}, found {self.model.kind} in {pretrained}")
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
         self._found: dict[str, Concept] = {}
@@ -57,6 +62,7 @@ class Adaptation(pl.LightningModule, ABC):
         self.concepts = data.concepts
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
             raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
+        self._found = {}
         self.domain = data.domain
         self.demonstrations: Demonstrations = data.demonstrations
         self.model.encode_initial(self.demonstrations.first_initial_states)  # a wrong size is told before anything is learned

@@ -13,6 +13,7 @@ from ftl_lightning.domains.domain import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.concept_model import TextConceptModel
 from ftl_lightning.seeding import generator
 
 FINAL_SAMPLES = 128
@@ -48,6 +49,7 @@ class InversionModule(Adaptation):
         seed: decides starts, noise and timesteps.
     """
 
+    kinds = ("diffusion", "bc", "cvae")
     learns = True
     strict_loading = False
 
@@ -75,6 +77,10 @@ class InversionModule(Adaptation):
             raise UserError(f"model.components: expected 1 or more, found {components}")
         if not 0 <= off_span <= 1:
             raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {off_span}")
+        if off_span < 1 and not isinstance(self.model, TextConceptModel):
+            raise UserError(
+                f"model.off_span: expected 1 (free) for {self.model.name}, whose concepts are no texts, found {off_span}"
+            )
         if timestep_power < 1:
             raise UserError(f"model.timestep_power: expected 1 or more, found {timestep_power}")
         for name, value in (("restarts", restarts), ("samples", samples)):
@@ -103,8 +109,11 @@ class InversionModule(Adaptation):
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
-        if "embeddings" in self._parameters:
-            return
+        if "embeddings" not in self._parameters:
+            with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
+                self._configure()
+
+    def _configure(self) -> None:
         super().configure_model()
         components, omega = self.hparams["components"], self.hparams["omega"]
         runs = len(self.concepts) * self.restarts
@@ -141,7 +150,7 @@ class InversionModule(Adaptation):
         noise = self.model.noise(samples, self.hparams["timestep_power"], draw)
         rows = self._rows(samples).flatten()
         share = torch.rand(samples, generator=draw, device=self.device).cpu().repeat(runs)
-        starts = self.demonstrations.starts(rows, share, self.domain.early)
+        starts = self.demonstrations.starts(rows, share, self.domain.start_power(self.model.window))
         states, initial = self.demonstrations.windows(rows, starts, self.model.window)
         initial = None if initial is None else initial.to(self.device)
         states, initial = self.model.perturbed(states.to(self.device), initial, draw)

@@ -97,8 +97,11 @@ class Pretraining(pl.LightningModule, ABC):
 
     def configure_model(self) -> None:
         """Build the layers once the data are known. Does nothing the second time."""
-        if "model" in self._modules:
-            return
+        if "model" not in self._modules:
+            with torch.device("cpu"):  # where the data are; Lightning moves the layers afterwards
+                self._configure()
+
+    def _configure(self) -> None:
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, PretrainingData):
             raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
@@ -223,7 +226,7 @@ class Pretraining(pl.LightningModule, ABC):
 
     def _signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
-        different = ("training", "training_concepts", "entities", "looks", "view", "perturb", "state_columns", "prediction")
+        different = ("training", "training_concepts", "entities", "looks", "perturb", "state_columns")
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
 
 

@@ -85,9 +85,7 @@ def test_plans_are_unrolled_state_by_state_and_straight_between(stride: int, cal
 
 
 def test_a_plan_that_no_state_can_be_unrolled_from_is_refused() -> None:
-    with pytest.raises(
-        UserError, match=r"model.plan_horizon: expected at most 2 states \(initial states of domain agent hold no state"
-    ):
+    with pytest.raises(UserError, match=r"model.plan_horizon: expected 2 states, and stride 1 \(initial states of domain agent"):
         StepConfig(**(AGENT | {"state_columns": ()}), horizon=3, concept_dim=2, training_concepts=TEXTS)  # type: ignore[arg-type]
 
 
@@ -206,7 +204,7 @@ def test_a_baselines_window_must_hold_a_transition(capsys: pytest.CaptureFixture
 def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = str(CONF / "baseline" / "in_context" / "invert" / "agent.yaml")
     assert main(["invert", "--config", config, f"--model.pretrained={tiny}"]) == 2
-    assert "expected an in-context model, found diffusion" in capsys.readouterr().err
+    assert "expected a model of kind in-context, found diffusion" in capsys.readouterr().err
 
 
 LANGUAGE = str(CONF / "baseline" / "language" / "invert" / "agent.yaml")

@@ -1,5 +1,7 @@
 """How a model may see a drive: as it stands in files, or in steps."""
 
+import itertools
+
 import torch
 from torch import Tensor
 
@@ -14,7 +16,8 @@ def _encode_steps(states: Tensor, initial_states: Tensor) -> Tensor:
 
 def _decode_steps(steps: Tensor, initial_states: Tensor) -> Tensor:
     """The inverse."""
-    return initial_states[:, None, :STATE] + steps.cumsum(dim=1)
+    # Not cumsum, which has no deterministic form on GPUs.
+    return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=initial_states[:, :STATE]))[1:], dim=1)
 
 
 VIEWS = {"steps": View(encode=_encode_steps, decode=_decode_steps, observe=lambda initial_states: initial_states)}

@@ -60,12 +60,12 @@ def _observe_from_ego(initial_states: Tensor) -> Tensor:
 
 def _known(initial_states: Tensor) -> Tensor:
     """Whether the place on the map is ``(sample, 1)``: the road is one of pretraining, and it was not hidden."""
-    return (initial_states[:, :1] > 0) & KNOWN[initial_states[:, OBSERVED].long(), None]
+    return (initial_states[:, :1] > 0) & KNOWN.to(initial_states.device)[initial_states[:, OBSERVED].long(), None]
 
 
 def _seconds(step: int, initial_states: Tensor) -> Tensor:
     """Between the state that comes before a plan's step and the one there ``(sample, 1)``: a plan's first is the present."""
-    return SECONDS[initial_states[:, OBSERVED].long(), None] * min(step, 1)
+    return SECONDS.to(initial_states.device)[initial_states[:, OBSERVED].long(), None] * min(step, 1)
 
 
 def _encode_steps(states: Tensor, initial_states: Tensor) -> Tensor:

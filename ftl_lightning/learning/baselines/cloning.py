@@ -24,7 +24,7 @@ class CloningConfig(StepConfig):
     Attributes:
         hidden_dim: width of the hidden layer.
         members: networks that differ in their initial weights. Each is deterministic; samples take turns among them (the paper
-            averages over seeds).
+            averages over seeds), and episodes are driven by the first.
     """
 
     hidden_dim: int = 512

@@ -81,16 +81,34 @@ class InContextModel(ConceptModel):
     def window(self) -> int:
         return self.config.window
 
-    def prompts(self, demonstrations: Demonstrations) -> Tensor:
-        """Each demonstration as the model reads it ``(demo, n)``."""
+    def prompts(self, demonstrations: Demonstrations, hide: bool = False) -> Tensor:
+        """Each demonstration as the model reads it ``(demo, n)``.
+
+        Args:
+            demonstrations: with initial states at every time.
+            hide: as if it were not known where they are, if the model's view can hide that.
+
+        Raises:
+            UserError: where initial states are known for the first time alone.
+        """
+        if demonstrations.initial_states is None or demonstrations.initial_states.dim() != 3:
+            raise UserError("key 'initial_states': expected one for each time (demo, time, initial state), found others")
         tokens, stride = self.config.tokens, self.config.stride
         rows = torch.arange(len(demonstrations)).repeat_interleave(tokens)
         starts = (stride * torch.arange(tokens)).repeat(len(demonstrations))
         states, initial = demonstrations.windows(rows, starts.minimum(demonstrations.lengths[rows] - 1), self.window)
+        assert initial is not None
+        states, initial = states.to(self.device), initial.to(self.device)
+        if hide:
+            assert self.view is not None
+            assert self.view.perturb is not None
+            states, initial = self.view.perturb(
+                states, initial, torch.tensor([[0.0, -1.0]], device=self.device).expand(len(states), 2)
+            )
         observed = self.encode_initial(initial)
         assert observed is not None
         read = torch.cat((observed, self.encode(states[:, ::stride], initial)[:, -1]), dim=-1)
-        return read.unflatten(0, (-1, tokens)).flatten(1)
+        return read.unflatten(0, (-1, tokens)).flatten(1).cpu()
 
     def read(self, prompts: Tensor, given: Tensor) -> Tensor:
         """Memory ``(group, K (tokens + 1), width)`` of the demonstrations ``prompts (group, K, n)`` where ``given (group, K)``."""
@@ -195,6 +213,8 @@ class InContextPretraining(Pretraining):
         expect_window(config, data)
         model = InContextModel(config, normalization, torch.zeros(len(embeddings), size), initial_normalization)
         self._prompts = model.prompts(data.training)
+        # Roads are hidden from whole prompts, as they are from a present in each of two windows.
+        self._hidden = model.prompts(data.training, hide=True) if config.perturb else self._prompts
         texts = data.training.concepts
         self._own = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
         model.training_embeddings.copy_(self._prompts[[own[0] for own in self._own]])
@@ -213,7 +233,9 @@ class InContextPretraining(Pretraining):
         rows = [[own[int(u * len(own))] for u in torch.rand(most, generator=draw, device=draw.device)] for own in self._own]
         counts = torch.randint(1, most + 1, (groups, 1), generator=draw, device=draw.device) if model.training else most
         given = torch.arange(most, device=draw.device).expand(groups, most) < counts
-        memory = model.read(self._prompts[torch.tensor(rows)].to(draw.device), given)
+        hidden = torch.rand((groups, 1, 1), generator=draw, device=draw.device) < 0.5
+        shown, other = (prompts[torch.tensor(rows)].to(draw.device) for prompts in (self._prompts, self._hidden))
+        memory = model.read(torch.where(hidden, other, shown), given)
         # The queries of each concept are a row of one batch, padded to the longest.
         queries = [(batch.concepts == group).nonzero()[:, 0] for group in range(groups)]
         index = nn.utils.rnn.pad_sequence(queries, batch_first=True, padding_value=-1)

@@ -20,7 +20,7 @@ class LanguageAdaptation(Adaptation):
         pretrained: folder of our pretrained model.
         omega: guidance weight of the description.
         encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`; the one behind the pretrained
-            model, but no table, which knows no new sentences.
+            model. The table knows no new sentences.
         output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
         seed: of the evaluation's rows.
 
@@ -28,6 +28,7 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or another encoder.
     """
 
+    kinds = ("diffusion",)
     method = "language"
 
     def __init__(
@@ -41,8 +42,6 @@ class LanguageAdaptation(Adaptation):
     ) -> None:
         super().__init__(pretrained, omega, output)
         self.save_hyperparameters()
-        if not isinstance(self.model, GenerativeModel):
-            raise UserError(f"model.pretrained: expected a diffusion model, found {self.model.kind} in {pretrained}")
         self._encoder = load_encoder(encoder, load_domain(self.model.config.domain).table, revision)
         if (found := self._encoder.identity) != self.model.config.encoder:
             raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {found!r}")

@@ -3,7 +3,6 @@
 import torch
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.baselines.in_context import InContextModel
 
@@ -17,13 +16,12 @@ class InContextAdaptation(Adaptation):
         seed: of the evaluation's rows.
     """
 
+    kinds = ("in-context",)
     method = "in-context"
 
     def __init__(self, pretrained: str, output: str | None = None, seed: int = 0) -> None:
         super().__init__(pretrained, 1.0, output)
         self.save_hyperparameters()
-        if not isinstance(self.model, InContextModel):
-            raise UserError(f"model.pretrained: expected an in-context model, found {self.model.kind} in {pretrained}")
 
     def learned(self) -> dict[str, Concept]:
         found = {}

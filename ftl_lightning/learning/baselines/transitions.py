@@ -24,10 +24,10 @@ class StepConfig(ModelConfig):
     def __post_init__(self) -> None:
         if self.stride < 1:
             raise UserError(f"model.stride: expected 1 or more, found {self.stride}")
-        if self.horizon > 1 + self.stride and not self.state_columns:
+        if self.horizon > 1 and (self.horizon, self.stride) != (2, 1) and not self.state_columns:
             raise UserError(
-                f"model.plan_horizon: expected at most {1 + self.stride} states (initial states of domain {self.domain} hold no "
-                f"state from which a longer plan could be unrolled), found {self.horizon}"
+                f"model.plan_horizon: expected 2 states, and stride 1 (initial states of domain {self.domain} hold no state from "
+                f"which a longer plan could be unrolled), found {self.horizon} and {self.stride}"
             )
 
     @property
@@ -62,7 +62,7 @@ def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], init
     config = model.config
     assert isinstance(config, StepConfig)
     first = model.decode(predict(model.encode_initial(initial_states)), initial_states)
-    if config.horizon <= 2:
+    if config.horizon == 1 or (config.horizon, config.stride) == (2, 1):
         return first
     assert initial_states is not None
     states, present = [initial_states[:, config.state_columns], first[:, -1]], initial_states.clone()
