@@ -1,5 +1,6 @@
 """Ablations: grids of configurations, each run through the same verbs as by hand, skipping what the results hold already."""
 
+import importlib
 import itertools
 import json
 import os
@@ -19,6 +20,7 @@ from ftl_lightning.errors import UserError
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ftl_lightning.learning.adaptation import Adaptation
     from ftl_lightning.lightning_cli import CommandLine
 
 
@@ -106,8 +108,8 @@ def run_ablation(
     from ftl_lightning.evaluation.results import add_rows
 
     plan = [[cell for seed in seeds for cell in stage.cells(seed)] for stage in stages]
-    check([cell for cells in plan for cell in cells])
     plan = _part(plan, shard)
+    check([cell for cells in plan for cell in cells])
     total, number, failed = sum(map(len, plan)), 0, []
     start = time.monotonic()
     with _executor(executor) as run:
@@ -136,7 +138,8 @@ def _part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Refuse cells that cannot run, before any does: files, keys, methods, domains, suites, encoders and pretrained models.
+    """Refuse cells that cannot run, before any does: for their files, keys, encoders and, of ``invert``, domains, suites and
+    pretrained models.
 
     Raises:
         UserError: naming them.
@@ -166,18 +169,33 @@ def _check(cell: Cell, made: set[str]) -> None:
     config = parse(cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
     if cell.verb == "fit":
+        load_encoder(data["encoder"], Path(), data["revision"])
         return
+    if "pretrained" not in model or "domain" not in data:
+        raise UserError(
+            f"verb: {cell.config}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)"
+        )
     domain = load_domain(data["domain"])
     for key, names in (("evaluation.suites", config["evaluation"]["suites"]), ("data.suite", [data["suite"]])):
         if unknown := set(names) - set(domain.suites):
             expected = ", ".join(domain.suites)
             raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")
     if model["pretrained"] not in made:
-        found = read_config(model["pretrained"])["domain"]
-        if found != domain.name:
-            raise UserError(f"model.pretrained: expected a model of {domain.name}, found one of {found} in {model['pretrained']}")
+        kinds = _class(config["model"]["class_path"]).kinds
+        found = read_config(model["pretrained"])
+        if found["domain"] != domain.name or found["kind"] not in kinds:
+            raise UserError(
+                f"model.pretrained: expected a model of {domain.name} ({' or '.join(kinds)}), found one of {found['domain']} "
+                f"({found['kind']}) in {model['pretrained']}"
+            )
     if "encoder" in model:
         load_encoder(model["encoder"], domain.table, model["revision"])
+
+
+def _class(path: str) -> type["Adaptation"]:
+    module, _, name = path.rpartition(".")
+    found: type[Adaptation] = getattr(importlib.import_module(module), name)
+    return found
 
 
 Run = Callable[[Sequence[Cell], set[str]], Iterator[tuple[Cell, Outcome]]]

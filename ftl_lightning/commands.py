@@ -238,7 +238,7 @@ def ablate(
         stages: verbs with grids of options, in order.
         results: results file that rows are added to.
         seeds: each stage runs once a seed.
-        shard: "3/8" for the third of eight parts; stages that others need are run before.
+        shard: "3/8" for the third of eight parts; models that it needs and does not make itself must be there.
         executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
     """
     from ftl_lightning.ablation import run_ablation

@@ -138,16 +138,24 @@ def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], 
         with_options(quick, **{"evaluation.suites": ["paper", "exam"]}),
         with_options(quick, **{"model.tempo": 3}),
         with_options(quick, **{"data.domain": "driving", "evaluation.closed_loop": True}),
+        {"verb": "invert", "config": str(CONF / "agent.yaml")},
+        {
+            "verb": "invert",
+            "config": f"{CONF}/baseline/in_context/invert/agent.yaml",
+            "options": {"model.pretrained": f"{ROOT}/pretrained/agent"},
+        },
         method,
     ]
     assert main(["ablate", "--config", plan("a.yaml", quick, *wrong)]) == 2
     told = capsys.readouterr().err
-    assert "6 of 7 cells cannot run, none was started" in told
+    assert "8 of 9 cells cannot run, none was started" in told
     for part in (
         "nowhere/config.json: expected a pretrained model",
         "evaluation.suites: expected some of training, paper, components, validation (domain object_rearrangement), found exam",
         "tempo",
-        "model.pretrained: expected a model of driving, found one of object_rearrangement",
+        "expected a model of driving (diffusion or bc or cvae), found one of object_rearrangement (diffusion)",
+        "agent.yaml: expected the configuration of an adaptation (invert), found that of a pretraining (fit)",
+        "expected a model of agent (in-context), found one of agent (diffusion)",
         "telepathy/invert/driving.yaml: expected a configuration file, found nothing",
         "holds bc, cvae, in_context, language",
         "pretrained/baseline/bc/driving/config.json: expected a pretrained model",

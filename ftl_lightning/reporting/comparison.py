@@ -75,7 +75,7 @@ def beside(number: Number, theirs: Published | None) -> list[str]:
 
 
 def lead(rows: pd.DataFrame, metric: str) -> tuple[float, float] | None:
-    """Ours less the best baseline, and its standard error; negative where a baseline is better.
+    """Ours less the best baseline, and its standard error; negative where a baseline is better. ``None`` of a single difference.
 
     Differences are taken task for task; of a single task, seed for seed.
 
@@ -91,7 +91,7 @@ def lead(rows: pd.DataFrame, metric: str) -> tuple[float, float] | None:
         return None
     best = max(others, key=lambda name: means[name].mean())
     differences = (means[OURS] - means[best]).dropna()
-    return float(differences.mean()), standard_error(differences.tolist())
+    return (float(differences.mean()), standard_error(differences.tolist())) if len(differences) > 1 else None
 
 
 def overview(results: pd.DataFrame) -> Table:

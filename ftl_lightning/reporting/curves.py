@@ -15,6 +15,9 @@ USUAL = {"demonstrations": 5, "K": 2}
 def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
     """The rows of a domain's main metric in which what else could grow is as usual.
 
+    Demonstrations grow with the main tables' guidance weight, components with learned weights: with a fixed one for each, guidance
+    would grow with them. Settings that start where the demonstrations did are left out: they have no more samples than these.
+
     Args:
         domain: the domain.
         results: rows of the results file.
@@ -22,7 +25,9 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
     """
     rows = latest(results[(results["domain"] == domain.name) & (results["K"] > 0) & (results["demonstrations"] > 0)])
     metric = ACCURACY if domain.succeeded else EXECUTED
-    return rows[(rows["metric"] == metric) & (rows[AXES[axis]] == USUAL[AXES[axis]])]
+    omega = domain.omega if axis == "demonstrations" else "learned"
+    own = (rows["metric"] == metric) & (rows[AXES[axis]] == USUAL[AXES[axis]]) & (rows["omega"] == omega)
+    return rows[own & (rows["n"] > rows["demonstrations"])]
 
 
 def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
@@ -33,5 +38,5 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
         for setting in dict.fromkeys(rows["setting"]):
             numbers = [summarise(rows[(rows["setting"] == setting) & (rows[axis] == count)]) for count in counts]
             lines.append([setting, axis, *(MISSING if number is None else str(number) for number in numbers)])
-    caption = f"{domain.name}: as demonstrations (with K = 2) and components K (from five demonstrations) grow"
+    caption = f"{domain.name}: as demonstrations (with K = 2) and components K (from five demonstrations, learned weights) grow"
     return Table("curves", caption, pd.DataFrame(lines, columns=["setting", "of", *map(str, counts)], dtype=str))

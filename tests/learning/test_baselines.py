@@ -230,7 +230,7 @@ def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[s
     for path in Path("c").iterdir():
         concept = Concept.load(path)
         assert concept.embeddings.shape == (1, model.config.concept_dim)
-        assert concept.weights.tolist() == [pytest.approx(0.6)]
+        assert concept.weights.tolist() == [pytest.approx(1.2)]
 
 
 def test_a_table_knows_no_new_sentences(tiny: Path) -> None:

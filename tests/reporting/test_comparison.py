@@ -45,8 +45,10 @@ def results(tmp_path: Path) -> Path:
     rows = [row(method, task, value) for method, values in METHODS.items() for task, value in zip("ab", values, strict=True)]
     rows += [row("random scenes", task, 0.15, K=0, omega="") for task in "ab"]
     append_rows(tmp_path / "r" / "comparison.csv", rows)
-    grown = [row("FTL-IGM (free)", "a", 0.1 * count, K=2, demonstrations=count) for count in (1, 2, 5)]
-    append_rows(tmp_path / "r" / "curves.csv", [*grown, row("FTL-IGM (free)", "a", 0.7, K=4)])
+    grown = [row("FTL-IGM (free)", "a", 0.1 * count, K=2, omega="1.2", demonstrations=count) for count in (1, 2, 5)]
+    wider = [row("FTL-IGM (free)", "a", value, K=K, omega="learned") for K, value in ((2, 0.5), (4, 0.7))]
+    few = row("FTL-IGM (free)", "b", 0.0, K=2, omega="1.2", n=5)  # starts where the demonstrations did
+    append_rows(tmp_path / "r" / "curves.csv", [*grown, *wider, few])
     return tmp_path / "r"
 
 
@@ -76,6 +78,7 @@ def test_the_lead_is_taken_task_for_task() -> None:
     )
     assert lead(one, "accuracy") == pytest.approx((0.15, 0.05))  # a single task: seed for seed
     assert lead(rows[rows["family"] != "FTL-IGM"], "accuracy") is None
+    assert lead(rows[rows["task"] == "a"], "accuracy") is None  # of a single difference nobody knows the error
 
 
 def test_the_overview_fits_on_one_screen_and_says_who_is_ahead(results: Path) -> None:
@@ -109,7 +112,7 @@ def test_ablations_comparison_and_curves_are_not_mixed(results: Path, capsys: py
     append_rows(results / "own.csv", [row("FTL-IGM (free)", "a", 0.33, K=2, omega="1.2")])
     assert set(read_study(results)["value"]) == {0.33}
     assert len(read_study(results, "comparison")) == 10
-    assert len(read_rows(results)) == 15
+    assert len(read_rows(results)) == 17
     assert read_study(results, "nothing").empty
     assert main(["report", f"--results={results}", "--out=out"]) == 0
     written = {path.name for path in Path("out").rglob("*")}
