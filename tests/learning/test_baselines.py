@@ -207,6 +207,39 @@ def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pyte
     assert "expected a model of kind in-context, found diffusion" in capsys.readouterr().err
 
 
+def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    fit, adapt = (str(CONF / "baseline" / "in_context" / part) for part in ("driving.yaml", "invert/driving.yaml"))
+    assert main(["invert", "--config", fit, *QUIET]) == 2
+    assert "expected a module that adapts a pretrained model, found InContextPretraining" in capsys.readouterr().err
+    made = [
+        f"--model.pretrained={ROOT / 'pretrained' / 'baseline' / 'in_context' / 'driving'}",
+        "--data.demonstrations=drives.safetensors",
+    ]
+    drives = load_domain("driving").training_set(2, 0).select("merge")
+    drives.save("drives.safetensors")
+    assert main(["fit", "--config", adapt, *made, *QUIET]) == 2
+    assert "expected invert (model.class_path: InContextAdaptation learns nothing), found fit" in capsys.readouterr().err
+    replace(drives, initial_states=drives.first_initial_states).save("drives.safetensors")
+    assert main(["invert", "--config", adapt, *made, *QUIET]) == 2
+    assert "key 'initial_states': expected one for each time" in capsys.readouterr().err
+
+
+def test_short_windows_start_anywhere_and_long_ones_early() -> None:
+    domain = load_domain("agent")
+    assert [domain.start_power(window) for window in (2, 9, domain.horizon)] == [1.0, 1.0, 3.0]
+
+
+def test_prompts_can_hide_the_road() -> None:
+    model = load_model(ROOT / "pretrained" / "baseline" / "in_context" / "driving")
+    assert isinstance(model, InContextModel)
+    drives = load_domain("driving").training_set(1, 0)
+    shown, hidden = (model.prompts(drives, hide=hide).unflatten(-1, (model.config.tokens, -1)) for hide in (False, True))
+    place = [0, 1, 2, 3]  # of what the view observes: place, and place with what is far squashed
+    assert (hidden[..., place] == hidden[0, 0, place]).all()  # nowhere
+    assert not (shown[..., place] == hidden[..., place]).all()
+    assert torch.allclose(shown[..., 4], hidden[..., 4], atol=1e-5)  # the speed stays
+
+
 LANGUAGE = str(CONF / "baseline" / "language" / "invert" / "agent.yaml")
 
 
