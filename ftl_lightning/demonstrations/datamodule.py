@@ -61,6 +61,8 @@ class PretrainingData(pl.LightningDataModule):
         steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
         encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`.
         horizon: states in a plan; ``None`` for the domain's.
+        early: how much more often windows start early in a demonstration; ``None`` for the domain's rule
+            (:meth:`~ftl_lightning.domains.domain.Domain.start_power`).
     """
 
     def __init__(
@@ -74,9 +76,13 @@ class PretrainingData(pl.LightningDataModule):
         encoder: str,
         revision: str,
         horizon: int | None = None,
+        early: float | None = None,
     ) -> None:
         super().__init__()
         self.horizon = domain.horizon if horizon is None else horizon
+        self.early = domain.start_power(self.horizon) if early is None else early
+        if self.early < 1:
+            raise UserError(f"data.early: expected 1 or more, found {early}")
         for name, value in (("batch_size", batch_size), ("steps_per_epoch", steps_per_epoch), ("horizon", self.horizon)):
             if value < 1:
                 raise UserError(f"data.{name}: expected 1 or more, found {value}")
@@ -100,7 +106,7 @@ class PretrainingData(pl.LightningDataModule):
 
     def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
         concepts = torch.tensor([self.domain.training_concepts.index(demonstrations.concepts[row]) for row in rows.tolist()])
-        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw), self.domain.start_power(self.horizon))
+        starts = demonstrations.starts(rows, torch.rand(len(rows), generator=draw), self.early)
         states, initial = demonstrations.windows(rows, starts, self.horizon)
         return Batch(states, concepts, initial)
 

@@ -16,6 +16,8 @@ class AgentData(PretrainingData):
         encoder: ``'table'``, ``'minilm'``, or the name or path of a language model.
         revision: of a Hugging Face model.
         horizon: states in a plan; ``None`` for the paper's 128.
+        early: windows start early in a drive: with 3 half of them in its first eighth. ``None`` for 3 where they reach over a whole
+            drive, and 1 where they are shorter.
     """
 
     def __init__(
@@ -28,8 +30,18 @@ class AgentData(PretrainingData):
         encoder: str = "table",
         revision: str = "main",
         horizon: int | None = None,
+        early: float | None = None,
     ) -> None:
         super().__init__(
-            DOMAIN, samples_per_concept, validation_per_concept, seed, batch_size, steps_per_epoch, encoder, revision, horizon
+            DOMAIN,
+            samples_per_concept,
+            validation_per_concept,
+            seed,
+            batch_size,
+            steps_per_epoch,
+            encoder,
+            revision,
+            horizon,
+            early,
         )
         self.save_hyperparameters()
