@@ -241,7 +241,7 @@ def ablate(
         shard: "3/8" for the third of eight parts; models that it needs and does not make itself must be there.
         executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
     """
-    from ftl_lightning.ablation import run_ablation
+    from ftl_lightning.ablation.run import run_ablation
 
     run_ablation(stages, seeds, results, shard, executor)
 

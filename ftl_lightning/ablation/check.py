@@ -1,0 +1,74 @@
+"""What is wrong with a plan, told before any of it runs."""
+
+import importlib
+from argparse import ArgumentError
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ftl_lightning.ablation.plan import Cell
+from ftl_lightning.errors import UserError
+
+if TYPE_CHECKING:
+    from ftl_lightning.learning.adaptation import Adaptation
+
+
+def check(cells: Sequence[Cell]) -> None:
+    """Refuse cells that cannot run, before any does: for their files, keys, encoders and, of ``invert``, domains, suites and
+    pretrained models.
+
+    Raises:
+        UserError: naming them.
+    """
+    made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
+    mistakes = {}
+    for cell in cells:
+        try:
+            _check(cell, made)
+        except (UserError, ArgumentError) as error:
+            mistakes[str(cell)] = " ".join(str(error).split())
+    if mistakes:
+        told = dict.fromkeys(mistakes.values())
+        raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(told)}")
+
+
+def _check(cell: Cell, made: set[str]) -> None:
+    from ftl_lightning.concepts.encoder import load_encoder
+    from ftl_lightning.domains.domain import load_domain
+    from ftl_lightning.learning.concept_model import read_config
+    from ftl_lightning.lightning_cli import parse
+
+    if not Path(cell.config).is_file():
+        folder = next(parent for parent in Path(cell.config).parents if parent.is_dir())
+        there = ", ".join(sorted(entry.name for entry in folder.iterdir()))
+        raise UserError(f"config: {cell.config}: expected a configuration file, found nothing; {folder} holds {there}")
+    config = parse(cell.arguments)
+    model, data = config["model"]["init_args"], config["data"]["init_args"]
+    if cell.verb == "fit":
+        load_encoder(data["encoder"], Path(), data["revision"])
+        return
+    if "pretrained" not in model or "domain" not in data:
+        raise UserError(
+            f"verb: {cell.config}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)"
+        )
+    domain = load_domain(data["domain"])
+    for key, names in (("evaluation.suites", config["evaluation"]["suites"]), ("data.suite", [data["suite"]])):
+        if unknown := set(names) - set(domain.suites):
+            expected = ", ".join(domain.suites)
+            raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")
+    if model["pretrained"] not in made:
+        kinds = _class(config["model"]["class_path"]).kinds
+        found = read_config(model["pretrained"])
+        if found["domain"] != domain.name or found["kind"] not in kinds:
+            raise UserError(
+                f"model.pretrained: expected a model of {domain.name} ({' or '.join(kinds)}), found one of {found['domain']} "
+                f"({found['kind']}) in {model['pretrained']}"
+            )
+    if "encoder" in model:
+        load_encoder(model["encoder"], domain.table, model["revision"])
+
+
+def _class(path: str) -> type["Adaptation"]:
+    module, _, name = path.rpartition(".")
+    found: type[Adaptation] = getattr(importlib.import_module(module), name)
+    return found

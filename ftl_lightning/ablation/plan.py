@@ -1,0 +1,76 @@
+"""The plan of an ablation: stages as they stand in a configuration file, and the cells that they come to."""
+
+import itertools
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ftl_lightning.errors import UserError
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One verb with a grid of options. ``{seed}`` in any value stands for the seed, ``{name}`` for a value of ``each``.
+
+    Attributes:
+        verb: ``fit`` or ``invert``.
+        config: its configuration file.
+        each: names with a list of texts each, which stand in the other values; the stage runs for their product.
+        options: that all cells share, by their names on the command line.
+        grid: options with a list of values each; the cells are their product.
+        done: a file whose presence means that the stage need not run, such as a pretrained model; empty for never. It is the
+            file alone that counts: remove it after a change of the stage's configuration.
+    """
+
+    verb: Literal["fit", "invert"]
+    config: str
+    each: Mapping[str, list[str]] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    grid: Mapping[str, list[Any]] = field(default_factory=dict)
+    done: str = ""
+
+    def cells(self, seed: int) -> Iterator["Cell"]:
+        """Every cell for one seed."""
+        for texts in itertools.product(*self.each.values()):
+            names = {"seed": str(seed), **dict(zip(self.each, texts, strict=True))}
+            for values in itertools.product(*self.grid.values()):
+                options = {**self.options, **dict(zip(self.grid, values, strict=True))}
+                told = {key: _text(value, names) for key, value in options.items()}
+                yield Cell(self.verb, _text(self.config, names), told, _text(self.done, names))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run: a verb, its configuration file, options, and the file that says that it need not run."""
+
+    verb: Literal["fit", "invert"]
+    config: str
+    options: Mapping[str, str]
+    done: str
+
+    @property
+    def arguments(self) -> list[str]:
+        """As on the command line, without the verb."""
+        return [f"--config={self.config}", *(f"--{key}={value}" for key, value in self.options.items())]
+
+    def __str__(self) -> str:
+        return " ".join((self.verb, *self.arguments))
+
+
+def _text(value: Any, names: Mapping[str, str]) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    for name, standing in names.items():
+        text = text.replace(f"{{{name}}}", standing)
+    return text
+
+
+def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
+    """Of every stage the cells of a shard: each so-manieth."""
+    found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
+    if not found or int(found[1]) > int(found[2]):
+        raise UserError(f"shard: expected 'number/shards' such as 3/8, found {shard!r}")
+    number, shards = int(found[1]), int(found[2])
+    position = itertools.count()
+    return [[cell for cell in cells if next(position) % shards == number - 1] for cells in plan]
