@@ -109,6 +109,7 @@ class ClosedLoop:
         frames: ``(observations (time, m), plans (step, horizon, state) that were followed) -> pictures (height, width, 3)`` of an
             episode.
         headline: what of that the method and others are compared by, episode for episode.
+        costs: of what of that less is better.
         policies: policies to print beside every rate: name to ``(goal, initial states (episode, m), demonstrations that the
             behaviour was learned from or None, seed) -> policy``, or ``None`` where it would take too long.
     """
@@ -119,6 +120,7 @@ class ClosedLoop:
     judge: Callable[[str, Tensor, Sequence[Mapping[str, Any]]], dict[str, Tensor]]
     frames: Callable[[Tensor, Tensor], list[NDArray[np.uint8]]]
     headline: str = "success"
+    costs: tuple[str, ...] = ()
     policies: Mapping[str, Callable[[str, Tensor, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
 
 

@@ -13,8 +13,6 @@ LANGUAGE = "language"
 METHODS = (OURS, "BC", "CVAE", "in-context", LANGUAGE)
 RESOLUTION = 0.005
 """What is nearer than that looks the same in the table."""
-LOWER = (f"{CLOSED} crash",)
-"""Metrics of which less is better."""
 
 
 def family(method: str) -> str:
@@ -79,17 +77,17 @@ def beside(number: Number, theirs: Published | None) -> list[str]:
     return [f"{number.mean:.2f}", error, spread, paper(theirs), difference_to(theirs, number)]
 
 
-def lead(rows: pd.DataFrame, metric: str, others: Sequence[str] = METHODS[1:]) -> tuple[float, float] | None:
+def lead(rows: pd.DataFrame, less: bool = False, others: Sequence[str] = METHODS[1:]) -> tuple[float, float] | None:
     """Ours less the best baseline, and its standard error; negative where a baseline is better. ``None`` of a single difference.
 
     Differences are taken task for task; of a single task, seed for seed.
 
     Args:
         rows: of one setting and metric, see :func:`compared`.
-        metric: of which more is better, unless it is one of :data:`LOWER`.
+        less: of the metric less is better.
         others: baselines that are compared with.
     """
-    sign = -1 if metric in LOWER else 1
+    sign = -1 if less else 1
     by = "task" if len(set(rows["task"])) > 1 else "seed"
     means = sign * rows.pivot_table(index=by, columns="family", values="value")
     others = [name for name in others if name in means]
@@ -112,9 +110,10 @@ def overview(results: pd.DataFrame) -> Table:
             for metric in metrics(domain):
                 own = rows[(rows["setting"] == setting) & (rows["metric"] == metric)]
                 if not own.empty:
+                    less = domain.closed_loop is not None and metric.removeprefix(f"{CLOSED} ") in domain.closed_loop.costs
                     cells = [_cell(domain, own, method, setting, metric) for method in METHODS]
                     around = references[(references["setting"] == setting) & (references["metric"] == metric)]
-                    lines.append([name, f"{setting}, {metric}", *cells, _lead(lead(own, metric, others)), _around(around)])
+                    lines.append([name, f"{setting}, {metric}", *cells, _lead(lead(own, less, others)), _around(around)])
     caption = "Ours and the baselines, mean ± standard error over tasks [the paper's]; then ours less the best baseline"
     return Table(
         "overview",

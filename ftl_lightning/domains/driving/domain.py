@@ -83,6 +83,7 @@ DOMAIN = Domain(
         judge=judge,
         frames=frames,
         headline="strict success",
+        costs=("crash",),
         policies=policies.POLICIES,
     ),
     published=PUBLISHED,
