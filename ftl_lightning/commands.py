@@ -7,7 +7,13 @@ from ftl_lightning.ablation import Stage
 
 
 def generate(
-    domain: str, task: str = "", count: int = 100, seed: int = 0, workers: int = 1, out: str = "demonstrations.safetensors"
+    domain: str,
+    task: str = "",
+    count: int = 100,
+    seed: int = 0,
+    workers: int = 1,
+    out: str = "demonstrations.safetensors",
+    root: str = "",
 ) -> None:
     """Draw demonstrations of a task into a file.
 
@@ -18,8 +24,9 @@ def generate(
         seed: the same seed gives the same bytes.
         workers: processes, in domains whose expert takes long; a run that was stopped goes on where it was.
         out: file to write.
+        root: folder of your copy of the data, for domains whose demonstrations do not ship.
     """
-    from ftl_lightning.domains.domain import load_domain
+    from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.errors import UserError
 
     if count < 1:
@@ -28,10 +35,11 @@ def generate(
         raise UserError(f"seed: expected 0 or more, found {seed}")
     if workers < 1:
         raise UserError(f"workers: expected 1 or more, found {workers}")
-    source = load_domain(domain)
-    demonstrations = source.generate(task, count, seed, workers) if task else source.training_set(count, seed)
+    found = load_domain(domain)
+    source = found.source(Path(root) if root else None)
+    demonstrations = source.draw(task, count, seed, workers) if task else source.split("train", count, seed)
     demonstrations.save(out)
-    print(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(source.training_concepts)} training concepts'}")
+    print(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
 
 
 def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: str = "") -> None:
@@ -44,11 +52,15 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
         out: file to write; empty for the table that ships with the domain.
     """
     from ftl_lightning.concepts.encoder import load_encoder, write_table
-    from ftl_lightning.domains.domain import load_domain
+    from ftl_lightning.domains.registry import load_domain
 
-    source = load_domain(domain)
-    path = Path(out) if out else source.table
-    write_table(path, load_encoder(encoder, source.table, revision), source.descriptions)
+    from ftl_lightning.errors import UserError
+
+    concepts = load_domain(domain).concepts
+    if not out and concepts.table is None:
+        raise UserError(f"out: expected a file to write, found none: domain {domain} names no table of its own")
+    path = Path(out) if out else Path(str(concepts.table))
+    write_table(path, load_encoder(encoder, concepts.table, revision), concepts.descriptions)
     print(path)
 
 
@@ -58,29 +70,29 @@ def sample(
     compose: str = "",
     count: int = 50,
     seed: int = 0,
-    sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddpm",
-    steps: int = 100,
-    temperature: float = 0.1,
+    sampler: Literal["", "ddpm", "ddim", "dpm_solver"] = "",
+    steps: int = 0,
+    temperature: float = -1.0,
     goal: str = "",
     initial: str = "",
     out: str = "states.safetensors",
     figure: str = "",
     execute: bool = False,
-    replan: int = 8,
+    replan: int = 0,
     animation: str = "",
 ) -> None:
     """Generate behaviour from a learned concept, composed with training concepts.
 
     Args:
-        pretrained: folder of the pretrained model.
+        pretrained: folder of the pretrained model, or the name of one that ships.
         concept: file of a learned concept; empty for training concepts alone.
         compose: what is composed with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9". Training
             concepts, or files of learned concepts, whose own weights are multiplied. A weight may be left out and is 1 then.
         count: samples.
         seed: of the samples.
-        sampler: see ftl_lightning.diffusion.samplers.
-        steps: of the sampler.
-        temperature: the paper's alpha; lower is less diverse and more accurate.
+        sampler: see ftl_lightning.diffusion.samplers; empty for the one that the domain's configuration of invert names.
+        steps: of the sampler; 0 likewise.
+        temperature: the paper's alpha; lower is less diverse and more accurate; negative likewise.
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
             drawn from the seed.
         initial: demonstrations file whose initial states are used instead; one sample of each.
@@ -88,114 +100,66 @@ def sample(
         figure: picture to write, .png or .svg.
         execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
             episodes ended.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
-        animation: .gif to write of the first executed episode.
+        replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 likewise.
+        animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
     """
-    import torch
+    from dataclasses import replace
 
-    from ftl_lightning.concepts.composition import parse_composition
-    from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.demonstrations.container import Demonstrations
-    from ftl_lightning.diffusion.samplers import SAMPLERS
-    from ftl_lightning.domains.domain import load_domain
     from ftl_lightning.errors import UserError
-    from ftl_lightning.evaluation.closed_loop import Following, planner, roll_out, sampled_plans
-    from ftl_lightning.evaluation.tensorboard import gif
-    from ftl_lightning.learning.pretrained import load_model
-    from ftl_lightning.seeding import generator
+    from ftl_lightning.evaluation.tensorboard import captioned, gif
+    from ftl_lightning.few_shot import FewShot
     from ftl_lightning.tensor_file import atomic
 
-    model = load_model(pretrained)
-    domain = load_domain(model.config.domain)
-    if count < 1:
-        raise UserError(f"count: expected 1 or more, found {count}")
-    if model.max_steps is not None and not 1 <= steps <= model.max_steps:
-        raise UserError(f"steps: expected 1 to {model.max_steps} (the model's T), found {steps}")
-    if seed < 0 or temperature < 0:
-        raise UserError(f"seed, temperature: expected 0 or more, found {min(seed, temperature)}")
-    if goal and not domain.reads(goal):
+    for name, path, endings in (("animation", animation, (".gif",)), ("figure", figure, (".png", ".svg", ".pdf"))):
+        if path and Path(path).suffix not in endings:
+            raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
+    if seed < 0 or count < 1 or steps < 0 or replan < 0:
+        raise UserError(f"seed, steps, replan, count: expected 0 or more, and 1 sample, found {seed}, {steps}, {replan}, {count}")
+    model = FewShot.from_pretrained(pretrained)
+    domain = model.domain
+    if goal and not domain.concepts.reads(goal):
         raise UserError(f"goal: expected a task of {domain.name}, found {goal!r}")
-    if replan < 1:
-        raise UserError(f"replan: expected 1 or more, found {replan}")
-    if animation and not (execute and animation.endswith(".gif")):
-        raise UserError(f"animation: expected a name that ends in .gif, and --execute true, found {animation!r}")
     if execute and domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
-    if figure and Path(figure).suffix not in (".png", ".svg", ".pdf"):
-        raise UserError(f"figure: expected a name that ends in .png, .svg or .pdf, found {figure!r}")
+    if animation and not execute and domain.show.film is None:
+        raise UserError(f"animation: expected --execute true, since plans of {domain.name} are not filmed, found {animation!r}")
+    starts = None
     if initial:
-        given = Demonstrations.load(initial)
-        starts = given.first_initial_states
-        count = len(given)
-    elif domain.initial_states is None:
-        starts = None
-    elif goal:
-        starts = domain.initial_states(goal, count, seed)
-    else:
-        raise UserError(
-            f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
-        )
-    model.encode_initial(starts)
-    embeddings, weights = [], []
-    for name, weight in [*parse_composition(compose), *([(concept, 1.0)] if concept else [])]:
-        if name == concept or name.endswith(".safetensors"):
-            learned = Concept.load(name)
-            model.check(learned, name)
-            embeddings += list(learned.embeddings)
-            weights += (weight * learned.weights).tolist()
-        else:
-            embeddings.append(model.concept(name))
-            weights.append(weight)
-    if not embeddings:
-        raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
-    states = model.sample(
-        [torch.stack(embeddings)],
-        [torch.tensor(weights)],
-        count,
-        SAMPLERS[sampler],
-        steps,
-        temperature,
-        [generator("cpu", seed)],
-        starts,
-    )[0]
-    result = Demonstrations(
-        states=states,
-        lengths=torch.full((count,), model.config.horizon),
-        domain=domain.name,
-        state_names=domain.state_names,
-        state_units=domain.state_units,
-        concepts=(goal,) * count,
-        initial_states=starts,
-        provenance={"pretrained": model.hash, "concept": concept, "compose": compose, "seed": seed, "temperature": temperature},
+        starts = Demonstrations.load(initial).fitted(domain.observed).initial_states
+    elif domain.observed:
+        if not goal:
+            raise UserError(
+                f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
+            )
+        starts = domain.source(None).starts(goal, count, seed)
+    chosen = {"sampler": sampler or None, "steps": steps or None, "temperature": None if temperature < 0 else temperature}
+    changes = {name: value for name, value in chosen.items() if value is not None}
+    composition = model.compose(" + ".join(part for part in (compose, concept) if part))
+    plans = model.sample(composition, count, starts, seed=seed, **changes)
+    plans = replace(
+        plans, concepts=(goal,) * len(plans), provenance={**plans.provenance, "concept": concept, "compose": compose}
     )
-    result.save(out)
-    print(f"{out}: {count} samples")
-    right = domain.succeeded(goal, states, starts) if goal and domain.succeeded else None
-    if right is not None:
-        print(f"accuracy on '{goal}': {right.float().mean():.2f}")
+    plans.save(out)
+    print(f"{out}: {len(plans)} samples")
+    if goal and domain.metrics:
+        for name, value in model.evaluate(plans, goal).items():
+            print(f"{name} on '{goal}': {value:.2f}")
     if figure:
         with atomic(figure) as temporary:
-            domain.render(states, None if right is None else right.tolist(), goal or "samples", starts).savefig(temporary, dpi=110)
+            model.render(plans, goal).savefig(temporary, dpi=110)
         print(figure)
-    if execute and domain.closed_loop is not None and starts is not None:
-        plan = sampled_plans(
-            model,
-            [torch.stack(embeddings)] * count,
-            [torch.tensor(weights)] * count,
-            SAMPLERS[sampler],
-            steps,
-            temperature,
-            [generator("cpu", seed, 1, episode) for episode in range(count)],
-        )
-        policy = Following(plan, planner(model, domain.closed_loop), replan)
-        rollout = roll_out(domain.closed_loop, starts, policy)
-        if goal:
-            for name, values in domain.closed_loop.judge(goal, rollout.observations, rollout.infos).items():
-                print(f"closed loop, {name}: {values.float().mean():.2f} of {count} episodes")
+    if execute and starts is not None:
+        done = model.execute(composition, starts, goal, replan=replan or None, seed=seed, **changes)
+        for name, value in done.outcomes.items():
+            print(f"closed loop, {name}: {value:.2f} of {len(starts)} episodes")
         if animation:
-            with atomic(animation) as temporary:
-                temporary.write_bytes(gif(domain.closed_loop.frames(rollout.observations[0], torch.stack(policy.followed[0]))))
+            done.save(animation)
             print(animation)
+    elif animation and domain.show.film:
+        with atomic(animation) as temporary:
+            temporary.write_bytes(gif(captioned(domain.show.film(plans.states[0]), goal or Path(concept).stem)))
+        print(animation)
 
 
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:

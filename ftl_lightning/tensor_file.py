@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ftl_lightning.errors import UserError
 
 _HEADER = "ftl_lightning"
 FORMAT = 1
-"""Version of the file form; a reader refuses others."""
+"""Version of a file's form, unless its kind has versions of its own; a reader refuses others."""
 
 
 @contextmanager
@@ -58,30 +58,38 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> bytes:
+def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any], version: int = FORMAT) -> bytes:
     """A safetensors file with a JSON header; the same content gives the same bytes.
 
     Args:
         kind: what the file is, checked when it is read.
         tensors: by name.
         header: anything JSON can hold.
+        version: of the form of this kind of file.
     """
     # One metadata key: safetensors does not keep the order of several, and bytes would differ from run to run.
-    text = json.dumps({"kind": kind, "format": FORMAT, **header}, sort_keys=True)
+    text = json.dumps({"kind": kind, "format": version, **header}, sort_keys=True)
     return safetensors.torch.save({name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}, {_HEADER: text})
 
 
-def save_tensors(path: str | Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+def save_tensors(
+    path: str | Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any], version: int = FORMAT
+) -> None:
     """Write what :func:`serialise` makes of its arguments, whole or not at all."""
     with atomic(path) as temporary:
-        temporary.write_bytes(serialise(kind, tensors, header))
+        temporary.write_bytes(serialise(kind, tensors, header, version))
 
 
-def load_tensors(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,)) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what :func:`save_tensors` wrote.
 
+    Args:
+        path: the file.
+        kind: what it is expected to be.
+        versions: of the form of this kind that the caller reads.
+
     Returns:
-        Tensors by name, and the header.
+        Tensors by name, and the header with the file's version as ``format``.
 
     Raises:
         UserError: for a file that is missing, damaged, or of another kind.
@@ -98,8 +106,9 @@ def load_tensors(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     found = header.get("kind")
     if found != kind:
         raise UserError(f"{path}: expected a {kind} file, found {f'a {found} file' if found else 'a file of other software'}")
-    if header.get("format") != FORMAT:
-        raise UserError(f"{path}: key 'format': expected {FORMAT}, found {header.get('format')!r}; it is of another version")
+    if header.get("format") not in versions:
+        expected = " or ".join(map(str, versions))
+        raise UserError(f"{path}: key 'format': expected {expected}, found {header.get('format')!r}; it is of another version")
     return tensors, header
 
 

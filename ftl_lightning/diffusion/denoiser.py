@@ -1,10 +1,14 @@
 """What every denoiser takes: the domain's sizes, and features of the timestep."""
 
+import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+
+from ftl_lightning.demonstrations.features import Feature
 
 
 @dataclass(frozen=True)
@@ -15,17 +19,43 @@ class Sizes:
         horizon: states in a plan.
         state_dim: columns of a state.
         concept_dim: columns of a concept embedding.
-        initial_state_dim: columns of the initial state; 0 where the domain has none.
-        entities: columns of the initial state for each exchangeable entity, in the same order for each.
-        looks: which of an entity's columns, counted from its first, a concept asks for; all where empty.
+        observed: features that it is conditioned on, by name; empty where there are none.
     """
 
     horizon: int
     state_dim: int
     concept_dim: int
-    initial_state_dim: int = 0
-    entities: tuple[tuple[int, ...], ...] = ()
-    looks: tuple[int, ...] = ()
+    observed: Mapping[str, Feature] = field(default_factory=dict)
+
+    @property
+    def vector_dim(self) -> int:
+        """Columns of the observed vectors one after another."""
+        return sum(feature.size for feature in self._vectors)
+
+    @property
+    def entities(self) -> tuple[tuple[int, ...], ...]:
+        """Columns of each exchangeable entity in those."""
+        return tuple(tuple(start + column for column in own) for start, feature in self._placed for own in feature.entities)
+
+    @property
+    def attributes(self) -> tuple[int, ...]:
+        """Which of an entity's columns, counted from its first, a concept asks for; all where empty."""
+        return next((feature.attributes for feature in self._vectors if feature.attributes), ())
+
+    @property
+    def state_columns(self) -> tuple[int, ...]:
+        """Columns of the observed vectors that hold the state a plan starts from; none where they hold no such state."""
+        return tuple(start + column for start, feature in self._placed for column in feature.state)
+
+    @property
+    def _vectors(self) -> list[Feature]:
+        return [feature for feature in self.observed.values() if feature.kind == "vector"]
+
+    @property
+    def _placed(self) -> list[tuple[int, Feature]]:
+        """Each vector after the column at which it begins."""
+        sizes = [feature.size for feature in self._vectors]
+        return list(zip(itertools.accumulate(sizes, initial=0), self._vectors, strict=False))
 
 
 def sinusoidal_embedding(t: Tensor, dimension: int, period: float = 10_000.0) -> Tensor:

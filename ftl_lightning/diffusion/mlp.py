@@ -5,25 +5,26 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
-from ftl_lightning.diffusion.initial_state import initial_state_encoder
+from ftl_lightning.concepts.composition import Context
+from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.errors import UserError
 
 
 class MLPDenoiser(nn.Module):
-    """Estimates noise from the noisy plan, the timestep, the concept and, where there is one, the initial state.
+    """Estimates noise from the noisy plan, the timestep, the concept and, where there is something, what is observed.
 
     Timestep and concept scale and shift every hidden layer (FiLM, Perez et al., 2018), which gives inversion more to hold on
     to than a concept that is only concatenated to the input. Hidden layers are residual.
 
     Args:
-        sizes: of plans, concepts and initial states.
+        sizes: of plans, concepts and observed features.
         hidden_dim: width.
         depth: hidden layers.
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
         time_dim: features of the timestep; even.
         dropout: of the hidden layers, in training.
-        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.initial_state`.
-        initial_dim: features of the initial state.
+        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.conditions`.
+        initial_dim: features of what is observed.
     """
 
     def __init__(
@@ -44,15 +45,19 @@ class MLPDenoiser(nn.Module):
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, condition_dim), nn.SiLU())
         plan = sizes.horizon * sizes.state_dim
-        self.initial = initial_state_encoder(initial_encoder, sizes, initial_dim) if sizes.initial_state_dim else None
-        inputs = [plan + (initial_dim if sizes.initial_state_dim else 0)] + [hidden_dim] * (depth - 1)
+        self.initial = condition_encoder(initial_encoder, sizes, initial_dim) if sizes.vector_dim else None
+        inputs = [plan + (initial_dim if sizes.vector_dim else 0)] + [hidden_dim] * (depth - 1)
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
         self.time_film = nn.Linear(time_dim, 2 * hidden_dim * depth)
         self.concept_film = nn.Linear(condition_dim, 2 * hidden_dim * depth, bias=False)
         self.dropout = nn.Dropout(dropout)
         self.head = nn.Linear(hidden_dim, plan)
 
-    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
+    def observe(self, vector: Tensor | None) -> Context:
+        """What is read once a plan of the observed vectors ``(batch, m)``, normalised; nothing where there are none."""
+        return () if self.initial is None or vector is None else self.initial.observe(vector)
+
+    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
         """Estimated noise ``(batch, horizon, state)``.
 
         What depends on the concept alone, two thirds of the arithmetic, is computed once for each row of ``concepts``.
@@ -62,14 +67,13 @@ class MLPDenoiser(nn.Module):
             t: ``(batch,)`` int64.
             concepts: ``(concept, n)``, the different concepts in the batch, in the model's concept space.
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
-            initial_state: ``(batch, initial state)``, normalised, or ``None``.
+            context: what :meth:`observe` read.
         """
         by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(2 * len(self.layers), dim=-1)
         by_concept = self.concept_film(self.concept(concepts)).chunk(2 * len(self.layers), dim=-1)
         hidden = x.flatten(1)
         if self.initial is not None:
-            assert initial_state is not None
-            hidden = torch.cat((hidden, self.initial(initial_state, concepts[index])), dim=-1)
+            hidden = torch.cat((hidden, self.initial.attend(context, concepts[index])), dim=-1)
         for depth, layer in enumerate(self.layers):
             # Summed layer by layer: all layers at once would not fit into the processor's cache.
             scale, shift = (by_time[i] + by_concept[i][index] for i in (2 * depth, 2 * depth + 1))

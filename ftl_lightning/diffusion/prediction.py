@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.concepts.composition import Context
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
 from ftl_lightning.errors import UserError
 
@@ -24,10 +25,10 @@ class Prediction(nn.Module):
         net: a denoiser.
         kind: ``'v'``, ``'clean'`` or ``'displacement'``.
         diffusion_steps: T.
-        state_columns: columns of the initial state that hold the state a plan starts from, on the plan's scale.
+        state_columns: columns of the observed vectors that hold the state a plan starts from, on the plan's scale.
 
     Raises:
-        UserError: for a displacement where the initial state holds no state.
+        UserError: for a displacement where they hold no state.
     """
 
     alpha_bar: Tensor
@@ -35,19 +36,27 @@ class Prediction(nn.Module):
     def __init__(self, net: nn.Module, kind: str, diffusion_steps: int, state_columns: Sequence[int] = ()) -> None:
         super().__init__()
         if kind == "displacement" and not state_columns:
-            raise UserError("prediction: expected clean, found displacement: this domain's initial states hold no state")
+            raise UserError("prediction: expected clean, found displacement: what this domain observes holds no state")
         self.net, self.kind, self.state_columns = net, kind, list(state_columns)
         self.register_buffer("alpha_bar", cosine_alpha_bar(diffusion_steps), persistent=False)
 
-    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
+    def observe(self, vector: Tensor | None) -> Context:
+        """As the network, with the state that plans start from before it, if they are displacements."""
+        context: Context = self.net.observe(vector)  # type: ignore[operator]
+        if self.kind != "displacement":
+            return context
+        assert vector is not None
+        return (vector[:, self.state_columns], *context)
+
+    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
         """Estimated noise, as :data:`ftl_lightning.concepts.composition.Denoiser` says."""
         alpha_bar = self.alpha_bar[t][:, None, None]
-        out: Tensor = self.net(x, t, concepts, index, initial_state)
+        start, context = (context[0], context[1:]) if self.kind == "displacement" else (None, context)
+        out: Tensor = self.net(x, t, concepts, index, context)
         if self.kind == "v":
             return alpha_bar.sqrt() * out + (1 - alpha_bar).sqrt() * x
-        if self.kind == "displacement":
-            assert initial_state is not None
-            out = out + initial_state[:, None, self.state_columns]
+        if start is not None:
+            out = out + start[:, None]
         return (x - alpha_bar.sqrt() * out) / (1 - alpha_bar).sqrt()
 
 

@@ -8,13 +8,16 @@ the result.
 """
 
 import itertools
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.diffusion.schedule import clean_from_epsilon
+from ftl_lightning.errors import UserError
 
 Epsilon = Callable[[Tensor, Tensor], Tensor]
 Noise = Callable[[], Tensor]
@@ -90,3 +93,33 @@ def dpm_solver(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, te
 
 
 SAMPLERS: dict[str, Sampler] = {"ddpm": ddpm, "ddim": ddim, "dpm_solver": dpm_solver}
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How behaviour is generated.
+
+    Attributes:
+        sampler: a name of :data:`SAMPLERS`.
+        steps: of the sampler, from 1 to the model's T.
+        temperature: the paper's alpha, 0 or more; lower is more accurate and less diverse.
+
+    Raises:
+        UserError: at construction, for a value that is none.
+    """
+
+    sampler: str = "ddpm"
+    steps: int = 100
+    temperature: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.sampler not in SAMPLERS:
+            raise UserError(f"sampler: expected one of {', '.join(SAMPLERS)}, found {self.sampler!r}")
+        if self.steps < 1:
+            raise UserError(f"steps: expected 1 or more, found {self.steps}")
+        if not 0 <= self.temperature < math.inf:
+            raise UserError(f"temperature: expected 0 or more, found {self.temperature}")
+
+    def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
+        """Clean plans ``(batch, horizon, state)``, normalised; arguments as of :class:`Sampler`."""
+        return SAMPLERS[self.sampler](epsilon, noise, alpha_bar, self.steps, self.temperature)

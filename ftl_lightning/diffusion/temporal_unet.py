@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
-from ftl_lightning.diffusion.initial_state import initial_state_encoder
+from ftl_lightning.concepts.composition import Context
+from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.errors import UserError
 
 KERNEL, GROUPS = 5, 8
@@ -63,15 +64,15 @@ class Level(nn.Module):
 
 
 class TemporalUNet(nn.Module):
-    """Estimates noise from the noisy plan, the timestep, the concept and the initial state.
+    """Estimates noise from the noisy plan, the timestep, the concept and what is observed.
 
     Args:
-        sizes: of plans, concepts and initial states; the horizon is a multiple of 2 to the number of levels less one.
+        sizes: of plans, concepts and observed features; the horizon is a multiple of 2 to the number of levels less one.
         width: channels of the first level, and columns of each of the condition's three parts; the paper's size is 128.
         multipliers: channels of the levels, in widths.
-        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.initial_state`.
+        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.conditions`.
         film: the condition scales and shifts channels; false for the paper's form, which adds it.
-        broadcast: the initial state's features are also channels of the input at every time; false for the paper's form.
+        broadcast: the features of what is observed are also channels of the input at every time; false for the paper's form.
         clock: channels that tell a state's place in the plan, in addition to the states; even, 0 for the paper's form, whose
             convolutions see it by the padding at the ends alone.
 
@@ -102,13 +103,13 @@ class TemporalUNet(nn.Module):
             raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
         if clock % 2:
             raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
-        self.width, self.broadcast = width, broadcast and sizes.initial_state_dim > 0
+        self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
         angle = torch.linspace(0, math.pi, sizes.horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.initial = initial_state_encoder(initial_encoder, sizes, width) if sizes.initial_state_dim else None
-        condition = width * (3 if sizes.initial_state_dim else 2)
+        self.initial = condition_encoder(initial_encoder, sizes, width) if sizes.vector_dim else None
+        condition = width * (3 if sizes.vector_dim else 2)
         channels = [width * multiplier for multiplier in multipliers]
         self.down = nn.ModuleList(
             Level(inputs, outputs, condition, film)
@@ -122,7 +123,11 @@ class TemporalUNet(nn.Module):
         self.grow = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, stride=2, padding=1) for width in channels[-2::-1])
         self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, sizes.state_dim, 1))
 
-    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial_state: Tensor | None = None) -> Tensor:
+    def observe(self, vector: Tensor | None) -> Context:
+        """What is read once a plan of the observed vectors ``(batch, m)``, normalised; nothing where there are none."""
+        return () if self.initial is None or vector is None else self.initial.observe(vector)
+
+    def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
         """Estimated noise ``(batch, horizon, state)``.
 
         Args:
@@ -130,12 +135,11 @@ class TemporalUNet(nn.Module):
             t: ``(batch,)`` int64.
             concepts: ``(concept, n)``, the different concepts in the batch, in the model's concept space.
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
-            initial_state: ``(batch, initial state)``, normalised, or ``None``.
+            context: what :meth:`observe` read.
         """
         parts = [self.time(sinusoidal_embedding(t, self.width)), self.concept(concepts)[index]]
         if self.initial is not None:
-            assert initial_state is not None
-            parts.append(self.initial(initial_state, concepts[index]))
+            parts.append(self.initial.attend(context, concepts[index]))
         condition = functional.mish(torch.cat(parts, dim=-1))
         inputs = [x.transpose(1, 2), self.clock.expand(len(x), -1, -1)]
         if self.broadcast:

@@ -1,7 +1,5 @@
-"""What a domain is: one object with a handful of members. Adding a domain adds a folder with such an object."""
+"""What a domain is: one object in a few groups. Adding a domain adds a folder, here or in a package of one's own, with such an object."""
 
-import importlib
-import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,89 +7,118 @@ from typing import Any, Literal, Protocol
 
 import gymnasium
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.errors import UserError
+from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
+from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.tasks import Suite
+
+ACCURACY = "accuracy"
+SUCCESS = "success"
+CLOSED = "closed loop"
+EXECUTED = f"{CLOSED} {SUCCESS}"
+Split = Literal["train", "validation"]
+Frames = list[NDArray[np.uint8]]
+"""Pictures ``(height, width, 3)``."""
 
 
 @dataclass(frozen=True)
-class EvaluationTask:
-    """One bar of a chart: behaviour to generate and the goal it is judged by.
+class Plans:
+    """The behaviour that is generated.
 
     Attributes:
-        setting: the paper's name of the group it is averaged in, e.g. ``'training composition'``.
-        goal: the task in words, as :attr:`Domain.succeeded` reads it.
-        learned: name of the learned concept that is used, or ``None``.
-        texts: training concepts that are composed in.
-        component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
-        initial: where behaviour starts, in domains with initial states: in new ones, or in those of the demonstrations that the
-            concept was learned from.
+        horizon: number of states in a plan.
+        columns, units: name and unit of each column of a state.
+        start_exponent: exponent u of the windows' starts in a demonstration, ``start = length * share^u``, for windows as long as a
+            plan: 1 is uniform; 3 where a plan reaches over the whole behaviour, so that the first window matters most. Shorter
+            windows start anywhere: all times are alike to them.
     """
 
-    setting: str
-    goal: str
-    learned: str | None = None
-    texts: tuple[str, ...] = ()
-    component: int | None = None
-    initial: Literal["new", "demonstrated"] = "new"
+    horizon: int
+    columns: tuple[str, ...]
+    units: tuple[str, ...]
+    start_exponent: float = 1.0
 
-    @property
-    def name(self) -> str:
-        """Its name within its setting."""
-        return self.goal if self.component is None else f"{self.goal} (learned from: {self.learned})"
+    def exponent(self, window: int) -> float:
+        """That of windows of this length."""
+        return self.start_exponent if window >= self.horizon else 1.0
 
 
 @dataclass(frozen=True)
-class Suite:
-    """Evaluation tasks that are reported together."""
-
-    tasks: tuple[EvaluationTask, ...]
-
-    @property
-    def learned(self) -> tuple[str, ...]:
-        """Names of the concepts to learn, each once, in order."""
-        return tuple(dict.fromkeys(task.learned for task in self.tasks if task.learned))
-
-    @property
-    def settings(self) -> tuple[str, ...]:
-        """Names of the settings, each once, in order."""
-        return tuple(dict.fromkeys(task.setting for task in self.tasks))
-
-
-OURS = "FTL-IGM"
-"""The name of the paper's method; what a method's tables tell of it in brackets is not part of its name."""
-
-
-@dataclass(frozen=True)
-class Published:
-    """A number of the paper, to be shown beside ours.
+class Concepts:
+    """The behaviour's concepts, in words.
 
     Attributes:
-        setting: as in :class:`EvaluationTask`.
-        value: accuracy in [0, 1].
-        error: standard error over tasks; ``None`` for a single task or where it is not reported.
-        components: K.
-        omega: the fixed weight as text, or ``'learned'``.
-        task: name of the evaluation task; ``''`` for the mean of the setting.
-        metric: as in a row of the results.
-        method: ours, or a baseline's name.
+        training: descriptions of the behaviours of pretraining.
+        suites: what is evaluated, by name: ``'training'`` (training concepts), ``'paper'`` (final evaluation only),
+            ``'validation'`` (for tuning), or any other.
+        descriptions: every text that the table of embeddings holds besides the empty one.
+        reads: whether a text is a goal that behaviour can be judged by.
+        sentence: how a goal is told to a language model.
+        table: file of the embeddings of all descriptions, made by ``encode``; ``None`` where none ships.
     """
 
-    setting: str
-    value: float
-    error: float | None = None
-    components: int = 2
-    omega: str = "learned"
-    task: str = ""
-    metric: str = "accuracy"
-    method: str = OURS
+    training: tuple[str, ...]
+    suites: Mapping[str, Suite]
+    descriptions: tuple[str, ...]
+    reads: Callable[[str], bool]
+    sentence: Callable[[str], str] = str
+    table: Path | None = None
 
 
-Policy = Callable[[Tensor, list[int], int], Tensor]
-"""``(observations (episode, m), which episodes, step) -> actions (episode, action)``; not finite where there is none."""
+class Source(Protocol):
+    """Where demonstrations come from: an expert, a generator, a folder of files."""
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """``count`` demonstrations of every training concept; those of ``'validation'`` are in no training split."""
+        ...
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        """Demonstrations of any task; the same task, count and seed give the same bytes, whatever the number of processes."""
+        ...
+
+    def starts(self, task: str, count: int, seed: int) -> InitialStates | None:
+        """New initial states of a task; ``None`` where behaviour has none."""
+        ...
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How generated plans are judged.
+
+    Attributes:
+        measure: ``(goal, states (sample, horizon, state), initial states or None) -> (sample,)`` of bool (right or wrong) or of
+            numbers; or a single number ``()`` for the whole set, such as a distance of distributions.
+        less_is_better: whether a smaller value is better.
+        identity: what decides the values besides the code, such as the hash of a trained judge's weights; empty for a rule.
+    """
+
+    measure: Callable[[str, Tensor, InitialStates | None], Tensor]
+    less_is_better: bool = False
+    identity: str = ""
+
+
+@dataclass(frozen=True)
+class Show:
+    """Pictures of plans.
+
+    Attributes:
+        picture: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title, initial states or
+            None) -> figure``.
+        film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is no motion.
+    """
+
+    picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], Figure]
+    film: Callable[[Tensor], Frames] | None = None
+
+
+Policy = Callable[[Observed, list[int], int], Tensor]
+"""``(observed (episode, *shape) by name, which episodes, step) -> actions (episode, action)``; not finite where there is none."""
 
 
 @dataclass(frozen=True)
@@ -99,35 +126,27 @@ class ClosedLoop:
     """How a domain executes plans.
 
     Attributes:
-        environment: makes an environment whose observation is an initial state ``(m,)`` and whose ``reset`` takes one as
-            ``options={'initial_state': ...}``. What its last step tells (``info``) is what ``judge`` knows besides observations.
-        act: the planner, ``(plans (episode, horizon, state), steps since they were made, observations (episode, m)) ->
+        environment: makes an environment whose observations are the domain's observed features by name, and whose ``reset`` takes
+            ``options={'scene': (scene,)}``. What its last step tells (``info``) is what ``judge`` knows besides them.
+        act: the planner, ``(plans (episode, horizon, state), steps since they were made, observed (episode, *shape) by name) ->
             actions (episode, action)``.
         steps: at most, of an episode.
-        judge: ``(goal, observations (episode, time, m), what the environment told at the end of each) -> what happened``, by name
-            ``(episode,)``; ``'success'``, of bool, is the paper's metric. Observations are padded with the last one.
-        frames: ``(observations (time, m), plans (step, horizon, state) that were followed) -> pictures (height, width, 3)`` of an
-            episode.
-        headline: what of that the method and others are compared by, episode for episode.
-        costs: of what of that less is better.
-        policies: policies to print beside every rate: name to ``(goal, initial states (episode, m), demonstrations that the
-            behaviour was learned from or None, seed) -> policy``, or ``None`` where it would take too long.
+        judge: ``(goal, rollout) -> what happened``, by name ``(episode,)``; ``'success'``, of bool, is the paper's metric.
+        film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``.
+        keeps: observed features that ``judge`` and ``film`` ask for; all where empty.
+        less_is_better: of which outcomes less is better.
+        policies: policies to print beside every rate: name to ``(goal, initial states, demonstrations that the behaviour was
+            learned from or None, seed) -> policy``, or ``None`` where it would take too long.
     """
 
     environment: Callable[[], gymnasium.Env[Any, Any]]
-    act: Callable[[Tensor, int, Tensor], Tensor]
+    act: Callable[[Tensor, int, Observed], Tensor]
     steps: int
-    judge: Callable[[str, Tensor, Sequence[Mapping[str, Any]]], dict[str, Tensor]]
-    frames: Callable[[Tensor, Tensor], list[NDArray[np.uint8]]]
-    headline: str = "success"
-    costs: tuple[str, ...] = ()
-    policies: Mapping[str, Callable[[str, Tensor, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
-
-
-class Generate(Protocol):
-    """Draws demonstrations; the same task, count and seed give the same bytes, whatever the number of processes."""
-
-    def __call__(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations: ...
+    judge: Callable[[str, Rollout], dict[str, Tensor]]
+    film: Callable[[Rollout, Tensor], Frames]
+    keeps: tuple[str, ...] = ()
+    less_is_better: tuple[str, ...] = ()
+    policies: Mapping[str, Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -135,22 +154,24 @@ class View:
     """How a model sees behaviour, where it is not as it stands in files.
 
     Attributes:
-        encode: ``(states (sample, horizon, state), initial states (sample, m)) -> (sample, horizon, state)``.
+        features: what the model observes, by name.
+        observe: observed features of the domain to those.
+        encode: ``(states (sample, horizon, state), observed) -> (sample, horizon, state)``.
         decode: its inverse.
-        observe: ``initial states (sample, m) -> (sample, what the model is conditioned on)``.
-        perturb: ``(states (sample, horizon, state), initial states (sample, m), normal noise (sample, 2)) -> both``, as if the
-            present had been a little different; ``None`` where that is not known. A model that has learned the ways back from
-            there does not get lost where its demonstrations never were.
+        perturb: ``(states, observed, generator) -> both``, as if the present had been a little different: training on perturbed
+            starts teaches recovery from states outside the demonstrations. Without a generator, only what a new task will not
+            show is hidden. ``None`` where neither is known.
         act: as of :class:`ClosedLoop`, for a planner that looks at behaviour likewise; ``None`` for the domain's.
-        alike: groups of columns of a state, in the same order: those in the same place of each share a scale.
+        scales: groups of columns of a state, in the same order: those in the same place of each share a scale.
     """
 
-    encode: Callable[[Tensor, Tensor], Tensor]
-    decode: Callable[[Tensor, Tensor], Tensor]
-    observe: Callable[[Tensor], Tensor]
-    perturb: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
-    act: Callable[[Tensor, int, Tensor], Tensor] | None = None
-    alike: tuple[tuple[int, ...], ...] = ()
+    features: Mapping[str, Feature]
+    observe: Callable[[Observed], Observed]
+    encode: Callable[[Tensor, Observed], Tensor]
+    decode: Callable[[Tensor, Observed], Tensor]
+    perturb: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
+    act: Callable[[Tensor, int, Observed], Tensor] | None = None
+    scales: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -158,86 +179,42 @@ class Domain:
     """A domain.
 
     Attributes:
-        name: folder name under ``ftl_lightning/domains``.
-        horizon: number of states in a generated plan.
-        state_names, state_units: one entry a column of a state.
-        training_concepts: descriptions of the behaviours of pretraining.
-        suites: by name: ``'training'`` (training concepts), ``'paper'`` (final evaluation only), ``'validation'`` (for tuning)
-            and any other, such as ``'components'`` (what each learned component generates alone).
-        descriptions: every text that the shipped table of embeddings holds besides the empty one.
-        training_set: ``(samples per concept, seed) -> demonstrations`` of every training concept.
-        generate: demonstrations of any task of the domain's grammar.
-        reads: whether a text is a goal that behaviour can be judged by.
-        succeeded: ``(goal, states (sample, horizon, state), initial states (sample, m) or None) -> (sample,)`` of bool, the paper's
-            metric of plans; ``None`` where only what comes of them is judged.
-        render: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title, initial states
-            (sample, m) or None) -> figure``.
-        references: trivial policies to print beside every rate: name to ``(goal, samples, initial states (sample, m) or None, seed)
+        name: as in ``load_domain``.
+        plans: the behaviour that is generated.
+        concepts: what it is told by.
+        source: makes the source of demonstrations, given the folder of a user's data or ``None``.
+        show: pictures of it.
+        observed: features that a plan is conditioned on, by name; empty where behaviour has no initial state.
+        metrics: of plans, by name; the first is what ablations are about. None where only what comes of plans is judged.
+        headline: what methods are compared by, task for task: a metric's name, or ``'closed loop '`` and an outcome's.
+        references: trivial policies and oracles to print beside every rate: name to ``(goal, samples, initial states or None, seed)
             -> states (sample, horizon, state)``.
-        initial_states: ``(task, count, seed) -> (count, m)``, new initial states of a task; ``None`` where behaviour has none.
-        views: by name, how a model may see behaviour; without any, as it is. The columns below are of what it sees.
-        entities: columns of an initial state for each of its exchangeable entities, in the same order for each; the other columns
-            say nothing about a single entity.
-        looks: which of an entity's columns, counted from its first, a concept asks for when it names an entity; all where empty.
-        state_columns: columns of an initial state that hold the state a plan starts from, in a state's order; none where it
-            holds no such state.
-        early: how much more often windows start early in a demonstration, see
-            :meth:`~ftl_lightning.demonstrations.container.Demonstrations.starts`; 3 where a plan reaches over the whole
-            behaviour, so that the first one matters most, 1 where it is short.
+        views: by name, how a model may see behaviour; without any, as it is.
         closed_loop: how plans are executed; ``None`` where they cannot be.
-        sentence: how a task is told to a language model, in the paper's words.
-        published: the paper's numbers for this domain.
-        omega: the fixed guidance weight of two learned components in our main tables, as text.
-        published_omega: that of the paper's main figures.
+        paper: the paper's numbers, if it has any.
     """
 
     name: str
-    horizon: int
-    state_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    training_concepts: tuple[str, ...]
-    suites: Mapping[str, Suite]
-    descriptions: tuple[str, ...]
-    training_set: Callable[[int, int], Demonstrations]
-    generate: Generate
-    reads: Callable[[str], bool]
-    succeeded: Callable[[str, Tensor, Tensor | None], Tensor] | None
-    render: Callable[[Tensor, Sequence[bool] | None, str, Tensor | None], Figure]
-    references: Mapping[str, Callable[[str, int, Tensor | None, int], Tensor]] = field(default_factory=dict)
-    initial_states: Callable[[str, int, int], Tensor] | None = None
+    plans: Plans
+    concepts: Concepts
+    source: Callable[[Path | None], Source]
+    show: Show
+    observed: Mapping[str, Feature] = field(default_factory=dict)
+    metrics: Mapping[str, Metric] = field(default_factory=dict)
+    headline: str = ACCURACY
+    references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
     views: Mapping[str, View] = field(default_factory=dict)
-    entities: tuple[tuple[int, ...], ...] = ()
-    looks: tuple[int, ...] = ()
-    state_columns: tuple[int, ...] = ()
-    early: float = 1.0
     closed_loop: ClosedLoop | None = None
-    sentence: Callable[[str], str] = lambda goal: goal
-    published: tuple[Published, ...] = ()
-    omega: str = "1.2"
-    published_omega: str = "1.2"
-
-    def start_power(self, window: int) -> float:
-        """:attr:`early` for windows that reach over the whole behaviour, 1 for shorter ones: all times of it are alike to them."""
-        return self.early if window >= self.horizon else 1.0
+    paper: Paper | None = None
 
     @property
-    def table(self) -> Path:
-        """The shipped table of concept embeddings, in the domain's folder."""
-        return Path(__file__).parent / self.name / "embeddings.safetensors"
+    def main_metric(self) -> str:
+        """What ablations are about: the first metric of plans, or success where only what comes of them is judged."""
+        return next(iter(self.metrics), EXECUTED)
 
-
-def domain_names() -> tuple[str, ...]:
-    """The domains that are installed: the folders beside this file."""
-    return tuple(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if module.ispkg)
-
-
-def load_domain(name: str) -> Domain:
-    """Import a domain by the name of its folder.
-
-    Raises:
-        UserError: if there is none of that name.
-    """
-    if name not in domain_names():
-        raise UserError(f"domain: expected one of {', '.join(domain_names())}, found {name!r}")
-    domain: Domain = importlib.import_module(f"ftl_lightning.domains.{name}").DOMAIN
-    return domain
+    def less_is_better(self, metric: str) -> bool:
+        """Whether a smaller value of a metric, or of an outcome in closed loop, is better."""
+        outcome = metric.removeprefix(f"{CLOSED} ")
+        if outcome != metric:
+            return self.closed_loop is not None and outcome in self.closed_loop.less_is_better
+        return metric in self.metrics and self.metrics[metric].less_is_better

@@ -1,10 +1,8 @@
 """Executing plans: environments step in lock-step, their plans are made in one batch (paper, 'closed loop')."""
 
-import itertools
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -13,53 +11,36 @@ import torch
 from rich.progress import Progress
 from torch import Tensor
 
-from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import InitialStates, Observed, moved, take
+from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop, Policy
+from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.learning.concept_model import ConceptModel
 
 _LOG = logging.getLogger(__name__)
 
-Plan = Callable[[Tensor, list[int]], Tensor]
-"""``(observations (episode, m), which episodes) -> plans (episode, horizon, state)``."""
+Planner = Callable[[Tensor, int, Observed], Tensor]
+"""``(plans (episode, horizon, state), steps since they were made, observed) -> actions (episode, action)``."""
+MakePlans = Callable[[Observed, list[int]], Tensor]
+"""``(observed (episode, *shape) by name, which episodes) -> plans (episode, horizon, state)``."""
 SIDE_BY_SIDE = 64
 """Episodes that run together: a simulator takes tens of megabytes, and a larger batch makes no plan faster."""
 
 
-@dataclass(frozen=True)
-class Rollout:
-    """What happened.
-
-    Attributes:
-        observations: ``(episode, steps + 1, m)``, padded with an episode's last one.
-        failed: ``(episode,)`` of bool: the policy had no finite action or the environment raised an error; the episode ended there.
-        infos: what the environment told of each episode's last step, by name.
-    """
-
-    observations: Tensor
-    failed: Tensor
-    infos: list[dict[str, Any]]
-
-    def split(self, counts: Sequence[int]) -> list["Rollout"]:
-        """The same in parts of so many episodes."""
-        ends = list(itertools.accumulate(counts))
-        return [
-            Rollout(self.observations[start:end], self.failed[start:end], self.infos[start:end])
-            for start, end in zip([0, *ends], ends, strict=False)
-        ]
-
-
-def roll_out(loop: ClosedLoop, initial_states: Tensor, policy: Policy) -> Rollout:
-    """Run one episode from each initial state until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
+def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout:
+    """Run one episode from each scene until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
 
     Args:
         loop: the domain's environment.
-        initial_states: ``(episode, m)``.
+        starts: initial states with scenes.
         policy: acts in those episodes that still run.
     """
-    count = len(initial_states)
-    found = Rollout(
-        initial_states[:, None].repeat(1, loop.steps + 1, 1), torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)]
-    )
+    count, kept = len(starts), loop.keeps or tuple(starts.observed)
+    observed = {
+        name: starts.observed[name][:, None].repeat(1, loop.steps + 1, *(1,) * (starts.observed[name].dim() - 1)) for name in kept
+    }
+    found = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
     with Progress(transient=True) as progress:
         bar = progress.add_task(f"{count} episodes", total=loop.steps * math.ceil(count / SIDE_BY_SIDE))
         for rows in torch.arange(count).split(SIDE_BY_SIDE):
@@ -67,21 +48,40 @@ def roll_out(loop: ClosedLoop, initial_states: Tensor, policy: Policy) -> Rollou
     return found
 
 
+def reset(loop: ClosedLoop, scenes: Tensor) -> InitialStates:
+    """What is observed where an environment is reset to scenes ``(episode, scene)``."""
+    environment = loop.environment()
+    try:
+        seen = [environment.reset(options={"scene": scene.numpy()})[0] for scene in scenes]
+    finally:
+        environment.close()
+    return InitialStates({name: torch.stack([torch.as_tensor(one[name]) for one in seen]) for name in seen[0]}, scenes)
+
+
 def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy, advance: Callable[[], None]) -> None:
     """Run these episodes together, one step of each after the other, and fill in what happened."""
     environments: dict[int, gymnasium.Env[Any, Any]] = {}
-    observations = found.observations
+    scenes = found.starts.require_scenes()
+    # What is seen now, of every feature; a rollout keeps some of them.
+    now = {name: values[rows].clone() for name, values in found.starts.observed.items()}
+    place = {row: index for index, row in enumerate(rows)}
+
+    def see(row: int, step: int, seen: Observed) -> None:
+        for name, values in now.items():
+            values[place[row]] = torch.as_tensor(seen[name])
+            if name in found.observed:
+                found.observed[name][row, step:] = values[place[row]]
+
     try:
         for row in rows:
             environments[row] = loop.environment()
-            initial = observations[row, 0].numpy()
-            observations[row] = torch.as_tensor(environments[row].reset(options={"initial_state": initial})[0])
+            see(row, 0, environments[row].reset(options={"scene": scenes[row].numpy()})[0])
         active = rows
         for step in range(loop.steps):
             advance()
             if not active:
                 break
-            actions = policy(observations[active, step], active, step).numpy().astype(np.float32)
+            actions = policy(take(now, [place[row] for row in active]), active, step).numpy().astype(np.float32)
             going = []
             for row, action in zip(active, actions, strict=True):
                 if not np.isfinite(action).all():
@@ -94,7 +94,7 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                     found.failed[row] = True
                     _LOG.warning("episode %d, step %d: %s; the episode counts as failed", row, step, repr(error))
                     continue
-                observations[row, step + 1 :] = torch.as_tensor(seen)
+                see(row, step + 1, seen)
                 found.infos[row].update(info)
                 if not (terminated or truncated):
                     going.append(row)
@@ -104,11 +104,11 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
             environment.close()
 
 
-class Following:
+class PlanFollower:
     """The policy that follows plans. Where one holds a number that is not finite, there is no action.
 
     Args:
-        plan: makes plans.
+        make: makes plans.
         act: the domain's planner, see :class:`~ftl_lightning.domains.domain.ClosedLoop`.
         replan: steps that a plan is followed before a new one is made; the paper's number is 1.
 
@@ -116,54 +116,47 @@ class Following:
         followed: for each episode the plan ``(horizon, state)`` of each of its steps.
     """
 
-    def __init__(self, plan: Plan, act: Callable[[Tensor, int, Tensor], Tensor], replan: int) -> None:
-        self._plan, self._act, self._replan = plan, act, replan
+    def __init__(self, make: MakePlans, act: Planner, replan: int) -> None:
+        self._make, self._act, self._replan = make, act, replan
         self.followed: dict[int, list[Tensor]] = {}
 
-    def __call__(self, observations: Tensor, rows: list[int], step: int) -> Tensor:
+    def __call__(self, observed: Observed, rows: list[int], step: int) -> Tensor:
         age = step % self._replan
         if age == 0:
-            made = self._plan(observations, rows)
+            made = self._make(observed, rows)
             finite = made.isfinite().flatten(1).all(dim=1)
             plans = torch.where(finite[:, None, None], made, torch.nan)
         else:
             plans = torch.stack([self.followed[row][-1] for row in rows])
         for row, plan in zip(rows, plans, strict=True):
             self.followed.setdefault(row, []).append(plan)
-        return self._act(plans, age, observations)
+        return self._act(plans, age, observed)
 
 
 def sampled_plans(
-    model: ConceptModel,
-    concepts: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    sampler: Sampler,
-    steps: int,
-    temperature: float,
-    generators: Sequence[torch.Generator],
-) -> Plan:
-    """Plans from a model: composition, weights and noise are an episode's own, so that it does not depend on its neighbours.
+    model: ConceptModel, compositions: Sequence[Composition], sampling: Sampling, generators: Sequence[torch.Generator]
+) -> MakePlans:
+    """Plans from a model: composition and noise are an episode's own, so that it does not depend on its neighbours.
 
     Args:
         model: the model.
-        concepts, weights: of each episode, ``(K, n)`` and ``(K,)``.
-        sampler, steps, temperature: see :mod:`ftl_lightning.diffusion.samplers`.
+        compositions: of each episode, ``(K, n)``.
+        sampling: sampler, steps and temperature.
         generators: of each episode's noise.
     """
 
-    def plan(observations: Tensor, rows: list[int]) -> Tensor:
-        own, omega, draws = ([values[row] for row in rows] for values in (concepts, weights, generators))
-        seen = observations.to(model.device)
-        return model.sample(own, omega, 1, sampler, steps, temperature, draws, seen)[:, 0].cpu()  # type: ignore[arg-type]
+    def make(observed: Observed, rows: list[int]) -> Tensor:
+        own, draws = [compositions[row] for row in rows], [generators[row] for row in rows]
+        return model.sample(own, 1, sampling, draws, moved(observed, model.device))[:, 0].cpu()
 
-    return plan
+    return make
 
 
-def planner(model: ConceptModel, loop: ClosedLoop) -> Callable[[Tensor, int, Tensor], Tensor]:
+def planner(model: ConceptModel, loop: ClosedLoop) -> Planner:
     """What follows a model's plans: the domain's planner, or that of the model's view."""
     return model.view.act if model.view is not None and model.view.act is not None else loop.act
 
 
-def fixed_plans(plans: Tensor) -> Plan:
+def fixed_plans(plans: Tensor) -> MakePlans:
     """Plans ``(episode, horizon, state)`` that are made once, such as those of reference policies."""
-    return lambda observations, rows: plans[rows]
+    return lambda observed, rows: plans[rows]

@@ -14,14 +14,16 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch import Tensor
 
-from ftl_lightning.diffusion.samplers import SAMPLERS
-from ftl_lightning.domains.domain import Domain, EvaluationTask, Suite, load_domain
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import InitialStates, join, moved
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.domain import CLOSED, Domain
+from ftl_lightning.domains.tasks import EvaluationTask, Suite
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.closed_loop import Following, planner, sampled_plans
+from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.evaluation.generates import Generates
-from ftl_lightning.evaluation.judged import ACCURACY, CLOSED, Judged, executed, share, standard_error
+from ftl_lightning.evaluation.judged import Judged, executed, share, standard_error
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.results import append_rows
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
@@ -70,12 +72,12 @@ class Evaluator(pl.Callback):
         references: bool = True,
         seed: int = 0,
     ) -> None:
-        if sampler not in SAMPLERS:
-            raise UserError(f"evaluation.sampler: expected one of {', '.join(SAMPLERS)}, found {sampler!r}")
+        try:
+            self.sampling = Sampling(sampler, steps, temperature)
+        except UserError as error:
+            raise UserError(f"evaluation.{error}") from None
         if samples < 1:
             raise UserError(f"evaluation.samples: expected 1 or more, found {samples}")
-        if temperature < 0:
-            raise UserError(f"evaluation.temperature: expected 0 or more, found {temperature}")
         if replan < 1:
             raise UserError(f"evaluation.replan: expected 1 or more, found {replan}")
         self.suites = tuple(suites)
@@ -89,32 +91,35 @@ class Evaluator(pl.Callback):
             "sample_seed": seed,
         } | ({"replan": replan} if closed_loop else {})
         self.closed_loop, self.replan = closed_loop, replan
-        self.samples, self.sampler, self.steps, self.temperature = samples, SAMPLERS[sampler], steps, temperature
+        self.samples = samples
         self.figures = figures
         self.results = results
         self.references = references
         self.seed = seed
         self.judged: list[Judged] = []
+        self.root: Path | None = None
         self._projected = False
 
     def _tasks(self, domain: Domain, learned: Sequence[str]) -> list[EvaluationTask]:
+        suites = domain.concepts.suites
         for name in self.suites:
-            if name not in domain.suites:
-                raise UserError(f"evaluation.suites: expected some of {', '.join(domain.suites)}, found {name!r}")
-        tasks = [task for name in self.suites for task in domain.suites[name].tasks]
+            if name not in suites:
+                raise UserError(f"evaluation.suites: expected some of {', '.join(suites)}, found {name!r}")
+        tasks = [task for name in self.suites for task in suites[name].tasks]
         asked = {task.learned for task in tasks}
-        return tasks + [EvaluationTask(OWN, name, learned=name) for name in learned if name not in asked and domain.reads(name)]
+        own = [name for name in learned if name not in asked and (domain.concepts.reads(name) or not domain.metrics)]
+        return tasks + [EvaluationTask(OWN, name, learned=name) for name in own]
 
-    def _start(self, task: EvaluationTask, module: Generates, domain: Domain) -> Tensor | None:
-        """Initial states ``(sample, m)`` of a task, or ``None`` where the domain has none."""
-        if domain.initial_states is None:
+    def _start(self, task: EvaluationTask, module: Generates, domain: Domain) -> InitialStates | None:
+        """Where a task's behaviour starts, or ``None`` where the domain has no initial states."""
+        if not domain.observed:
             return None
         if task.initial == "demonstrated":
             assert task.learned is not None
             own = module.demonstrated(task.learned)
             assert own is not None
-            return own.first_initial_states
-        return domain.initial_states(task.goal, self.samples, EVALUATION_SEED + self.seed)
+            return own.initial_states
+        return domain.source(self.root).starts(task.goal, self.samples, EVALUATION_SEED + self.seed)
 
     @torch.no_grad()
     def evaluate(self, module: Generates, execute: bool = False) -> list[Judged]:
@@ -124,24 +129,20 @@ class Evaluator(pl.Callback):
             module: what generates.
             execute: also execute plans in the domain's environment.
         """
-        model = module.model
-        domain = load_domain(model.config.domain)
+        model, domain = module.model, module.domain
         composed = {task: composition for task in self._tasks(domain, module.concepts) if (composition := module.composition(task))}
         starts = {task: self._start(task, module, domain) for task in composed}
         counts = {task: self.samples if start is None else len(start) for task, start in starts.items()}
         judged: dict[EvaluationTask, Judged] = {}
         for count in dict.fromkeys(counts.values()):
             tasks = [task for task in composed if counts[task] == count]
-            given = [start for task in tasks if (start := starts[task]) is not None]
+            given = join([start for task in tasks if (start := starts[task]) is not None])
             states = model.sample(
-                [composed[task][0] for task in tasks],
-                [composed[task][1] for task in tasks],
+                [composed[task] for task in tasks],
                 count,
-                self.sampler,
-                self.steps,
-                self.temperature,
+                self.sampling,
                 [generator("cpu", self.seed, *_key(task)) for task in tasks],
-                torch.cat(given).to(model.device) if given else None,
+                moved(given.observed, model.device),
             ).cpu()
             for task, own in zip(tasks, states, strict=True):
                 judged[task] = Judged.of(task, own, starts[task], domain)
@@ -149,26 +150,14 @@ class Evaluator(pl.Callback):
         return self._execute(found, composed, model, domain) if execute and domain.closed_loop else found
 
     def _execute(
-        self,
-        judged: Sequence[Judged],
-        composed: Mapping[EvaluationTask, tuple[Tensor, Tensor]],
-        model: ConceptModel,
-        domain: Domain,
+        self, judged: Sequence[Judged], composed: Mapping[EvaluationTask, Composition], model: ConceptModel, domain: Domain
     ) -> list[Judged]:
         """With the plans that the model makes on the way."""
         tasks = [one.task for one in judged for _ in one.states]
         draws = [generator("cpu", self.seed, *_key(one.task), episode) for one in judged for episode in range(len(one.states))]
-        plan = sampled_plans(
-            model,
-            [composed[task][0] for task in tasks],
-            [composed[task][1] for task in tasks],
-            self.sampler,
-            self.steps,
-            self.temperature,
-            draws,
-        )
         assert domain.closed_loop is not None
-        policy = Following(plan, planner(model, domain.closed_loop), self.replan)
+        make = sampled_plans(model, [composed[task] for task in tasks], self.sampling, draws)
+        policy = PlanFollower(make, planner(model, domain.closed_loop), self.replan)
         done = executed(judged, policy, domain)
         firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
         return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(done, firsts, strict=True)]
@@ -178,9 +167,10 @@ class Evaluator(pl.Callback):
         if not isinstance(pl_module, Generates):
             raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(pl_module).__name__}")
         total = pl_module.model.max_steps
-        if total is not None and not 1 <= self.steps <= total:
-            raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.steps}")
-        self._tasks(load_domain(pl_module.model.config.domain), pl_module.concepts)
+        if total is not None and self.sampling.steps > total:
+            raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.sampling.steps}")
+        self._tasks(pl_module.domain, pl_module.concepts)
+        self.root = getattr(trainer.datamodule, "root", None)  # type: ignore[attr-defined]
 
     on_fit_start = on_validation_start = on_test_start = _check
 
@@ -189,14 +179,14 @@ class Evaluator(pl.Callback):
             return
         assert isinstance(module, Generates)
         self.judged = self.evaluate(module, execute=self.closed_loop and stage == "test")
-        domain = load_domain(module.model.config.domain)
+        domain = module.domain
         metrics: dict[str, float] = {}
         for setting in Suite(tuple(one.task for one in self.judged)).settings:
             own = [one.values for one in self.judged if one.task.setting == setting]
             for name in own[0]:
                 values = [each[name] for each in own]
                 metrics[f"{stage}/{name}/{setting}"] = sum(values) / len(values)
-                metrics[f"{stage}/standard error{'' if name == ACCURACY else f' of {name}'}/{setting}"] = standard_error(values)
+                metrics[f"{stage}/standard error of {name}/{setting}"] = standard_error(values)
         each = {
             f"{stage}/{name}/{one.task.setting}/{one.task.name}": value for one in self.judged for name, value in one.values.items()
         }
@@ -221,13 +211,13 @@ class Evaluator(pl.Callback):
     def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
         for one in self.judged if self.figures else ():
             shown = slice(0, self.figures)
-            start = None if one.initial_states is None else one.initial_states[shown]
+            start = None if one.starts is None else one.starts.take(shown)
             right = None if one.right is None else one.right[shown].tolist()
             title = one.task.name if one.right is None else f"{one.task.name}: {share(one.right):.2f}"
-            figure = domain.render(one.states[shown], right, title, start)
+            figure = domain.show.picture(one.states[shown], right, title, start)
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
             if one.rollout is not None and one.followed is not None and domain.closed_loop is not None:
-                pictures = domain.closed_loop.frames(one.rollout.observations[0], one.followed)
+                pictures = domain.closed_loop.film(one.rollout.take(0, 1), one.followed)
                 log_animation(logger, f"{CLOSED}/{one.task.setting}/{one.task.name}", pictures, step)
 
     def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:

@@ -4,8 +4,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.concept_model import ConceptModel
 
 
@@ -17,12 +19,18 @@ class Generates(Protocol):
     hparams: Any
 
     @property
+    def domain(self) -> Domain: ...
+
+    @property
+    def variant(self) -> str: ...
+
+    @property
     def method(self) -> str: ...
 
     @property
     def concepts(self) -> tuple[str, ...]: ...
 
-    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None: ...
+    def composition(self, task: EvaluationTask) -> Composition | None: ...
 
     def demonstrated(self, concept: str) -> Demonstrations | None: ...
 

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
-from ftl_lightning.domains.domain import Domain, EvaluationTask, Policy
-from ftl_lightning.evaluation.closed_loop import Rollout, roll_out
+from ftl_lightning.demonstrations.features import InitialStates, join
+from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy
+from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.evaluation.closed_loop import roll_out
 
-ACCURACY = "accuracy"
-SUCCESS = "success"
-CLOSED = "closed loop"
 WON, LOST = "won against ", "lost against "
 """Metrics of the share of episodes in which only the method succeeds, or only a reference policy from the same initial state."""
 
@@ -25,8 +25,8 @@ class Judged:
     Attributes:
         task: what was asked.
         states: plans ``(sample, horizon, state)``.
-        right: whether each is right ``(sample,)``, or ``None`` in domains that judge episodes alone.
-        initial_states: that they start from ``(sample, m)``, or ``None``.
+        measured: what the domain's metrics say of them, by name: ``(sample,)``, or ``()`` for the whole set.
+        starts: initial states that they start from, or ``None``.
         rollout: what happened when they were executed, if they were.
         followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
         outcomes: the domain's judgement of that, by name ``(sample,)``.
@@ -34,28 +34,33 @@ class Judged:
 
     task: EvaluationTask
     states: Tensor
-    right: Tensor | None
-    initial_states: Tensor | None = None
+    measured: Mapping[str, Tensor]
+    starts: InitialStates | None = None
     rollout: Rollout | None = None
     followed: Tensor | None = None
     outcomes: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: EvaluationTask, states: Tensor, initial_states: Tensor | None, domain: Domain) -> Self:
+    def of(cls, task: EvaluationTask, states: Tensor, starts: InitialStates | None, domain: Domain) -> Self:
         """Judge states by the task's goal."""
-        right = domain.succeeded(task.goal, states, initial_states) if domain.succeeded else None
-        return cls(task, states, right, initial_states)
+        found = {name: metric.measure(task.goal, states, starts) for name, metric in domain.metrics.items()}
+        return cls(task, states, found, starts)
 
     def executed(self, rollout: Rollout, domain: Domain) -> Self:
         """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
         assert domain.closed_loop is not None
-        outcomes = domain.closed_loop.judge(self.task.goal, rollout.observations, rollout.infos)
+        outcomes = domain.closed_loop.judge(self.task.goal, rollout)
         return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
 
     @property
+    def right(self) -> Tensor | None:
+        """Whether each plan is right ``(sample,)``, by the first metric that says so; ``None`` if none does."""
+        return next((values for values in self.measured.values() if values.dtype == torch.bool and values.dim()), None)
+
+    @property
     def values(self) -> dict[str, float]:
-        """Every metric's value: ``accuracy`` of plans and, after ``closed loop``, what happened when they were executed."""
-        plans = {} if self.right is None else {ACCURACY: share(self.right)}
+        """Every metric's value: those of plans and, after ``closed loop``, what happened when they were executed."""
+        plans = {name: share(values) for name, values in self.measured.items()}
         return plans | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
 
 
@@ -69,7 +74,9 @@ def share(values: Tensor) -> float:
 def paired(one: Judged, other: Judged, domain: Domain) -> dict[str, Tensor]:
     """In which episodes ``(sample,)`` one succeeds and another, from the same initial state, does not, and the reverse."""
     assert domain.closed_loop is not None
-    ours, theirs = (judged.outcomes[domain.closed_loop.headline] for judged in (one, other))
+    name = domain.headline.removeprefix(f"{CLOSED} ")
+    compared = name if name != domain.headline else SUCCESS
+    ours, theirs = (judged.outcomes[compared] for judged in (one, other))
     return {WON: ours & ~theirs, LOST: theirs & ~ours}
 
 
@@ -82,6 +89,6 @@ def standard_error(values: Sequence[float]) -> float:
 def executed(judged: Sequence[Judged], policy: Policy, domain: Domain) -> list[Judged]:
     """The same tasks with their episodes, which run all side by side."""
     assert domain.closed_loop is not None
-    initial = torch.cat([one.initial_states for one in judged if one.initial_states is not None])
-    parts = roll_out(domain.closed_loop, initial, policy).split([len(one.states) for one in judged])
+    starts = join([one.starts for one in judged if one.starts is not None])
+    parts = roll_out(domain.closed_loop, starts, policy).split([len(one.states) for one in judged])
     return [one.executed(part, domain) for one, part in zip(judged, parts, strict=True)]

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from torch import Tensor
-
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import ClosedLoop, Domain
-from ftl_lightning.evaluation.closed_loop import Following, Rollout, fixed_plans, roll_out
+from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.tensor_file import bytes_hash
 
@@ -36,16 +36,16 @@ def references(
 
 def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int) -> Judged:
     """A policy that makes its plan once."""
-    key = (name, domain.name, one.task.goal, len(one.states), _hash(one.initial_states), seed)
+    key = (name, domain.name, one.task.goal, len(one.states), _hash(one.starts), seed)
     if key not in _KNOWN:
-        _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.initial_states, seed)
+        _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.starts, seed)
     plans = _KNOWN[key]
-    own = Judged.of(one.task, plans, one.initial_states, domain)
+    own = Judged.of(one.task, plans, one.starts, domain)
     if loop is None:
         return own
-    assert one.initial_states is not None
+    assert one.starts is not None
     if (*key, "executed") not in _KNOWN:
-        _KNOWN[*key, "executed"] = roll_out(loop, one.initial_states, Following(fixed_plans(plans), loop.act, loop.steps))
+        _KNOWN[*key, "executed"] = roll_out(loop, one.starts, PlanFollower(fixed_plans(plans), loop.act, loop.steps))
     return own.executed(_KNOWN[*key, "executed"], domain)
 
 
@@ -54,15 +54,18 @@ def _acted(
 ) -> Judged | None:
     """A policy that acts as it goes; ``None`` where it would take too long."""
     assert domain.closed_loop is not None
-    assert one.initial_states is not None
+    assert one.starts is not None
     known = demonstrated(one.task.learned) if one.task.learned else None
-    key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.initial_states), seed)
+    key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.starts), seed)
     if key not in _KNOWN:
-        policy = domain.closed_loop.policies[name](one.task.goal, one.initial_states, known, seed)
-        _KNOWN[key] = policy and roll_out(domain.closed_loop, one.initial_states, policy)
+        policy = domain.closed_loop.policies[name](one.task.goal, one.starts, known, seed)
+        _KNOWN[key] = policy and roll_out(domain.closed_loop, one.starts, policy)
     rollout: Rollout | None = _KNOWN[key]
     return None if rollout is None else one.executed(rollout, domain)
 
 
-def _hash(initial_states: Tensor | None) -> str:
-    return "" if initial_states is None else bytes_hash(initial_states.numpy().tobytes())
+def _hash(starts: InitialStates | None) -> str:
+    if starts is None:
+        return ""
+    parts = [*starts.observed.values(), *([] if starts.scenes is None else [starts.scenes])]
+    return bytes_hash(b"".join(part.contiguous().numpy().tobytes() for part in parts))

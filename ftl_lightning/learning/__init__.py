@@ -1,6 +1,21 @@
-"""The two LightningModules: pretraining (Eq. 1) and inversion (Eq. 2)."""
+"""The two LightningModules: pretraining (Eq. 1) and inversion (Eq. 2).
 
-from ftl_lightning.learning.inversion import InversionModule
-from ftl_lightning.learning.pretraining import PretrainingModule
+They are imported when they are asked for: what learns and samples without a trainer does not need Lightning.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ftl_lightning.learning.inversion_module import InversionModule
+    from ftl_lightning.learning.pretraining import PretrainingModule
 
 __all__ = ["InversionModule", "PretrainingModule"]
+
+_MODULES = {"InversionModule": "inversion_module", "PretrainingModule": "pretraining"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

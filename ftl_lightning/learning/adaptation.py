@@ -7,12 +7,15 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.concept import Concept, Origin
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.datamodule import InversionData
-from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.domains.from_file import own_domain
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.data import InversionData
+from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
 
 
 class Adaptation(pl.LightningModule, ABC):
@@ -26,25 +29,31 @@ class Adaptation(pl.LightningModule, ABC):
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
     """
 
-    kinds: tuple[str, ...]
-    """Of models that can be adapted so."""
+    adapts: tuple[type[ConceptModel], ...]
+    """Models that can be adapted so."""
     learns = False
     """Whether concepts are learned by gradient descent, for which there are training steps."""
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
         self.model = load_model(pretrained)
-        if self.model.kind not in self.kinds:
-            expected = " or ".join(self.kinds)
+        if not isinstance(self.model, self.adapts):
+            expected = " or ".join(kind for kind in MODELS if issubclass(model_class(kind), self.adapts))
             raise UserError(f"model.pretrained: expected a model of kind {expected}, found {self.model.kind} in {pretrained}")
+        self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
         self._found: dict[str, Concept] = {}
 
     @property
-    @abstractmethod
     def method(self) -> str:
         """The method's name in tables."""
+        return self.model.name
+
+    @property
+    def variant(self) -> str:
+        """What tables tell of it beside its name."""
+        return ""
 
     @abstractmethod
     def learned(self) -> dict[str, Concept]:
@@ -55,31 +64,22 @@ class Adaptation(pl.LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, InversionData):
             raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
-        if data.domain.name != self.model.config.domain:
+        if data.domain_name != self.model.config.domain:
             raise UserError(
-                f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain.name!r}"
+                f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain_name!r}"
             )
         self.concepts = data.concepts
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
             raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
         self._found = {}
-        self.domain = data.domain
-        self.demonstrations: Demonstrations = data.demonstrations
-        self.model.encode_initial(self.demonstrations.first_initial_states)  # a wrong size is told before anything is learned
-
-    def origin(self, name: str, weights: str, loss: float) -> Origin:
-        """Where a concept comes from; ``weights`` is ``'fixed'`` or ``'learned'``."""
-        own = self.demonstrations.select(name)
-        return Origin(
-            name=name,
-            domain=self.model.config.domain,
-            encoder=self.model.config.encoder,
-            pretrained=self.model.hash,
-            demonstrations=own.hash,
-            count=len(own),
-            weights=weights,
-            loss=loss,
-        )
+        expected, found = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
+        if found != expected:
+            raise UserError(f"data.demonstrations: expected states of {expected} columns (the pretrained model's), found {found}")
+        self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
+        if self.model.examples is not None:  # of a user's own data, whose new concepts are judged by their demonstrations
+            examples = concatenate([self.model.examples, self.demonstrations])
+            config = self.model.config
+            self.domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
 
     # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
     def validation_step(self, step: int) -> None:
@@ -129,8 +129,8 @@ class Adaptation(pl.LightningModule, ABC):
         """Guidance weight of a task's training concepts."""
         return self._omega
 
-    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
-        """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if its concept was not learned here."""
+    def composition(self, task: EvaluationTask) -> Composition | None:
+        """What generates a task, or ``None`` if its concept was not learned here."""
         embeddings = [self.model.concept(text) for text in task.texts]
         weights = [self.training_weight(task)] * len(task.texts)
         if task.learned:
@@ -140,7 +140,7 @@ class Adaptation(pl.LightningModule, ABC):
             chosen = slice(None) if task.component is None else slice(task.component - 1, task.component)
             embeddings += concept.embeddings[chosen].to(self.device)
             weights += concept.weights[chosen].tolist()
-        return torch.stack(embeddings), torch.tensor(weights, device=self.device)
+        return Composition(torch.stack(embeddings), torch.tensor(weights, device=self.device))
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
         """What a concept was learned from."""

@@ -16,7 +16,7 @@ def _signature(module: pl.LightningModule, more: Mapping[str, Any]) -> dict[str,
 
 
 def sign(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write the module's class, and what else its parameters mean nothing without, into its checkpoint."""
+    """Write the module's class, and the settings that must match before it is loaded, into its checkpoint."""
     checkpoint[_KEY] = _signature(module, more)
 
 

@@ -10,21 +10,29 @@ from typing import Any, ClassVar, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import Feature, Observed, expect_features
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.denoiser import Sizes
-from ftl_lightning.diffusion.samplers import Sampler
-from ftl_lightning.domains.domain import View, load_domain
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.domain import Domain, View
+from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import FORMAT, bytes_hash, file_hash, load_tensors, save_tensors, serialise, write_text
 
 KIND = "generative model"
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
+CONFIG, WEIGHTS, EXAMPLES = "config.json", "model.safetensors", "demonstrations.safetensors"
+"""Files of a model's folder; the last one only of a model of a user's own data."""
+VERSION = 2
+"""Of the configuration's form. Form 1, which still loads, did not name observed features."""
 DIFFUSION = "diffusion"
 """The kind of a model whose configuration names none."""
 
 
-class Noise(NamedTuple):
+class Draws(NamedTuple):
     """Timesteps ``(sample,)`` int64 and noise ``(sample, horizon, state)`` of diffusion."""
 
     t: Tensor
@@ -41,7 +49,7 @@ class ModelConfig(Sizes):
         encoder: identity of the text encoder.
         view: name of the domain's view that the model sees behaviour with; empty for as it is.
         perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
-        state_columns: columns of the initial state that hold the state a plan starts from.
+        metrics: of a user's own data, what plans are judged by, see :mod:`ftl_lightning.domains.from_file`.
         training: how it was trained, for the record.
     """
 
@@ -50,11 +58,11 @@ class ModelConfig(Sizes):
     encoder: str
     view: str = ""
     perturb: bool = False
-    state_columns: tuple[int, ...] = ()
+    metrics: Mapping[str, float] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
 
-def load_view(domain: str, name: str) -> View | None:
+def find_view(domain: Domain, name: str) -> View | None:
     """A domain's view by its name; ``None`` for the empty one.
 
     Raises:
@@ -62,10 +70,9 @@ def load_view(domain: str, name: str) -> View | None:
     """
     if not name:
         return None
-    views = load_domain(domain).views
-    if name not in views:
-        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *views)))}, found {name!r}")
-    return views[name]
+    if name not in domain.views:
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {name!r}")
+    return domain.views[name]
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:
@@ -77,8 +84,10 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     path = Path(folder) / CONFIG
     try:
         content: dict[str, Any] = {"kind": DIFFUSION} | json.loads(path.read_text(encoding="utf-8"))
-        if content.pop("format") != FORMAT:
-            raise ValueError(f"format is not {FORMAT}")
+        if (version := content.pop("format")) not in (FORMAT, VERSION):
+            raise ValueError(f"format is not {FORMAT} or {VERSION}")
+        if version == FORMAT:
+            _upgrade(content)
         if "hash" not in content:
             raise ValueError("it has no hash")
     except OSError as error:
@@ -88,18 +97,41 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     return content
 
 
+def _upgrade(content: dict[str, Any]) -> None:
+    """Bring a configuration of form 1 to form 2, in place: features are those of its domain and view."""
+    size = content.pop("initial_state_dim", 0)
+    for key in ("entities", "looks", "state_columns"):
+        content.pop(key, None)
+    domain = load_domain(content["domain"])
+    view = find_view(domain, content.get("view", ""))
+    features = (view.features if view else domain.observed) if size else {}
+    content["observed"] = {name: asdict(feature) for name, feature in features.items()}
+
+
+def _feature(content: Mapping[str, Any]) -> Feature:
+    return Feature(
+        shape=tuple(content["shape"]),
+        kind=content["kind"],
+        entities=tuple(map(tuple, content["entities"])),
+        attributes=tuple(content["attributes"]),
+        state=tuple(content["state"]),
+    )
+
+
 class ConceptModel(nn.Module, ABC):
     """A model of behaviour given a concept: what adapting, sampling and evaluation ask of every method.
 
     Args:
         config: sizes and names.
+        domain: whose behaviour it is.
         normalization: of states.
         embeddings: ``(1 + training concepts, n)``, the empty concept first.
-        initial_normalization: of initial states, where the domain has them.
+        initial_normalization: of the observed vectors, one after another, where there are any.
 
     Attributes:
         empty: the empty concept ``(n,)`` in the model's concept space.
         training_embeddings: ``(training concept, n)``, likewise.
+        examples: of a user's own data, some demonstrations of each training concept, kept beside the weights.
     """
 
     kind: ClassVar[str]
@@ -114,15 +146,19 @@ class ConceptModel(nn.Module, ABC):
     def __init__(
         self,
         config: ModelConfig,
+        domain: Domain,
         normalization: Normalization,
         embeddings: Tensor,
         initial_normalization: Normalization | None = None,
     ) -> None:
         super().__init__()
-        self.config = config
-        self.view = load_view(config.domain, config.view)
+        self.config, self.domain = config, domain
+        self.examples: Demonstrations | None = None
+        self.view = find_view(domain, config.view)
         if config.perturb and (self.view is None or self.view.perturb is None):
             raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
+        if images := [name for name, feature in config.observed.items() if feature.kind == "image"]:
+            raise UserError(f"key 'observed/{images[0]}': expected vectors, found images, for which there is no encoder yet")
         self.normalization = normalization
         self.initial_normalization = initial_normalization
         self.register_buffer("empty", embeddings[0].clone())
@@ -131,50 +167,37 @@ class ConceptModel(nn.Module, ABC):
     @abstractmethod
     def sample(
         self,
-        concepts: Sequence[Tensor],
-        weights: Sequence[Tensor],
+        compositions: Sequence[Composition],
         count: int,
-        sampler: Sampler,
-        steps: int,
-        temperature: float,
+        sampling: Sampling,
         generators: Sequence[torch.Generator],
-        initial_states: Tensor | None = None,
+        observed: Observed | None = None,
     ) -> Tensor:
         """Generate behaviour of several compositions in one batch.
 
         Args:
-            concepts: for each composition ``(K, n)``; K may differ between them.
-            weights: for each composition ``(K,)``.
+            compositions: ``(K, n)`` each; K may differ between them.
             count: samples of each.
-            sampler, steps, temperature: see :mod:`ftl_lightning.diffusion.samplers`.
+            sampling: sampler, steps and temperature.
             generators: of the noise, one for each composition, so that its samples do not depend on what is sampled beside it.
-            initial_states: ``(composition * count, initial state)`` in the domain's units, or ``None``.
+            observed: features ``(composition * count, *shape)`` by name, in the domain's units; ``None`` for none.
 
         Returns:
             ``(composition, count, horizon, state)`` in the domain's units.
         """
 
-    def noise(self, samples: int, timestep_power: float, draw: torch.Generator) -> Noise | None:
+    def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
         """What is random in :meth:`losses`, alike for every run; ``None`` for a method that has nothing random."""
         return None
 
-    def losses(
-        self,
-        states: Tensor,
-        initial_states: Tensor | None,
-        embeddings: Tensor,
-        weights: Tensor,
-        noise: Noise | None,
-        loss: str,
-    ) -> Tensor:
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         """How badly concepts explain behaviour, for a method that learns them by gradient descent.
 
         Args:
             states: ``(run * sample, window, state)`` in the domain's units.
-            initial_states: ``(run * sample, initial state)`` or ``None``.
-            embeddings: ``(run, K, n)``.
-            weights: ``(run, K)``.
-            noise: of :meth:`noise`.
+            observed: features ``(run * sample, *shape)`` by name.
+            composition: ``(run, K, n)``.
+            draws: of :meth:`draws`.
             loss: whose squared error a diffusion model minimises.
 
         Returns:
@@ -234,45 +257,38 @@ class ConceptModel(nn.Module, ABC):
                     f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
                 )
 
-    def perturbed(self, states: Tensor, initial_states: Tensor | None, draw: torch.Generator) -> tuple[Tensor, Tensor | None]:
-        """What to learn from: behaviour and initial states with another present, if the model's configuration says so."""
+    def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:
+        """What to learn from: behaviour with another present, if the model's configuration says so."""
         if not self.config.perturb:
-            return states, initial_states
+            return states, observed
         assert self.view is not None
         assert self.view.perturb is not None
-        assert initial_states is not None
-        noise = torch.randn((len(states), 2), generator=draw, device=draw.device)
-        return self.view.perturb(states, initial_states, noise)
+        return self.view.perturb(states, observed, draw)
 
-    def encode(self, states: Tensor, initial_states: Tensor | None) -> Tensor:
-        """Behaviour ``(sample, horizon, state)`` in the domain's units to what the denoiser sees."""
+    def encode(self, states: Tensor, observed: Observed) -> Tensor:
+        """Behaviour ``(sample, horizon, state)`` in the domain's units to what the network sees."""
         if self.view is not None:
-            assert initial_states is not None
-            states = self.view.encode(states, initial_states)
+            states = self.view.encode(states, observed)
         return self.normalization.encode(states)
 
-    def decode(self, normalised: Tensor, initial_states: Tensor | None) -> Tensor:
+    def decode(self, normalised: Tensor, observed: Observed) -> Tensor:
         """The inverse of :meth:`encode`."""
         states = self.normalization.decode(normalised)
-        if self.view is not None:
-            assert initial_states is not None
-            states = self.view.decode(states, initial_states)
-        return states
+        return states if self.view is None else self.view.decode(states, observed)
 
-    def encode_initial(self, initial_states: Tensor | None) -> Tensor | None:
-        """Initial states ``(batch, m)`` as the denoiser sees them, or ``None`` for a model that is not conditioned on any.
+    def vector(self, observed: Observed) -> Tensor | None:
+        """The observed vectors ``(batch, m)`` as the network sees them, one after another; ``None`` where it observes none.
 
         Raises:
-            UserError: if the model needs them and there are none, or their size is another.
+            UserError: if a feature is missing or of another shape.
         """
         if self.initial_normalization is None:
             return None
-        seen = self.view.observe(initial_states) if self.view and initial_states is not None else initial_states
-        expected = self.config.initial_state_dim
-        if seen is None or seen.shape[-1] != expected:
-            found = "none" if seen is None else str(seen.shape[-1])
-            raise UserError(f"key 'initial_states': expected {expected} numbers each (the pretrained model's), found {found}")
-        return self.initial_normalization.encode(seen)
+        if self.view is not None:
+            expect_features(observed, self.domain.observed)
+            observed = self.view.observe(observed)
+        expect_features(observed, self.config.observed)
+        return self.initial_normalization.encode(joined_vectors(observed, self.config.observed))
 
     @property
     def hash(self) -> str:
@@ -285,10 +301,15 @@ class ConceptModel(nn.Module, ABC):
         return {name: value.half() if name in weights else value for name, value in self.state_dict().items()}
 
     def save(self, folder: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision."""
+        """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision.
+
+        Where there are examples, they are written too.
+        """
         folder = Path(folder)
         save_tensors(folder / WEIGHTS, KIND, self._stored(), {"domain": self.config.domain})
-        header = {"format": FORMAT, "hash": self.hash, "kind": self.kind}
+        if self.examples is not None:
+            self.examples.save(folder / EXAMPLES)
+        header = {"format": VERSION, "hash": self.hash, "kind": self.kind}
         write_text(folder / CONFIG, json.dumps(header | asdict(self.config), indent=2) + "\n")
 
     @classmethod
@@ -303,11 +324,11 @@ class ConceptModel(nn.Module, ABC):
         expected_hash = content.pop("hash")
         if (found := content.pop("kind")) != cls.kind:
             raise UserError(f"{path}: key 'kind': expected {cls.kind!r}, found {found!r}, the model of another method")
-        for key in ("training_concepts", "entities", "looks", "state_columns"):
-            content[key] = tuple(tuple(one) if isinstance(one, list) else one for one in content.get(key, ()))
         try:
+            content["training_concepts"] = tuple(content["training_concepts"])
+            content["observed"] = {name: _feature(feature) for name, feature in content["observed"].items()}
             config = cls.Config(**content)
-        except TypeError as error:
+        except (TypeError, KeyError, AttributeError) as error:
             raise UserError(f"{path}: expected the configuration of a pretrained model, found something else ({error})") from error
         weights = Path(folder) / WEIGHTS
         tensors, _ = load_tensors(weights, KIND)
@@ -316,18 +337,32 @@ class ConceptModel(nn.Module, ABC):
                 f"{weights}: expected the hash {expected_hash} that {CONFIG} names, found {found}; copy both files again"
             )
         blank = torch.zeros(config.state_dim)
-        initial = torch.zeros(config.initial_state_dim)
+        initial = torch.zeros(config.vector_dim)
+        examples = Demonstrations.load(Path(folder) / EXAMPLES) if config.domain == OWN else None
+        domain = (
+            load_domain(config.domain)
+            if examples is None
+            else own_domain(examples, config.training_concepts, config.horizon, config.metrics)
+        )
         model = cls(
             config,
+            domain,
             Normalization(blank, blank),
             torch.zeros(1 + len(config.training_concepts), config.concept_dim),
-            Normalization(initial, initial) if config.initial_state_dim else None,
+            Normalization(initial, initial) if config.vector_dim else None,
         )
+        model.examples = examples
         try:
             model.load_state_dict(tensors)
         except RuntimeError as error:
             raise UserError(f"{weights}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()})") from error
         return model.requires_grad_(False).eval()
+
+
+def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:
+    """The vectors among observed features, one after another ``(batch, m)``."""
+    vectors = [observed[name].flatten(1) for name, feature in features.items() if feature.kind == "vector"]
+    return torch.cat(vectors, dim=1)
 
 
 class TextConceptModel(ConceptModel):
@@ -337,7 +372,7 @@ class TextConceptModel(ConceptModel):
     all of them, which hides what tells two concepts apart.
 
     Args:
-        config, normalization, initial_normalization: see :class:`ConceptModel`.
+        config, domain, normalization, initial_normalization: see :class:`ConceptModel`.
         embeddings: the encoder's ``(1 + training concepts, n)``, the empty text first.
     """
 
@@ -347,13 +382,14 @@ class TextConceptModel(ConceptModel):
     def __init__(
         self,
         config: ModelConfig,
+        domain: Domain,
         normalization: Normalization,
         embeddings: Tensor,
         initial_normalization: Normalization | None = None,
     ) -> None:
         centre = embeddings[1:].mean(dim=0)
         spread = (embeddings[1:] - centre).square().mean().sqrt()
-        super().__init__(config, normalization, (embeddings - centre) / spread, initial_normalization)
+        super().__init__(config, domain, normalization, (embeddings - centre) / spread, initial_normalization)
         self.register_buffer("centre", centre)
         self.register_buffer("spread", spread)
 

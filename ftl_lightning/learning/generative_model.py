@@ -8,14 +8,16 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning import diffusion
-from ftl_lightning.concepts.composition import composed_epsilon
+from ftl_lightning.concepts.composition import Composition, Context, batched, composed_epsilon
+from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
-from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss
-from ftl_lightning.domains.domain import OURS
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import DIFFUSION, ModelConfig, Noise, TextConceptModel
+from ftl_lightning.learning.concept_model import DIFFUSION, Draws, ModelConfig, TextConceptModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,10 +61,8 @@ class GenerativeModel(TextConceptModel):
     """A denoiser with everything that is needed to go from words and states to states.
 
     Args:
-        config: sizes and names.
-        normalization: of states.
+        config, domain, normalization, initial_normalization: see :class:`~ftl_lightning.learning.concept_model.ConceptModel`.
         embeddings: the encoder's embeddings ``(1 + training concepts, n)``, the empty text first.
-        initial_normalization: of initial states, where the domain has them.
     """
 
     kind = DIFFUSION
@@ -74,11 +74,12 @@ class GenerativeModel(TextConceptModel):
     def __init__(
         self,
         config: DiffusionConfig,
+        domain: Domain,
         normalization: Normalization,
         embeddings: Tensor,
         initial_normalization: Normalization | None = None,
     ) -> None:
-        super().__init__(config, normalization, embeddings, initial_normalization)
+        super().__init__(config, domain, normalization, embeddings, initial_normalization)
         self.denoiser = build_denoiser(config)
         self.register_buffer("alpha_bar", cosine_alpha_bar(config.diffusion_steps))
 
@@ -91,7 +92,7 @@ class GenerativeModel(TextConceptModel):
     def max_steps(self) -> int:
         return len(self.alpha_bar)
 
-    def noise(self, samples: int, timestep_power: float, draw: torch.Generator) -> Noise:
+    def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws:
         """Noise and stratified timesteps ``T (1 - u^power)``, u even in [0, 1)."""
         total, device = len(self.alpha_bar), draw.device
         spread = (torch.arange(samples, device=device) + torch.rand(samples, generator=draw, device=device)) / samples
@@ -99,48 +100,40 @@ class GenerativeModel(TextConceptModel):
             spread = 1 - spread**timestep_power
         t = (spread * total).long().clamp(max=total - 1)
         t = t[torch.randperm(samples, generator=draw, device=device)]
-        return Noise(t, torch.randn((samples, self.config.horizon, self.config.state_dim), generator=draw, device=device))
+        return Draws(t, torch.randn((samples, self.config.horizon, self.config.state_dim), generator=draw, device=device))
 
-    def losses(
-        self,
-        states: Tensor,
-        initial_states: Tensor | None,
-        embeddings: Tensor,
-        weights: Tensor,
-        noise: Noise | None,
-        loss: str,
-    ) -> Tensor:
+    def observe(self, observed: Observed) -> Context:
+        """What the condition encoder reads of observed features, once a plan."""
+        context: Context = self.denoiser.observe(self.vector(observed))  # type: ignore[operator]
+        return context
+
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         """Eq. 2 for every run and sample."""
-        assert noise is not None
-        runs, s0 = len(embeddings), self.encode_initial(initial_states)
+        assert draws is not None
+        runs, context = len(composition.embeddings), self.observe(observed)
         losses = denoising_loss(
-            lambda x, t: composed_epsilon(self.denoiser, x, t, embeddings, weights, self.empty, s0),
-            self.encode(states, initial_states),
-            noise.noise.repeat(runs, 1, 1),
-            noise.t.repeat(runs),
+            lambda x, t: composed_epsilon(self.denoiser, x, t, composition, self.empty, context),
+            self.encode(states, observed),
+            draws.noise.repeat(runs, 1, 1),
+            draws.t.repeat(runs),
             self.alpha_bar,
         )
-        return losses.unflatten(0, (runs, -1)) * loss_weights(loss, self.alpha_bar)[noise.t]
+        return losses.unflatten(0, (runs, -1)) * loss_weights(loss, self.alpha_bar)[draws.t]
 
     @torch.no_grad()
     def sample(
         self,
-        concepts: Sequence[Tensor],
-        weights: Sequence[Tensor],
+        compositions: Sequence[Composition],
         count: int,
-        sampler: Sampler,
-        steps: int,
-        temperature: float,
+        sampling: Sampling,
         generators: Sequence[torch.Generator],
-        initial_states: Tensor | None = None,
+        observed: Observed | None = None,
     ) -> Tensor:
-        # Compositions with fewer components are padded with empty ones of weight zero, which add nothing.
-        embeddings = nn.utils.rnn.pad_sequence(list(concepts), batch_first=True)
-        omega = nn.utils.rnn.pad_sequence(list(weights), batch_first=True)
-        s0 = self.encode_initial(initial_states)
+        together, seen = batched(compositions), observed or {}
+        context = self.observe(seen)
 
         def epsilon(x: Tensor, t: Tensor) -> Tensor:
-            return composed_epsilon(self.denoiser, x, t, embeddings, omega, self.empty, s0)
+            return composed_epsilon(self.denoiser, x, t, together, self.empty, context)
 
         shape = (count, self.config.horizon, self.config.state_dim)
 
@@ -149,5 +142,5 @@ class GenerativeModel(TextConceptModel):
             drawn = [torch.randn(shape, generator=one, device=one.device) for one in generators]
             return torch.cat(drawn).to(self.device)
 
-        plans = sampler(epsilon, noise, self.alpha_bar, steps, temperature)
-        return self.decode(plans, initial_states).unflatten(0, (len(concepts), count))
+        plans = sampling.run(epsilon, noise, self.alpha_bar)
+        return self.decode(plans, seen).unflatten(0, (len(compositions), count))

@@ -1,17 +1,26 @@
 """Pretrained models by the folder they are kept in, whatever their method."""
 
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.baselines.cloning import CloningModel
-from ftl_lightning.learning.baselines.in_context import InContextModel
-from ftl_lightning.learning.baselines.vae import VAEModel
 from ftl_lightning.learning.concept_model import CONFIG, ConceptModel, read_config
-from ftl_lightning.learning.generative_model import GenerativeModel
 
-_CLASSES: tuple[type[ConceptModel], ...] = (GenerativeModel, CloningModel, VAEModel, InContextModel)
-MODELS = {one.kind: one for one in _CLASSES}
+MODELS = {
+    "diffusion": "generative_model:GenerativeModel",
+    "bc": "baselines.cloning:CloningModel",
+    "cvae": "baselines.vae:VAEModel",
+    "in-context": "baselines.in_context:InContextModel",
+}
+"""Where the class of each kind of model is; the baselines' also need Lightning, which takes seconds to import."""
+
+
+def model_class(kind: str) -> type[ConceptModel]:
+    """The class of a kind of model, one of :data:`MODELS`."""
+    module, _, name = MODELS[kind].partition(":")
+    found: type[ConceptModel] = getattr(importlib.import_module(f"ftl_lightning.learning.{module}"), name)
+    return found
 
 
 def load_model(folder: str | Path) -> ConceptModel:
@@ -22,7 +31,7 @@ def load_model(folder: str | Path) -> ConceptModel:
     """
     if (kind := read_config(folder)["kind"]) not in MODELS:
         raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {kind!r}")
-    return MODELS[kind].load(folder)
+    return model_class(kind).load(folder)
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:

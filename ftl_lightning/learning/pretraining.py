@@ -13,17 +13,22 @@ import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion import PAPER_SIZE
+from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.prediction import loss_weights
 from ftl_lightning.diffusion.schedule import denoising_loss
-from ftl_lightning.domains.domain import EvaluationTask
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.paper import OURS
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import check_signature, sign
-from ftl_lightning.learning.concept_model import ConceptModel, load_view
+from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors
+from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
@@ -49,6 +54,8 @@ class Pretraining(pl.LightningModule, ABC):
 
     method: str
     """The method's name in tables."""
+    variant = ""
+    """What tables tell of it beside its name."""
     concepts: tuple[str, ...] = ()
     """Names of learned concepts; pretraining learns none."""
     stride: int = 1
@@ -87,7 +94,8 @@ class Pretraining(pl.LightningModule, ABC):
         Args:
             shared: what every model's configuration says.
             data: what it learns from.
-            normalization, initial_normalization: of that.
+            normalization: of its states.
+            initial_normalization: of the observed vectors; ``None`` where there are none.
             embeddings: of the encoder ``(1 + training concepts, n)``, the empty text first.
         """
 
@@ -105,28 +113,28 @@ class Pretraining(pl.LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, PretrainingData):
             raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
-        embeddings = data.encoder((EMPTY, *data.domain.training_concepts))
-        view = load_view(data.domain.name, self.hparams["view"])
+        concepts = data.domain.concepts.training
+        embeddings = data.encoder((EMPTY, *concepts))
+        view = find_view(data.domain, self.hparams["view"])
+        features = data.domain.observed if view is None else view.features
+        seen: Observed
         if view is None:
-            states, initial = data.training.states, data.training.initial_states
+            states, seen = data.training.states, data.training.every_observation
         else:
             windows = data.every_window()
-            assert windows.initial_states is not None
-            states, initial = windows.states[:, :: self.stride], view.observe(windows.initial_states)
-            states = view.encode(states, windows.initial_states)
+            states, seen = windows.states[:, :: self.stride], view.observe(windows.observed)
+            states = view.encode(states, windows.observed)
         shared = {
             "domain": data.domain.name,
             "horizon": data.horizon,
-            "state_dim": len(data.domain.state_names),
-            "initial_state_dim": 0 if initial is None else initial.shape[-1],
+            "state_dim": len(data.domain.plans.columns),
+            "observed": dict(features),
             "concept_dim": embeddings.shape[-1],
-            "training_concepts": data.domain.training_concepts,
+            "training_concepts": concepts,
             "encoder": data.encoder.identity,
-            "entities": data.domain.entities,
-            "looks": data.domain.looks,
             "view": self.hparams["view"],
             "perturb": self.hparams["perturb"],
-            "state_columns": data.domain.state_columns,
+            "metrics": dict(data.metrics),
             "training": {
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
                 "data": {key: value for key, value in data.hparams.items() if not key.startswith("_")},
@@ -136,11 +144,15 @@ class Pretraining(pl.LightningModule, ABC):
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            normalization = Normalization.fit(states, view.alike if view else ())
-            beside = None if initial is None else Normalization.fit(initial, data.domain.entities)
-            if beside is not None and data.domain.state_columns and view is None:  # a view has another scale
-                beside.share(data.domain.state_columns, normalization)
+            normalization = Normalization.fit(states, view.scales if view else ())
+            beside = None
+            if features:
+                sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
+                beside = Normalization.fit(joined_vectors(seen, features), sizes.entities)
+                if sizes.state_columns and view is None:  # a view has another scale
+                    beside.share(sizes.state_columns, normalization)
             self.model = self.build(shared, data, normalization, embeddings, beside)
+            self.model.examples = data.examples
         self.raw = copy.deepcopy(self.model)
         self.model.requires_grad_(False).eval()
 
@@ -201,12 +213,17 @@ class Pretraining(pl.LightningModule, ABC):
         """Write the averaged model for ``invert`` and ``sample``."""
         self.model.save(self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
 
-    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
-        """Embeddings ``(K, n)`` and weights ``(K,)`` that generate a task, or ``None`` if it needs a learned concept."""
+    @property
+    def domain(self) -> Domain:
+        """Whose behaviour it is."""
+        return self.model.domain
+
+    def composition(self, task: EvaluationTask) -> Composition | None:
+        """What generates a task, or ``None`` if it needs a learned concept."""
         if task.learned:
             return None
         embeddings = torch.stack([self.model.concept(text) for text in task.texts])
-        return embeddings, embeddings.new_full((len(embeddings),), self.guidance)
+        return Composition(embeddings, embeddings.new_full((len(embeddings),), self.guidance))
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
         """What a concept was learned from: nothing is learned here."""
@@ -226,7 +243,7 @@ class Pretraining(pl.LightningModule, ABC):
 
     def _signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
-        different = ("training", "training_concepts", "entities", "looks", "perturb", "state_columns")
+        different = ("training", "training_concepts", "perturb", "metrics")
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
 
 
@@ -248,7 +265,7 @@ class PretrainingModule(Pretraining):
         compile: compile the denoiser for training (worth it on GPUs).
     """
 
-    method = "FTL-IGM"
+    method = OURS
 
     def __init__(
         self,
@@ -284,7 +301,7 @@ class PretrainingModule(Pretraining):
     ) -> GenerativeModel:
         names = ("denoiser", "diffusion_steps", "prediction")
         config = DiffusionConfig(**shared, denoiser_args=self.denoiser_args, **{name: self.hparams[name] for name in names})
-        return GenerativeModel(config, normalization, embeddings, initial_normalization)
+        return GenerativeModel(config, data.domain, normalization, embeddings, initial_normalization)
 
     def configure_model(self) -> None:
         super().configure_model()
@@ -294,9 +311,9 @@ class PretrainingModule(Pretraining):
     def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Eq. 1; while fitting, concepts are dropped."""
         assert isinstance(model, GenerativeModel)
-        states, seen = model.perturbed(batch.states, batch.initial_states, draw)
+        states, seen = model.perturbed(batch.states, batch.observed, draw)
         clean = model.encode(states, seen)
-        initial = model.encode_initial(seen)
+        context = model.observe(seen)
         count = len(clean)
         dropout = self.hparams["condition_dropout"] if model.training else 0.0
         removed = torch.rand(count, generator=draw, device=self.device) < dropout
@@ -304,5 +321,5 @@ class PretrainingModule(Pretraining):
         index = torch.where(removed, 0, batch.concepts + 1)
         t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
         noise = torch.randn(clean.shape, generator=draw, device=self.device)
-        losses = denoising_loss(lambda x, t: model.denoiser(x, t, concepts, index, initial), clean, noise, t, model.alpha_bar)
+        losses = denoising_loss(lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar)
         return losses * loss_weights(self.hparams["loss"], model.alpha_bar)[t]

@@ -1,31 +1,27 @@
 """The domain object: what the rest of the package knows of navigation."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates, Observed
 from ftl_lightning.domains.agent import environment, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
 from ftl_lightning.domains.agent.environment import LOOKAHEAD, MAX_STEPS, AgentEnvironment
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.published import PUBLISHED
-from ftl_lightning.domains.agent.rendering import frames, render
-from ftl_lightning.domains.agent.scenes import (
-    OBJECT_COLUMNS,
-    PLANE,
-    STATE,
-    object_positions,
-    parse,
-    scenes,
-    target,
-)
+from ftl_lightning.domains.agent.rendering import film, render
+from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
-from ftl_lightning.domains.domain import ClosedLoop, Domain
+from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
+from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import VALIDATION_SEED
 
 NAME = "agent"
 HORIZON = 128
@@ -65,7 +61,9 @@ def _drive(tasks: tuple[str, ...], count: int, seed: int, progress: Callable[[],
         state_names=STATE_NAMES,
         state_units=STATE_UNITS,
         concepts=tuple(task for task in tasks for _ in range(count)),
-        initial_states=observations,
+        observed={OBSERVED: observations},
+        per_step=(OBSERVED,),
+        scenes=observations[:, 0].contiguous(),
         provenance={"generator": NAME, "seed": seed, "count_per_task": count},
     )
 
@@ -78,80 +76,91 @@ def reads(task: str) -> bool:
         return False
 
 
-def act(plans: Tensor, step: int, observations: Tensor) -> Tensor:
+class Expert:
+    """The expert's drives, from the cache if they are there."""
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        return demonstrations(TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        return demonstrations((task,), count, seed)
+
+    def starts(self, task: str, count: int, seed: int) -> InitialStates:
+        return initial_states(scenes(task, count, seed))
+
+
+def initial_states(drawn: Tensor) -> InitialStates:
+    """Scenes ``(scene, 52)`` as they are observed: everything in them is."""
+    return InitialStates({OBSERVED: drawn}, drawn)
+
+
+def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
     """Forces ``(episode, 2)``: the way to where the plan is :data:`LOOKAHEAD` steps ahead (paper, closed loop).
 
     Args:
         plans: ``(episode, horizon, 13)``.
         step: steps since the plan was made.
-        observations: ``(episode, 52)``.
+        observed: ``world (episode, 52)``.
     """
     ahead = plans[:, min(step + LOOKAHEAD, plans.shape[1] - 1)]
-    return (ahead - observations[:, :STATE])[:, list(PLANE)]
+    return (ahead - observed[OBSERVED][:, :STATE])[:, list(PLANE)]
 
 
-def _straight(initial_states: Tensor, chosen: Tensor) -> Tensor:
+def _straight(world: Tensor, chosen: Tensor) -> Tensor:
     """Plans ``(scene, horizon, 13)`` straight to the chosen object, at the expert's speed."""
-    objects = object_positions(initial_states)
+    objects = object_positions(world)
     goal = objects[torch.arange(len(objects)), chosen]
-    start = initial_states[:, None, :3]
-    way = (goal - initial_states[:, :3])[:, None]
+    start = world[:, None, :3]
+    way = (goal - world[:, :3])[:, None]
     length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
     driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * environment.STEP * expert.SPEED, length)
-    plans = initial_states[:, None, :STATE].repeat(1, HORIZON, 1)
+    plans = world[:, None, :STATE].repeat(1, HORIZON, 1)
     plans[..., :3] = start + way * driven / length
     return plans
 
 
-def _nearest(goal: str, count: int, initial_states: Tensor | None, seed: int) -> Tensor:
-    assert initial_states is not None
-    away = torch.linalg.vector_norm(object_positions(initial_states) - initial_states[:, None, :3], dim=-1)
-    return _straight(initial_states, away.argmin(dim=1))
+def _nearest(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+    assert starts is not None
+    world = starts.observed[OBSERVED]
+    away = torch.linalg.vector_norm(object_positions(world) - world[:, None, :3], dim=-1)
+    return _straight(world, away.argmin(dim=1))
 
 
-def _random(goal: str, count: int, initial_states: Tensor | None, seed: int) -> Tensor:
-    assert initial_states is not None
+def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+    assert starts is not None
     draw = torch.Generator().manual_seed(seed)
-    return _straight(initial_states, torch.randint(2, (len(initial_states),), generator=draw))
+    return _straight(starts.observed[OBSERVED], torch.randint(2, (len(starts),), generator=draw))
 
 
-def _oracle(goal: str, count: int, initial_states: Tensor | None, seed: int) -> Tensor:
-    assert initial_states is not None
-    env = AgentEnvironment()
+def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+    assert starts is not None
+    env, world = AgentEnvironment(), starts.observed[OBSERVED]
     drives = [
         torch.from_numpy(expert.demonstrate(env, state, chosen))
-        for state, chosen in zip(initial_states.numpy(), target(goal, initial_states).tolist(), strict=True)
+        for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)
     ]
     env.close()
     rows = torch.arange(HORIZON)
     return torch.stack([drive[rows.clamp(max=len(drive) - 1), :STATE] for drive in drives])
 
 
-# Position, and as its looks colour and shape, of each object; its type (object 1 or 2) is what tells apart what should be alike.
-_ENTITIES = tuple((*range(columns.start, columns.start + 3), *range(columns.start + 6, columns.stop)) for columns in OBJECT_COLUMNS)
-
 DOMAIN = Domain(
     name=NAME,
-    horizon=HORIZON,
-    state_names=STATE_NAMES,
-    state_units=STATE_UNITS,
-    training_concepts=TRAINING_CONCEPTS,
-    suites=SUITES,
-    descriptions=tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(task.goal for suite in SUITES.values() for task in suite.tasks)))),
-    training_set=lambda count, seed: demonstrations(TRAINING_CONCEPTS, count, seed),
-    generate=lambda task, count, seed, workers=1: demonstrations((task,), count, seed),
-    reads=reads,
-    succeeded=progressed,
-    render=render,
-    initial_states=scenes,
-    views=VIEWS,
-    entities=_ENTITIES,
-    looks=tuple(range(3, len(_ENTITIES[0]))),
-    state_columns=tuple(range(STATE)),
-    early=3.0,
-    closed_loop=ClosedLoop(environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, frames=frames),
+    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0),
+    concepts=Concepts(
+        training=TRAINING_CONCEPTS,
+        suites=SUITES,
+        descriptions=tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for suite in SUITES.values() for goal in suite.goals)))),
+        reads=reads,
+        table=Path(__file__).parent / "embeddings.safetensors",
+    ),
+    source=lambda root: Expert(),
+    observed={OBSERVED: FEATURE},
+    metrics={ACCURACY: Metric(progressed)},
+    headline="closed loop success",
+    show=Show(render),
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
-    published=PUBLISHED,
-    omega="0.6",
-    published_omega="1.6",
+    views=VIEWS,
+    closed_loop=ClosedLoop(environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, film=film),
+    paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
 )

@@ -15,6 +15,7 @@ from ftl_lightning.domains.agent.scenes import (
     HEIGHT,
     INITIAL,
     OBJECT_COLUMNS,
+    OBSERVED,
     PLANE,
     REACH,
     STATE,
@@ -49,6 +50,10 @@ IMAGE = (200, 320)
 """Height and width of a rendered picture."""
 
 
+Seen = dict[str, NDArray[np.float32]]
+"""Observed features by name."""
+
+
 class Simulator:
     """pybullet's functions, each for one simulator of its own without a display.
 
@@ -64,7 +69,7 @@ class Simulator:
         return functools.partial(getattr(pybullet, name), physicsClientId=self._id)
 
 
-class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """One agent and two objects.
 
     An observation is an initial state (52 numbers, :mod:`ftl_lightning.domains.agent.scenes`). An action is a force in newtons
@@ -78,7 +83,7 @@ class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP)}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)
+    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict({OBSERVED: gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)})
     action_space = gymnasium.spaces.Box(-MAX_FORCE, MAX_FORCE, (len(PLANE),), np.float32)
 
     def __init__(self) -> None:
@@ -92,19 +97,19 @@ class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Seen, dict[str, Any]]:
         """Build a scene.
 
         Args:
             seed: of the scene that is drawn if none is given.
-            options: ``initial_state``, 52 numbers; or ``task``, whose scene is drawn (default 'go to red object').
+            options: ``scene``, 52 numbers; or ``task``, whose scene is drawn (default 'go to red object').
 
         Raises:
-            UserError: for an initial state of another size, with overlapping bodies, or with numbers that are not finite.
+            UserError: for a scene of another size, with overlapping bodies, or with numbers that are not finite.
         """
         super().reset(seed=seed)
         options = options or {}
-        if (given := options.get("initial_state")) is None:
+        if (given := options.get("scene")) is None:
             draw = int(self.np_random.integers(2**31))
             given = scenes(options.get("task", "go to red object"), 1, draw)[0]
         self._initial = check(np.asarray(given)).copy()
@@ -162,14 +167,14 @@ class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         client.changeDynamics(body, -1, lateralFriction=0)
         return body
 
-    def _observation(self) -> NDArray[np.float32]:
+    def _observation(self) -> Seen:
         place, turn = self.client.getBasePositionAndOrientation(self._agent)
         velocity, spin = self.client.getBaseVelocity(self._agent)
         observation = self._initial.copy()
         observation[:STATE] = (*place, *turn, *velocity, *spin)
-        return observation
+        return {OBSERVED: observation}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Push for :data:`STEP` seconds. The reward is 0: what is right depends on the task, which physics does not know.
 
         Raises:
@@ -188,8 +193,9 @@ class AgentEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.client.stepSimulation()
         self._steps += 1
         observation = self._observation()
-        objects = np.stack([observation[columns][:3] for columns in OBJECT_COLUMNS])
-        reached = bool((np.linalg.norm(objects - observation[:3], axis=-1) < REACH).any())
+        world = observation[OBSERVED]
+        objects = np.stack([world[columns][:3] for columns in OBJECT_COLUMNS])
+        reached = bool((np.linalg.norm(objects - world[:3], axis=-1) < REACH).any())
         return observation, 0.0, reached, self._steps >= MAX_STEPS, {}
 
     def render(self) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.domains.agent.environment import LOOKAHEAD, STEP, AgentEnvironment
-from ftl_lightning.domains.agent.scenes import INITIAL, PLANE, object_positions, scenes, target
+from ftl_lightning.domains.agent.scenes import INITIAL, OBSERVED, PLANE, object_positions, scenes, target
 
 LENGTH = 150
 """States of a demonstration, padded with its last one (paper)."""
@@ -61,11 +61,11 @@ def demonstrate(environment: AgentEnvironment, initial: NDArray[np.float32], cho
     objects = object_positions(torch.from_numpy(initial)[None])[0].double().numpy()[:, PLANE]
     place = initial[list(PLANE)].astype(np.float64)
     corners = route(place, objects[chosen], objects[1 - chosen])
-    observation, _ = environment.reset(options={"initial_state": initial})
+    observation = environment.reset(options={"scene": initial})[0][OBSERVED]
     seen = [observation]
     for step in range(LENGTH - 1):
         ahead = along(corners, (step + LOOKAHEAD) * STEP * SPEED)
-        observation, *_ = environment.step((ahead - observation[list(PLANE)]).astype(np.float32))
+        observation = environment.step((ahead - observation[list(PLANE)]).astype(np.float32))[0][OBSERVED]
         seen.append(observation)
         near = np.linalg.norm(corners[-1] - observation[list(PLANE)]) < 0.02
         if near and np.linalg.norm(observation[7:10]) < AT_REST:

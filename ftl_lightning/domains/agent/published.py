@@ -1,6 +1,6 @@
 """The paper's numbers for navigation, to stand beside ours."""
 
-from ftl_lightning.domains.domain import Published
+from ftl_lightning.domains.paper import Published
 
 NEW = "new initial state"
 

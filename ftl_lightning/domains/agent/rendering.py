@@ -8,8 +8,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.agent.environment import AgentEnvironment
-from ftl_lightning.domains.agent.scenes import COLOURS, PLANE, REACH, looks, object_positions
+from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
+from ftl_lightning.domains.rollout import Rollout
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """A bowl is an open triangle that points down."""
@@ -18,23 +20,23 @@ EVERY = 4
 """Steps between two frames."""
 
 
-def render(states: Tensor, right: Sequence[bool] | None, title: str, initial_states: Tensor | None) -> Figure:
+def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
     """A grid of scenes from above with the agent's way.
 
     Args:
         states: plans ``(scene, horizon, 13)``.
         right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
         title: above the grid.
-        initial_states: ``(scene, 52)``.
+        starts: with ``world (scene, 52)``.
     """
-    assert initial_states is not None
+    assert starts is not None
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(2.6 * columns, 1.3 * rows + 0.4), layout="constrained")
     figure.suptitle(title, fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     grid = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, plan, initial, frame in zip(grid, states, initial_states, frames, strict=False):
+    for axes, plan, initial, frame in zip(grid, states, starts.observed[OBSERVED], frames, strict=False):
         _scene(axes, plan, initial, frame)
     for axes in figure.axes[len(states) :]:
         axes.set_axis_off()
@@ -56,17 +58,18 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
         spine.set(color=frame, linewidth=2.0)
 
 
-def frames(observations: Tensor, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode ``(time, 52)``, every :data:`EVERY` steps, until nothing moves any more.
+def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
+    """Pictures ``(height, width, 3)`` of an episode, every :data:`EVERY` steps, until nothing moves any more.
 
     Plans are not drawn: the pictures are the simulator's.
     """
+    observations = rollout.observed[OBSERVED][0]
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1
     environment = AgentEnvironment()
     pictures = []
     for observation in observations[:end:EVERY]:
-        environment.reset(options={"initial_state": observation.numpy()})
+        environment.reset(options={"scene": observation.numpy()})
         pictures.append(environment.render())
     environment.close()
     return pictures

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.errors import UserError
 
 COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
@@ -42,6 +43,17 @@ INITIAL = STATE + _TAIL + 2 * _OBJECT
 OBJECT_COLUMNS = tuple(slice(start, start + _OBJECT) for start in range(STATE + _TAIL, INITIAL, _OBJECT))
 PLANE = (0, 2)
 """x and z within a position."""
+OBSERVED = "world"
+"""Name of the observed feature: the agent and both objects."""
+FEATURE = Feature(
+    shape=(INITIAL,),
+    # Position, and as attributes colour and shape, of each object; its type (object 1 or 2) would tell apart what should be alike.
+    entities=tuple(
+        (*range(columns.start, columns.start + 3), *range(columns.start + 3 + len(TYPES), columns.stop)) for columns in OBJECT_COLUMNS
+    ),
+    attributes=tuple(range(3, 3 + _TAIL - len(TYPES))),
+    state=tuple(range(STATE)),
+)
 
 TRAINING_GROUPS = (
     tuple(itertools.product(("red", "yellow"), ("cone", "sphere"))),

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 from ftl_lightning.domains.agent.scenes import parse
-from ftl_lightning.domains.domain import EvaluationTask, Suite
+from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 
 TRAINING_CONCEPTS = ("go to red object", "go to yellow object", "go to bowl", "go to cube")
 COMPOSITIONS = ("go to red bowl", "go to yellow bowl", "go to red cube", "go to yellow cube", "go to purple cone")
 
-TRAINING = Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in TRAINING_CONCEPTS))
+TRAINING = training_suite(TRAINING_CONCEPTS)
 
 
 def _suite(learned: Sequence[str]) -> Suite:

@@ -1,53 +1,60 @@
 """The domain object: what the rest of the package knows of driving."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.domain import ClosedLoop, Domain
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split
 from ftl_lightning.domains.driving import policies
-from ftl_lightning.domains.driving.environment import MAX_STEPS, STATE, DrivingEnvironment, initial_state
+from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, DrivingEnvironment, initial_states, scene
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.published import PUBLISHED
-from ftl_lightning.domains.driving.rendering import frames, render
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, VEHICLES, make, observe, scenario
+from ftl_lightning.domains.driving.rendering import film, render
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.views import VIEWS
+from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.rollout import Rollout
 
 
-def generate(task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-    """Episodes of the expert that succeeded."""
-    settings = {
-        "domain": NAME,
-        "task": task,
-        "count": count,
-        "seed": seed,
-        "config": scenario(task).config,
-        "search": SEARCH[task],
-        "beyond": HORIZON,
-    }
-    return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress))
+class Expert:
+    """Episodes of the expert that succeeded: those that ship, and new ones."""
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """The same for every seed: the expert takes half an hour for them."""
+        return training_set(name, count)
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        settings = {
+            "domain": NAME,
+            "task": task,
+            "count": count,
+            "seed": seed,
+            "config": scenario(task).config,
+            "search": SEARCH[task],
+            "beyond": HORIZON,
+        }
+        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress))
+
+    def starts(self, task: str, count: int, seed: int) -> InitialStates:
+        """Scenes ``(count, 37)`` of new episodes."""
+        env = make(task)
+        found = []
+        for number in range(count):
+            start = episode_seed(seed, number)
+            env.reset(seed=start)
+            found.append(torch.from_numpy(scene(observe(env), task, start)))
+        env.close()
+        return initial_states(torch.stack(found))
 
 
-def starts(task: str, count: int, seed: int) -> Tensor:
-    """Initial states ``(count, 37)`` of new episodes."""
-    env = make(task)
-    found = []
-    for number in range(count):
-        start = episode_seed(seed, number)
-        env.reset(seed=start)
-        found.append(torch.from_numpy(initial_state(observe(env), task, start)))
-    env.close()
-    return torch.stack(found)
-
-
-def judge(goal: str, observations: Tensor, infos: Sequence[Mapping[str, Any]]) -> dict[str, Tensor]:
+def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
     """What happened in episodes.
 
     Returns:
@@ -56,37 +63,33 @@ def judge(goal: str, observations: Tensor, infos: Sequence[Mapping[str, Any]]) -
         episode that broke off.
     """
     columns = {"success": "passed", "strict success": "arrived", "crash": "crashed", "return": "return", "length": "length"}
-    found = {name: torch.tensor([float(info.get(key, 0)) for info in infos]) for name, key in columns.items()}
+    found = {name: torch.tensor([float(info.get(key, 0)) for info in rollout.infos]) for name, key in columns.items()}
     return found | {name: found[name] > 0 for name in ("success", "strict success", "crash")}
 
 
 DOMAIN = Domain(
     name=NAME,
-    horizon=HORIZON,
-    state_names=STATE_NAMES,
-    state_units=STATE_UNITS,
-    training_concepts=TRAINING_CONCEPTS,
-    suites=SUITES,
-    descriptions=tuple(SCENARIOS),
-    training_set=training_set,
-    generate=generate,
-    reads=lambda task: task in SCENARIOS,
-    succeeded=None,
-    render=render,
-    initial_states=starts,
+    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS),
+    concepts=Concepts(
+        training=TRAINING_CONCEPTS,
+        suites=SUITES,
+        descriptions=tuple(SCENARIOS),
+        reads=lambda task: task in SCENARIOS,
+        table=Path(__file__).parent / "embeddings.safetensors",
+    ),
+    source=lambda root: Expert(),
+    observed=FEATURES_SEEN,
+    headline="closed loop strict success",
+    show=Show(render),
     views=VIEWS,
-    entities=tuple(tuple(range(start, start + STATE)) for start in range(STATE, VEHICLES * STATE, STATE)),
     closed_loop=ClosedLoop(
         environment=DrivingEnvironment,
-        act=lambda plans, step, observations: plans[:, min(step + 1, plans.shape[1] - 1)],
+        act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
         steps=MAX_STEPS,
         judge=judge,
-        frames=frames,
-        headline="strict success",
-        costs=("crash",),
+        film=film,
+        less_is_better=("crash",),
         policies=policies.POLICIES,
     ),
-    published=PUBLISHED,
-    omega="learned",
-    published_omega="learned",
+    paper=Paper(PUBLISHED, omega="learned", ours="learned"),
 )

@@ -6,7 +6,9 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from ftl_lightning.demonstrations.features import Feature, InitialStates
 from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, arrived, make, observe
 from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
@@ -15,15 +17,24 @@ from ftl_lightning.errors import UserError
 NAMES = tuple(SCENARIOS)
 STATE = len(FEATURES)
 OBSERVED = VEHICLES * STATE
-INITIAL = OBSERVED + 2
-"""Columns of an initial state: what is observed, and what no network sees: the scenario's number and the seed of its start. A view
-reads the number for the time between two decisions.
-"""
+SCENE = OBSERVED + 2
+"""Columns of a scene: what is observed at its start, the scenario's number, and the seed of the start."""
+TRAFFIC, SCENARIO = "traffic", "scenario"
+"""Names of the observed features: vehicles ``(35,)`` and the scenario's number ``(1,)``, by which views know the time between two
+decisions and which road is one of pretraining."""
+FEATURES_SEEN = {
+    TRAFFIC: Feature((OBSERVED,), entities=tuple(tuple(range(start, start + STATE)) for start in range(STATE, OBSERVED, STATE))),
+    SCENARIO: Feature((1,)),
+}
 DRIVE = 4
 """Numbers of a drive."""
 MAX_STEPS = 30
 SEEDS = 2**24
 """Seeds are below, so that float32 holds them exactly."""
+
+
+Seen = dict[str, NDArray[np.float32]]
+"""Observed features by name."""
 
 
 class _Tried(NamedTuple):
@@ -35,7 +46,7 @@ class _Tried(NamedTuple):
     state: NDArray[np.float64] | None
 
 
-class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """Any scenario, from a start that its number and seed decide.
 
     An observation is an initial state (37 numbers). An action is the state (7 numbers) that the controlled vehicle should be in a
@@ -50,7 +61,9 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)
+    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
+        {name: gymnasium.spaces.Box(-np.inf, np.inf, feature.shape, np.float32) for name, feature in FEATURES_SEEN.items()}
+    )
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
 
     def __init__(self) -> None:
@@ -61,19 +74,19 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Seen, dict[str, Any]]:
         """Go to a start.
 
         Args:
-            seed: of the start, if no initial state is given.
-            options: ``initial_state``, 37 numbers; or ``task``, a scenario (default 'roundabout').
+            seed: of the start, if no scene is given.
+            options: ``scene``, 37 numbers; or ``task``, a scenario (default 'roundabout').
 
         Raises:
-            UserError: for an initial state that is not the start that its scenario and seed lead to.
+            UserError: for a scene that is not the start that its scenario and seed lead to.
         """
         super().reset(seed=seed)
         options = options or {}
-        given = options.get("initial_state")
+        given = options.get("scene")
         if given is None:
             name, start = options.get("task", "roundabout"), int(self.np_random.integers(SEEDS))
         else:
@@ -83,18 +96,19 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         super().reset(seed=start)  # of the draws among equal decisions
         self._env.reset(seed=start)
         self._seed, self._return, self._length = start, 0.0, 0
-        seen = self._observation()
-        if given is not None and not np.allclose(seen, given, atol=1e-3):
+        seen = observe(self._env)
+        if given is not None and not np.allclose(scene(seen, name, start), given, atol=1e-3):
             raise UserError(
-                f"driving initial state: expected the start of {name!r} that seed {start} gives, found another; episodes start at "
+                f"driving scene: expected the start of {name!r} that seed {start} gives, found another; episodes start at "
                 "starts, not in the middle of a drive"
             )
-        return seen, {}
+        return self._observation(), {}
 
-    def _observation(self) -> NDArray[np.float32]:
-        return initial_state(observe(self._env), self._name, self._seed)
+    def _observation(self) -> Seen:
+        number = np.array([NAMES.index(self._name)], dtype=np.float32)
+        return {TRAFFIC: observe(self._env).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Decide and drive on until the next decision.
 
         Raises:
@@ -165,23 +179,26 @@ class DrivingEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
             self._env.close()
 
 
-def initial_state(seen: NDArray[np.float32], name: str, seed: int) -> NDArray[np.float32]:
-    """The 37 numbers of what is observed ``(..., 5, 7)`` in an episode of this scenario and seed."""
+def scene(seen: NDArray[np.float32], name: str, seed: int) -> NDArray[np.float32]:
+    """The 37 numbers of a start ``(..., 5, 7)`` of this scenario and seed."""
     hidden = np.broadcast_to(np.array((NAMES.index(name), seed), dtype=np.float32), (*seen.shape[:-2], 2))
     return np.concatenate((seen.reshape(*seen.shape[:-2], OBSERVED), hidden), axis=-1)
 
 
-def origin(initial: NDArray[np.float32]) -> tuple[str, int]:
-    """Scenario and seed of an initial state.
+def initial_states(scenes: Tensor) -> InitialStates:
+    """Scenes ``(scene, 37)`` and what is observed in them."""
+    return InitialStates({TRAFFIC: scenes[:, :OBSERVED], SCENARIO: scenes[:, OBSERVED : OBSERVED + 1]}, scenes)
+
+
+def origin(given: NDArray[np.float32]) -> tuple[str, int]:
+    """Scenario and seed of a scene.
 
     Raises:
         UserError: for another size, or numbers that are none of a scenario and seed.
     """
-    if initial.shape != (INITIAL,) or not np.isfinite(initial).all():
-        raise UserError(f"driving initial state: expected {INITIAL} finite numbers, found shape {initial.shape}")
-    number, seed = initial[OBSERVED:].tolist()
+    if given.shape != (SCENE,) or not np.isfinite(given).all():
+        raise UserError(f"driving scene: expected {SCENE} finite numbers, found shape {given.shape}")
+    number, seed = given[OBSERVED:].tolist()
     if number not in range(len(NAMES)) or not (0 <= seed < SEEDS and seed == int(seed)):
-        raise UserError(
-            f"driving initial state: expected a scenario from 0 to {len(NAMES) - 1} and a seed, found {number:g} and {seed:g}"
-        )
+        raise UserError(f"driving scene: expected a scenario from 0 to {len(NAMES) - 1} and a seed, found {number:g} and {seed:g}")
     return NAMES[int(number)], int(seed)

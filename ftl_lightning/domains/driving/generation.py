@@ -12,7 +12,7 @@ import torch
 from ftl_lightning.demonstrations.cache import cache_folder
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving import expert
-from ftl_lightning.domains.driving.environment import SEEDS, STATE, initial_state
+from ftl_lightning.domains.driving.environment import FEATURES_SEEN, OBSERVED, SCENARIO, SEEDS, STATE, TRAFFIC, scene
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.errors import UserError
@@ -110,14 +110,18 @@ def demonstrations(name: str, count: int, seed: int, workers: int, progress: Cal
     else:
         raise UserError(f"driving {name!r}: expected {count} successful episodes of {driven}, found {len(kept)}")
     longest = max(len(seen) for _, seen in kept) + HORIZON
-    observations = torch.from_numpy(np.stack([initial_state(driven_on(seen, name, longest), name, start) for start, seen in kept]))
+    seen = np.stack([driven_on(seen, name, longest) for _, seen in kept])
+    traffic = torch.from_numpy(seen).float().flatten(2)
+    scenes = torch.from_numpy(np.stack([scene(seen[0], name, start) for start, seen in kept]))
     return Demonstrations(
-        states=observations[..., :STATE].contiguous(),
+        states=traffic[..., :STATE].contiguous(),
         lengths=torch.tensor([len(seen) for _, seen in kept]),
         domain=NAME,
         state_names=STATE_NAMES,
         state_units=STATE_UNITS,
         concepts=(name,) * count,
-        initial_states=observations,
+        observed={TRAFFIC: traffic, SCENARIO: scenes[:, None, OBSERVED : OBSERVED + 1].repeat(1, longest, 1)},
+        per_step=tuple(FEATURES_SEEN),
+        scenes=scenes,
         provenance={"generator": NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count},
     )

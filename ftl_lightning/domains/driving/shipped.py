@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
-from ftl_lightning.seeding import VALIDATION_SEED
 
 SHIPPED = Path(__file__).parent / "demonstrations"
 """The expert's episodes of the training scenarios, a file each; see the data card beside them."""
@@ -13,8 +13,8 @@ HELD_OUT = 10
 """So many of the shipped episodes of each scenario, its last, are for validation."""
 
 
-def training_set(count: int, seed: int) -> Demonstrations:
-    """The first ``count`` shipped episodes of each training scenario; with a validation seed, of those that are held out.
+def training_set(name: Split, count: int) -> Demonstrations:
+    """The first ``count`` shipped episodes of each training scenario; of ``'validation'``, of those that are held out.
 
     The expert takes half an hour for them, so they are the same for every seed.
 
@@ -22,11 +22,11 @@ def training_set(count: int, seed: int) -> Demonstrations:
         UserError: if fewer ship.
     """
     parts = []
-    for name in TRAINING_CONCEPTS:
-        shipped = Demonstrations.load(SHIPPED / f"{name}.safetensors")
+    for scenario in TRAINING_CONCEPTS:
+        shipped = Demonstrations.load(SHIPPED / f"{scenario}.safetensors")
         rows = list(range(len(shipped)))
-        pool = rows[-HELD_OUT:] if seed >= VALIDATION_SEED else rows[:-HELD_OUT]
+        pool = rows[-HELD_OUT:] if name == "validation" else rows[:-HELD_OUT]
         if count > len(pool):
-            raise UserError(f"data.samples_per_concept: expected at most {len(pool)} episodes of {name!r}, found {count}")
+            raise UserError(f"data.samples_per_concept, data.validation_per_concept: expected at most {len(pool)} episodes of {scenario!r}, found {count}")
         parts.append(shipped.rows(pool[:count]))
     return concatenate(parts)

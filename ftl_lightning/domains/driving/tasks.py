@@ -1,11 +1,11 @@
 """What is learned and evaluated: the paper's scenarios, and the validation suite on which everything is tuned."""
 
-from ftl_lightning.domains.domain import EvaluationTask, Suite
+from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 
 TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
 NEW = "new initial state"
 
-TRAINING = Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in TRAINING_CONCEPTS))
+TRAINING = training_suite(TRAINING_CONCEPTS)
 PAPER = Suite((EvaluationTask(NEW, "roundabout", learned="roundabout"),))
 VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned="roundabout third exit"),))
 """Another way through the same roundabout."""

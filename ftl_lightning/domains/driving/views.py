@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
+from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.domain import View
-from ftl_lightning.domains.driving.environment import INITIAL, OBSERVED, STATE
+from ftl_lightning.domains.driving.environment import FEATURES_SEEN, SCENARIO, STATE, TRAFFIC
 from ftl_lightning.domains.driving.motion import drive, speed, turn, turned, way
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
-from ftl_lightning.errors import UserError
 
 SECONDS = torch.tensor([decision_seconds(name) for name in SCENARIOS])
 """Between two decisions, by the number of the scenario."""
@@ -20,15 +20,9 @@ _PAIRS = ((1, 3, 5), (2, 4, 6))
 """Columns of a direction and the one across."""
 
 
-def _vehicles(initial_states: Tensor) -> Tensor:
-    """What is observed ``(sample, 5, 7)``, without what no model sees.
-
-    Raises:
-        UserError: for initial states of another size.
-    """
-    if initial_states.shape[-1] != INITIAL:
-        raise UserError(f"key 'initial_states': expected {INITIAL} numbers each, found {initial_states.shape[-1]}")
-    return initial_states[:, :OBSERVED].unflatten(-1, (VEHICLES, STATE))
+def _vehicles(observed: Observed) -> Tensor:
+    """The vehicles ``(sample, 5, 7)``."""
+    return observed[TRAFFIC].unflatten(-1, (VEHICLES, STATE))
 
 
 def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
@@ -44,59 +38,61 @@ def _near(places: Tensor) -> Tensor:
     return places * NEAR / (NEAR + places.norm(dim=-1, keepdim=True))
 
 
-def _observe_from_ego(initial_states: Tensor) -> Tensor:
+def _observe_from_ego(observed: Observed) -> Observed:
     """The controlled vehicle's place, speed and heading, and the others seen from it, those that are none at 0 ``(7 + 4 * 7)``.
 
     Place and heading are known on the roads of pretraining alone, else 0: on a new road they say nothing that was ever learned.
     """
-    vehicles = _vehicles(initial_states)
+    vehicles = _vehicles(observed)
     ego, others = vehicles[:, 0], vehicles[:, 1:]
     seen = _seen_from(others, ego)
     presence, place, velocity, heading = seen.split((1, 2, 2, 2), dim=-1)
     seen = torch.cat((presence, _near(place), velocity - speed(ego)[:, None], heading), dim=-1) * presence
-    own = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(initial_states)
-    return torch.cat((own[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), own[:, 4:], seen.flatten(1)), dim=-1)
+    own = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(observed)
+    return {TRAFFIC: torch.cat((own[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), own[:, 4:], seen.flatten(1)), dim=-1)}
 
 
-def _known(initial_states: Tensor) -> Tensor:
+def _known(observed: Observed) -> Tensor:
     """Whether the place on the map is ``(sample, 1)``: the road is one of pretraining, and it was not hidden."""
-    return (initial_states[:, :1] > 0) & KNOWN.to(initial_states.device)[initial_states[:, OBSERVED].long(), None]
+    traffic = observed[TRAFFIC]
+    return (traffic[:, :1] > 0) & KNOWN.to(traffic.device)[observed[SCENARIO].long()[:, 0], None]
 
 
-def _seconds(step: int, initial_states: Tensor) -> Tensor:
+def _seconds(step: int, observed: Observed) -> Tensor:
     """Between the state that comes before a plan's step and the one there ``(sample, 1)``: a plan's first is the present."""
-    return SECONDS.to(initial_states.device)[initial_states[:, OBSERVED].long(), None] * min(step, 1)
+    number = observed[SCENARIO].long()[:, 0]
+    return SECONDS.to(number.device)[number, None] * min(step, 1)
 
 
-def _encode_steps(states: Tensor, initial_states: Tensor) -> Tensor:
+def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
     """How each state ``(sample, horizon, 7)`` differs from the one before kept at its speed; the first, from the present.
 
     Presence; metres along and across the mean of both headings, which for a curve are its length and 0; metres a second along and
     across the own heading; cosine and sine of the turn.
     """
-    found, before = [], _vehicles(initial_states)[:, 0]
+    found, before = [], _vehicles(observed)[:, 0]
     for step, state in enumerate(states.unbind(dim=1)):
-        ahead = way(before, state) - _seconds(step, initial_states) * speed(before)
+        ahead = way(before, state) - _seconds(step, observed) * speed(before)
         found.append(torch.cat((state[:, :1], ahead, speed(state) - speed(before), turn(before, state)), dim=-1))
         before = state
     return torch.stack(found, dim=1)
 
 
-def _decode_steps(steps: Tensor, initial_states: Tensor) -> Tensor:
+def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
     """The inverse, for turns of any length."""
-    states = [_vehicles(initial_states)[:, 0]]
+    states = [_vehicles(observed)[:, 0]]
     for step, change in enumerate(steps.unbind(dim=1)):
         before = states[-1]
         angle = torch.atan2(change[:, 6], change[:, 5])
         heading = turned(before[:, 5:], angle.cos(), angle.sin())
-        ahead = change[:, 1:3] + _seconds(step, initial_states) * speed(before)
+        ahead = change[:, 1:3] + _seconds(step, observed) * speed(before)
         ahead = turned(turned(ahead, (angle / 2).cos(), (angle / 2).sin()), before[:, 5], before[:, 6])
         velocity = turned(change[:, 3:5] + speed(before), heading[:, 0], heading[:, 1])
         states.append(torch.cat((change[:, :1], before[:, 1:3] + ahead, velocity, heading), dim=-1))
     return torch.stack(states[1:], dim=1)
 
 
-def _act(plans: Tensor, step: int, observations: Tensor) -> Tensor:
+def _act(plans: Tensor, step: int, observed: Observed) -> Tensor:
     """The drive between two states of plans ``(episode, horizon, 7)``."""
     after = min(step + 1, plans.shape[1] - 1)
     return drive(plans[:, after - 1], plans[:, after])
@@ -106,25 +102,38 @@ PERTURBATION = 4.0
 """Standard deviation of the present's speed in m/s."""
 
 
-def _perturb(states: Tensor, initial_states: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
     """On an unknown road other speeds of the controlled vehicle in the present, from where it goes on as it did.
 
-    Half of the time a road is unknown.
+    Half of the time a road is unknown; without a generator all are, at the speed that is.
     """
-    ego = _vehicles(initial_states)[:, 0]
-    known = _known(initial_states) & (noise[:, 1:] > 0)
+    if draw is None:
+        noise = torch.tensor([[0.0, -1.0]], device=states.device).expand(len(states), 2)
+    else:
+        noise = torch.randn((len(states), 2), generator=draw, device=draw.device)
+    ego = _vehicles(observed)[:, 0]
+    known = _known(observed) & (noise[:, 1:] > 0)
     other = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
     now = torch.cat((ego[:, :3], other * ego[:, 5:], ego[:, 5:]), dim=-1)
-    seen = torch.cat((ego[:, :1] * known, now[:, 1:], initial_states[:, STATE:]), dim=-1)
-    return torch.cat((now[:, None], states[:, 1:]), dim=1), seen
+    traffic = torch.cat((ego[:, :1] * known, now[:, 1:], observed[TRAFFIC][:, STATE:]), dim=-1)
+    return torch.cat((now[:, None], states[:, 1:]), dim=1), {**observed, TRAFFIC: traffic}
 
 
 VIEWS = {
     "map": View(
-        encode=lambda states, initial_states: states,
-        decode=lambda states, initial_states: states,
-        observe=lambda initial_states: _vehicles(initial_states).flatten(1),
+        features={TRAFFIC: FEATURES_SEEN[TRAFFIC]},
+        observe=lambda observed: {TRAFFIC: observed[TRAFFIC]},
+        encode=lambda states, observed: states,
+        decode=lambda states, observed: states,
     ),
-    "steps": View(encode=_encode_steps, decode=_decode_steps, observe=_observe_from_ego, perturb=_perturb, act=_act, alike=_PAIRS),
+    "steps": View(
+        features={TRAFFIC: FEATURES_SEEN[TRAFFIC]},
+        observe=_observe_from_ego,
+        encode=_encode_steps,
+        decode=_decode_steps,
+        perturb=_perturb,
+        act=_act,
+        scales=_PAIRS,
+    ),
 }
 """``map`` is the paper's. In ``steps`` a plan is the same numbers on any road where the vehicle drives on as before."""

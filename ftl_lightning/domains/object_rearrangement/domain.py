@@ -1,18 +1,21 @@
 """The domain object: what the rest of the package knows of object rearrangement."""
 
-import functools
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.domain import Domain
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, Split
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse, sentence
 from ftl_lightning.domains.object_rearrangement.rendering import render
 from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import VALIDATION_SEED
 
 NAME = "object_rearrangement"
 STATE_NAMES = tuple(
@@ -43,13 +46,26 @@ def reads(task: str) -> bool:
         return False
 
 
-def succeeded(goal: str, states: Tensor, initial_states: Tensor | None = None) -> Tensor:
+class Generator:
+    """Scenes drawn anew from a seed."""
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        return _demonstrations(TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        return _demonstrations((task,), count, seed)
+
+    def starts(self, task: str, count: int, seed: int) -> None:
+        """A scene starts nowhere."""
+
+
+def succeeded(goal: str, states: Tensor, starts: InitialStates | None = None) -> Tensor:
     """Whether every relation of a goal holds in its relaxed form (paper, 'Evaluation data and metrics').
 
     Args:
         goal: relations in words.
         states: ``(sample, 1, 21)`` in the domain's units.
-        initial_states: there are none.
+        starts: there are none.
 
     Returns:
         ``(sample,)`` of bool.
@@ -59,23 +75,21 @@ def succeeded(goal: str, states: Tensor, initial_states: Tensor | None = None) -
 
 DOMAIN = Domain(
     name=NAME,
-    horizon=1,
-    state_names=STATE_NAMES,
-    state_units=STATE_UNITS,
-    training_concepts=TRAINING_CONCEPTS,
-    suites=SUITES,
-    descriptions=tuple(
-        dict.fromkeys((*TRAINING_CONCEPTS, *(text for suite in SUITES.values() for task in suite.tasks for text in (task.goal,))))
+    plans=Plans(1, STATE_NAMES, STATE_UNITS),
+    concepts=Concepts(
+        training=TRAINING_CONCEPTS,
+        suites=SUITES,
+        descriptions=tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for suite in SUITES.values() for goal in suite.goals)))),
+        reads=reads,
+        sentence=sentence,
+        table=Path(__file__).parent / "embeddings.safetensors",
     ),
-    training_set=functools.partial(_demonstrations, TRAINING_CONCEPTS),
-    generate=lambda task, count, seed, workers=1: _demonstrations((task,), count, seed),
-    reads=reads,
-    succeeded=succeeded,
-    render=render,
+    source=lambda root: Generator(),
+    metrics={ACCURACY: Metric(succeeded)},
+    show=Show(render),
     references={
-        "random scenes": lambda goal, count, initial_states, seed: random_scenes(count, seed)[:, None],
-        "generator (oracle)": lambda goal, count, initial_states, seed: generate(goal, count, seed)[:, None],
+        "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
+        "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
     },
-    sentence=sentence,
-    published=PUBLISHED,
+    paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
 )

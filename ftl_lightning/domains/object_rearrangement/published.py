@@ -1,6 +1,6 @@
 """The numbers that the paper reports for object rearrangement, as rows."""
 
-from ftl_lightning.domains.domain import Published
+from ftl_lightning.domains.paper import Published
 
 
 def _bars() -> list[Published]:

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, RegularPolygon
 from torch import Tensor
 
+from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
 
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
@@ -14,14 +15,14 @@ CORNERS = {"triangle": 3, "square": 4}
 MAX_COLUMNS = 8
 
 
-def render(states: Tensor, right: Sequence[bool] | None, title: str, initial_states: Tensor | None = None) -> Figure:
+def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None = None) -> Figure:
     """A grid of scenes.
 
     Args:
         states: ``(scene, 1, 21)`` in the domain's units.
         right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
         title: above the grid.
-        initial_states: there are none.
+        starts: there are none.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)

@@ -1,6 +1,6 @@
 """The paper's settings for object rearrangement, as data, and the validation suite on which everything is tuned."""
 
-from ftl_lightning.domains.domain import EvaluationTask, Suite
+from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, TRAINING_RELATIONS, Relation
 
 TRAINING_CONCEPTS = tuple(str(relation) for relation in TRAINING_RELATIONS)
@@ -18,7 +18,7 @@ def _suite(compositions: tuple[str, ...], new_concepts: tuple[str, ...], with_tr
     )
 
 
-TRAINING = Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in TRAINING_CONCEPTS))
+TRAINING = training_suite(TRAINING_CONCEPTS)
 
 PAPER = _suite(
     compositions=(

@@ -6,36 +6,31 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ftl_lightning.learning.concept_model import ConceptModel, Noise
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.learning.concept_model import ConceptModel, Draws
 
 
 class AdditiveModel(ConceptModel):
     """A model to which a composition is one concept: the weighted sum of its parts."""
 
     @abstractmethod
-    def errors(self, states: Tensor, initial_states: Tensor | None, concepts: Tensor) -> Tensor:
+    def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
         """Squared error of behaviour ``(batch,)``.
 
         Args:
             states: ``(batch, window, state)`` in the domain's units.
-            initial_states: ``(batch, initial state)`` or ``None``.
+            observed: features ``(batch, *shape)`` by name.
             concepts: ``(batch, n)``.
         """
 
-    def losses(
-        self,
-        states: Tensor,
-        initial_states: Tensor | None,
-        embeddings: Tensor,
-        weights: Tensor,
-        noise: Noise | None,
-        loss: str,
-    ) -> Tensor:
-        runs = len(embeddings)
-        each = added(embeddings, weights).repeat_interleave(len(states) // runs, dim=0)
-        return self.errors(states, initial_states, each).unflatten(0, (runs, -1))
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+        runs = len(composition.weights)
+        runs_apart = zip(composition.embeddings, composition.weights, strict=True)
+        each = added([Composition(embeddings, weights) for embeddings, weights in runs_apart])
+        return self.errors(states, observed, each.repeat_interleave(len(states) // runs, dim=0)).unflatten(0, (runs, -1))
 
 
-def added(concepts: Sequence[Tensor] | Tensor, weights: Sequence[Tensor] | Tensor) -> Tensor:
-    """Weighted sums ``(composition, n)`` of concepts ``(K, n)`` and weights ``(K,)`` each; K may differ between them."""
-    return torch.stack([omega @ own for own, omega in zip(concepts, weights, strict=True)])
+def added(compositions: Sequence[Composition]) -> Tensor:
+    """Weighted sums ``(composition, n)`` of concepts ``(K, n)``; K may differ between them."""
+    return torch.stack([one.weights @ one.embeddings for one in compositions])

@@ -7,9 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.learning.data import Batch, PretrainingData
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
@@ -55,7 +58,7 @@ class CloningModel(AdditiveModel, TextConceptModel):
     """A deterministic policy of the concept and, where there is one, the state; composing adds concepts.
 
     Args:
-        config, normalization, embeddings, initial_normalization: see :class:`TextConceptModel`.
+        config, domain, normalization, embeddings, initial_normalization: see :class:`TextConceptModel`.
     """
 
     kind = "bc"
@@ -66,64 +69,62 @@ class CloningModel(AdditiveModel, TextConceptModel):
     def __init__(
         self,
         config: CloningConfig,
+        domain: Domain,
         normalization: Normalization,
         embeddings: Tensor,
         initial_normalization: Normalization | None = None,
     ) -> None:
-        super().__init__(config, normalization, embeddings, initial_normalization)
+        super().__init__(config, domain, normalization, embeddings, initial_normalization)
         if config.members < 1:
             raise UserError(f"model.members: expected 1 or more, found {config.members}")
-        inputs = config.concept_dim + config.initial_state_dim
+        inputs = config.concept_dim + config.vector_dim
         self.network = ParallelMLP(config.members, inputs, config.hidden_dim, config.moments * config.state_dim)
 
     @property
     def window(self) -> int:
         return self.config.window
 
-    def predict(self, observed: Tensor | None, concepts: Tensor) -> Tensor:
+    def predict(self, vector: Tensor | None, concepts: Tensor) -> Tensor:
         """Transitions ``(member, batch, moments, state)``, normalised.
 
         Args:
-            observed: ``(member or 1, batch, m)`` or ``None``.
+            vector: ``(member or 1, batch, m)`` or ``None``.
             concepts: ``(member or 1, batch, n)``.
         """
-        out: Tensor = self.network(concepts if observed is None else torch.cat((observed, concepts), dim=-1))
+        out: Tensor = self.network(concepts if vector is None else torch.cat((vector, concepts), dim=-1))
         return out.unflatten(-1, (self.config.moments, self.config.state_dim))
 
-    def errors(self, states: Tensor, initial_states: Tensor | None, concepts: Tensor) -> Tensor:
+    def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
         """Squared error of transitions ``(batch,)``, the negative log-likelihood of a normal distribution but for constants.
 
         Args:
             states: ``(batch, window, state)`` in the domain's units.
-            initial_states: ``(batch, initial state)`` or ``None``.
+            observed: features ``(batch, *shape)`` by name.
             concepts: ``(batch, n)``.
         """
-        observed = self.encode_initial(initial_states)
-        predicted = self.predict(None if observed is None else observed[None], concepts[None])
-        target = self.encode(states[:, :: self.config.stride], initial_states)
+        vector = self.vector(observed)
+        predicted = self.predict(None if vector is None else vector[None], concepts[None])
+        target = self.encode(states[:, :: self.config.stride], observed)
         return (predicted - target).square().mean(dim=(0, 2, 3))
 
     @torch.no_grad()
     def sample(
         self,
-        concepts: Sequence[Tensor],
-        weights: Sequence[Tensor],
+        compositions: Sequence[Composition],
         count: int,
-        sampler: Sampler,
-        steps: int,
-        temperature: float,
+        sampling: Sampling,
         generators: Sequence[torch.Generator],
-        initial_states: Tensor | None = None,
+        observed: Observed | None = None,
     ) -> Tensor:
-        """Deterministic: ``sampler``, ``steps``, ``temperature`` and ``generators`` do not matter."""
-        condition = added(concepts, weights).repeat_interleave(count, dim=0)
+        """Deterministic: ``sampling`` and ``generators`` do not matter."""
+        condition = added(compositions).repeat_interleave(count, dim=0)
         member = torch.arange(len(condition), device=self.device) % count % self.config.members
         rows = torch.arange(len(condition), device=self.device)
 
-        def predict(observed: Tensor | None) -> Tensor:
-            return self.predict(None if observed is None else observed[None], condition[None])[member, rows]
+        def predict(vector: Tensor | None) -> Tensor:
+            return self.predict(None if vector is None else vector[None], condition[None])[member, rows]
 
-        return unroll(self, predict, initial_states).unflatten(0, (len(concepts), count))
+        return unroll(self, predict, observed or {}).unflatten(0, (len(compositions), count))
 
 
 class CloningPretraining(Pretraining):
@@ -154,12 +155,12 @@ class CloningPretraining(Pretraining):
         initial_normalization: Normalization | None,
     ) -> CloningModel:
         own = {name: self.hparams[name] for name in ("hidden_dim", "members", "stride")}
-        config = CloningConfig(**dict(shared) | own | {"horizon": self.hparams["plan_horizon"] or data.domain.horizon})
+        config = CloningConfig(**dict(shared) | own | {"horizon": self.hparams["plan_horizon"] or data.domain.plans.horizon})
         expect_window(config, data)
-        return CloningModel(config, normalization, embeddings, initial_normalization)
+        return CloningModel(config, data.domain, normalization, embeddings, initial_normalization)
 
     def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Squared error of what follows."""
         assert isinstance(model, CloningModel)
-        states, initial = model.perturbed(batch.states, batch.initial_states, draw)
-        return model.errors(states, initial, model.training_embeddings[batch.concepts])
+        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        return model.errors(states, seen, model.training_embeddings[batch.concepts])

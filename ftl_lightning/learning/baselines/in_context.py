@@ -9,9 +9,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.learning.data import Batch, PretrainingData
+from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.demonstrations.features import Observed, moved
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -43,7 +47,7 @@ class InContextModel(ConceptModel):
     and puts out, for each number of what follows, probabilities of bins over [-1, 1].
 
     Args:
-        config, normalization, embeddings, initial_normalization: see :class:`ConceptModel`.
+        config, domain, normalization, embeddings, initial_normalization: see :class:`ConceptModel`.
     """
 
     kind = "in-context"
@@ -55,17 +59,18 @@ class InContextModel(ConceptModel):
     def __init__(
         self,
         config: InContextConfig,
+        domain: Domain,
         normalization: Normalization,
         embeddings: Tensor,
         initial_normalization: Normalization | None = None,
     ) -> None:
-        super().__init__(config, normalization, embeddings, initial_normalization)
+        super().__init__(config, domain, normalization, embeddings, initial_normalization)
         if config.width % config.heads:
             raise UserError(f"model.width: expected a multiple of {config.heads} (model.heads), found {config.width}")
-        numbers = config.initial_state_dim + config.state_dim
+        numbers = config.vector_dim + config.state_dim
         self.token = nn.Linear(numbers, config.width)
         self.place = nn.Parameter(0.02 * torch.randn(config.tokens + 1, config.width))
-        self.present = nn.Linear(config.initial_state_dim, config.width)
+        self.present = nn.Linear(config.vector_dim, config.width)
         form = {"dim_feedforward": 2 * config.width, "dropout": 0.0, "batch_first": True, "norm_first": True}
         layer = nn.TransformerEncoderLayer(config.width, config.heads, **form)  # type: ignore[arg-type]
         self.encoder = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
@@ -85,29 +90,27 @@ class InContextModel(ConceptModel):
         """Each demonstration as the model reads it ``(demo, n)``.
 
         Args:
-            demonstrations: with initial states at every time.
-            hide: as if it were not known where they are, if the model's view can hide that.
+            demonstrations: with features observed at every time.
+            hide: without what a new task will not show, if the model's view can hide that.
 
         Raises:
-            UserError: where initial states are known for the first time alone.
+            UserError: where features are observed for the first time alone.
         """
-        if demonstrations.initial_states is None or demonstrations.initial_states.dim() != 3:
-            raise UserError("key 'initial_states': expected one for each time (demo, time, initial state), found others")
+        if not demonstrations.per_step or not set(self.domain.observed) <= set(demonstrations.per_step):
+            raise UserError("key 'per_step': expected every feature to be observed at each time, found others")
         tokens, stride = self.config.tokens, self.config.stride
         rows = torch.arange(len(demonstrations)).repeat_interleave(tokens)
         starts = (stride * torch.arange(tokens)).repeat(len(demonstrations))
-        states, initial = demonstrations.windows(rows, starts.minimum(demonstrations.lengths[rows] - 1), self.window)
-        assert initial is not None
-        states, initial = states.to(self.device), initial.to(self.device)
+        states, own = demonstrations.windows(rows, starts.minimum(demonstrations.lengths[rows] - 1), self.window)
+        seen: Observed = moved(own, self.device)
+        states = states.to(self.device)
         if hide:
             assert self.view is not None
             assert self.view.perturb is not None
-            states, initial = self.view.perturb(
-                states, initial, torch.tensor([[0.0, -1.0]], device=self.device).expand(len(states), 2)
-            )
-        observed = self.encode_initial(initial)
+            states, seen = self.view.perturb(states, seen, None)
+        observed = self.vector(seen)
         assert observed is not None
-        read = torch.cat((observed, self.encode(states[:, ::stride], initial)[:, -1]), dim=-1)
+        read = torch.cat((observed, self.encode(states[:, ::stride], seen)[:, -1]), dim=-1)
         return read.unflatten(0, (-1, tokens)).flatten(1).cpu()
 
     def read(self, prompts: Tensor, given: Tensor) -> Tensor:
@@ -132,29 +135,26 @@ class InContextModel(ConceptModel):
     @torch.no_grad()
     def sample(
         self,
-        concepts: Sequence[Tensor],
-        weights: Sequence[Tensor],
+        compositions: Sequence[Composition],
         count: int,
-        sampler: Sampler,
-        steps: int,
-        temperature: float,
+        sampling: Sampling,
         generators: Sequence[torch.Generator],
-        initial_states: Tensor | None = None,
+        observed: Observed | None = None,
     ) -> Tensor:
-        """``concepts`` are demonstrations; ``temperature`` sharpens the bins' probabilities, 0 takes the most probable.
+        """Concepts are demonstrations; the temperature sharpens the bins' probabilities, 0 takes the most probable.
 
-        ``weights``, ``sampler`` and ``steps`` do not matter.
+        Weights, sampler and steps do not matter.
         """
-        prompts = nn.utils.rnn.pad_sequence(list(concepts), batch_first=True)
-        counts = torch.tensor([len(own) for own in concepts], device=self.device)
+        prompts, temperature = batched(compositions).embeddings, sampling.temperature
+        counts = torch.tensor([len(one.weights) for one in compositions], device=self.device)
         given = torch.arange(prompts.shape[1], device=self.device) < counts[:, None]
         memory = self.read(prompts, given)
         middles = (torch.arange(self.config.bins, device=self.device) + 0.5) / self.config.bins * 2 - 1
         shape = (count, self.config.state_dim, self.config.bins)
 
-        def predict(observed: Tensor | None) -> Tensor:
-            assert observed is not None
-            logits = self.follow(memory, given, observed.unflatten(0, (len(concepts), count)))
+        def predict(vector: Tensor | None) -> Tensor:
+            assert vector is not None
+            logits = self.follow(memory, given, vector.unflatten(0, (len(compositions), count)))
             if temperature:
                 drawn = [torch.rand(shape, generator=one, device=one.device) for one in generators]
                 gumbel = -(-torch.stack(drawn).clamp(1e-9, 1 - 1e-7).log()).log()
@@ -162,7 +162,7 @@ class InContextModel(ConceptModel):
             following = middles[logits.argmax(dim=-1)].flatten(0, 1)
             return torch.stack((self.start.expand_as(following), following), dim=1)
 
-        return unroll(self, predict, initial_states).unflatten(0, (len(concepts), count))
+        return unroll(self, predict, observed or {}).unflatten(0, (len(compositions), count))
 
 
 class InContextPretraining(Pretraining):
@@ -205,13 +205,14 @@ class InContextPretraining(Pretraining):
         initial_normalization: Normalization | None,
     ) -> InContextModel:
         if initial_normalization is None:
-            raise UserError(f"data.class_path: expected a domain with initial states, found {data.domain.name}: nothing follows")
+            raise UserError(f"data.class_path: expected a domain with observed features, found {data.domain.name}: nothing follows")
         own = {name: self.hparams[name] for name in ("tokens", "bins", "width", "layers", "heads", "stride")}
-        size = own["tokens"] * (shared["initial_state_dim"] + shared["state_dim"])
-        horizon = self.hparams["plan_horizon"] or data.domain.horizon
+        sizes = Sizes(**{key: shared[key] for key in ("horizon", "state_dim", "concept_dim", "observed")})
+        size = own["tokens"] * (sizes.vector_dim + sizes.state_dim)
+        horizon = self.hparams["plan_horizon"] or data.domain.plans.horizon
         config = InContextConfig(**dict(shared) | own | {"concept_dim": size, "horizon": horizon})
         expect_window(config, data)
-        model = InContextModel(config, normalization, torch.zeros(len(embeddings), size), initial_normalization)
+        model = InContextModel(config, data.domain, normalization, torch.zeros(len(embeddings), size), initial_normalization)
         self._prompts = model.prompts(data.training)
         # Roads are hidden from whole prompts, as they are from a present in each of two windows.
         self._hidden = model.prompts(data.training, hide=True) if config.perturb else self._prompts
@@ -219,16 +220,16 @@ class InContextPretraining(Pretraining):
         self._own = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
         model.training_embeddings.copy_(self._prompts[[own[0] for own in self._own]])
         windows = data.first_windows()
-        model.start.copy_(model.encode(windows.states[:, :: self.stride], windows.initial_states)[:, 0].mean(dim=0))
+        model.start.copy_(model.encode(windows.states[:, :: self.stride], windows.observed)[:, 0].mean(dim=0))
         return model
 
     def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Negative log-likelihood of the bins of what follows."""
         assert isinstance(model, InContextModel)
-        states, initial = model.perturbed(batch.states, batch.initial_states, draw)
-        observed = model.encode_initial(initial)
+        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        observed = model.vector(seen)
         assert observed is not None
-        target = model.bins(model.encode(states[:, :: self.stride], initial)[:, -1])
+        target = model.bins(model.encode(states[:, :: self.stride], seen)[:, -1])
         most, groups = self.hparams["prompts"], len(self._own)
         rows = [[own[int(u * len(own))] for u in torch.rand(most, generator=draw, device=draw.device)] for own in self._own]
         counts = torch.randint(1, most + 1, (groups, 1), generator=draw, device=draw.device) if model.training else most

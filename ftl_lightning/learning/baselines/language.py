@@ -3,11 +3,13 @@
 import torch
 from torch import Tensor
 
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.encoder import load_encoder
-from ftl_lightning.domains.domain import EvaluationTask, load_domain
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.inversion import origin
 from ftl_lightning.learning.generative_model import GenerativeModel
 
 
@@ -28,7 +30,7 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or another encoder.
     """
 
-    kinds = ("diffusion",)
+    adapts = (GenerativeModel,)
     method = "language"
 
     def __init__(
@@ -42,21 +44,21 @@ class LanguageAdaptation(Adaptation):
     ) -> None:
         super().__init__(pretrained, omega, output)
         self.save_hyperparameters()
-        self._encoder = load_encoder(encoder, load_domain(self.model.config.domain).table, revision)
+        self._encoder = load_encoder(encoder, self.model.domain.concepts.table, revision)
         if (found := self._encoder.identity) != self.model.config.encoder:
             raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {found!r}")
 
     def _embedding(self, goal: str) -> Tensor:
         """``(1, n)`` of a task's description."""
         assert isinstance(self.model, GenerativeModel)
-        return self.model.standardise(self._encoder([self.domain.sentence(goal)]).to(self.device))
+        return self.model.standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))
 
     def learned(self) -> dict[str, Concept]:
         weights = torch.tensor([self._omega])
-        return {name: Concept(self._embedding(name).cpu(), weights, self.origin(name, "fixed", 0.0)) for name in self.concepts}
+        return {name: Concept(self._embedding(name).cpu(), weights, origin(self.model, self.demonstrations, name, "fixed", 0.0)) for name in self.concepts}
 
-    def composition(self, task: EvaluationTask) -> tuple[Tensor, Tensor] | None:
+    def composition(self, task: EvaluationTask) -> Composition | None:
         """The description of the whole task, with its weight."""
         if task.learned and (task.learned not in self._found or task.component is not None):
             return None
-        return self._embedding(task.goal), torch.tensor([self._omega], device=self.device)
+        return Composition(self._embedding(task.goal), torch.tensor([self._omega], device=self.device))

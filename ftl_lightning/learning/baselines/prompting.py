@@ -4,6 +4,7 @@ import torch
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.inversion import origin
 from ftl_lightning.learning.baselines.in_context import InContextModel
 
 
@@ -16,7 +17,7 @@ class InContextAdaptation(Adaptation):
         seed: of the evaluation's rows.
     """
 
-    kinds = ("in-context",)
+    adapts = (InContextModel,)
     method = "in-context"
 
     def __init__(self, pretrained: str, output: str | None = None, seed: int = 0) -> None:
@@ -28,5 +29,5 @@ class InContextAdaptation(Adaptation):
         assert isinstance(self.model, InContextModel)
         for name in self.concepts:
             prompts = self.model.prompts(self.demonstrations.select(name))
-            found[name] = Concept(prompts, torch.ones(len(prompts)), self.origin(name, "fixed", 0.0))
+            found[name] = Concept(prompts, torch.ones(len(prompts)), origin(self.model, self.demonstrations, name, "fixed", 0.0))
         return found

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.datamodule import PretrainingData
+from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
+from ftl_lightning.learning.data import PretrainingData
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +27,7 @@ class StepConfig(ModelConfig):
             raise UserError(f"model.stride: expected 1 or more, found {self.stride}")
         if self.horizon > 1 and (self.horizon, self.stride) != (2, 1) and not self.state_columns:
             raise UserError(
-                f"model.plan_horizon: expected 2 states, and stride 1 (initial states of domain {self.domain} hold no state from "
+                f"model.plan_horizon: expected 2 states, and stride 1 (what domain {self.domain} observes holds no state from "
                 f"which a longer plan could be unrolled), found {self.horizon} and {self.stride}"
             )
 
@@ -51,24 +52,25 @@ def expect_window(config: StepConfig, data: PretrainingData) -> None:
         raise UserError(f"data.horizon: expected {config.window} (states that a transition spans), found {data.horizon}")
 
 
-def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], initial_states: Tensor | None) -> Tensor:
+def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], observed: Observed) -> Tensor:
     """Plans ``(batch, horizon, state)`` in the domain's units.
 
     Args:
         model: whose transitions they are; its configuration is a :class:`StepConfig`.
-        predict: ``initial states as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
-        initial_states: ``(batch, initial state)`` in the domain's units, or ``None``.
+        predict: ``observed vectors as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
+        observed: features ``(batch, *shape)`` by name, in the domain's units.
     """
     config = model.config
     assert isinstance(config, StepConfig)
-    first = model.decode(predict(model.encode_initial(initial_states)), initial_states)
+    first = model.decode(predict(model.vector(observed)), observed)
     if config.horizon == 1 or (config.horizon, config.stride) == (2, 1):
         return first
-    assert initial_states is not None
-    states, present = [initial_states[:, config.state_columns], first[:, -1]], initial_states.clone()
+    ((name, columns),) = [(name, feature.state) for name, feature in model.domain.observed.items() if feature.state]
+    present = {other: values.clone() for other, values in observed.items()}
+    states = [observed[name][:, columns], first[:, -1]]
     while len(states) < 1 + -(-(config.horizon - 1) // config.stride):
-        present[:, config.state_columns] = states[-1]
-        states.append(model.decode(predict(model.encode_initial(present)), present)[:, -1])
+        present[name][:, columns] = states[-1]
+        states.append(model.decode(predict(model.vector(present)), present)[:, -1])
     coarse = torch.stack(states, dim=1)
     at = torch.arange(config.horizon, device=coarse.device) / config.stride
     before = at.long().clamp(max=len(states) - 2)

@@ -7,9 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.demonstrations.datamodule import Batch, PretrainingData
+from ftl_lightning.learning.data import Batch, PretrainingData
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import Observed, moved
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import Sampler
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
 from ftl_lightning.learning.pretraining import Pretraining
@@ -30,7 +33,7 @@ class VAEModel(AdditiveModel):
     """Behaviour from an initial state and z, a normal variable in which a concept is a point; composing adds points.
 
     Args:
-        config, normalization, embeddings, initial_normalization: see :class:`ConceptModel`.
+        config, domain, normalization, embeddings, initial_normalization: see :class:`ConceptModel`.
     """
 
     kind = "cvae"
@@ -41,50 +44,48 @@ class VAEModel(AdditiveModel):
     def __init__(
         self,
         config: VAEConfig,
+        domain: Domain,
         normalization: Normalization,
         embeddings: Tensor,
         initial_normalization: Normalization | None = None,
     ) -> None:
-        super().__init__(config, normalization, embeddings, initial_normalization)
-        plan, beside, z = config.horizon * config.state_dim, config.initial_state_dim, config.concept_dim
+        super().__init__(config, domain, normalization, embeddings, initial_normalization)
+        plan, beside, z = config.horizon * config.state_dim, config.vector_dim, config.concept_dim
         self.encoder = nn.Sequential(nn.Linear(plan + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, 2 * z))
         self.decoder = nn.Sequential(nn.Linear(z + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, plan))
 
-    def posterior(self, states: Tensor, initial_states: Tensor | None) -> tuple[Tensor, Tensor]:
+    def posterior(self, states: Tensor, observed: Observed) -> tuple[Tensor, Tensor]:
         """Mean and logarithm of the variance of z, ``(batch, z)`` each, of behaviour ``(batch, horizon, state)``."""
-        observed = self.encode_initial(initial_states)
-        plan = self.encode(states, initial_states).flatten(1)
-        mean, log_variance = self.encoder(plan if observed is None else torch.cat((plan, observed), dim=-1)).chunk(2, dim=-1)
+        vector = self.vector(observed)
+        plan = self.encode(states, observed).flatten(1)
+        mean, log_variance = self.encoder(plan if vector is None else torch.cat((plan, vector), dim=-1)).chunk(2, dim=-1)
         return mean, log_variance
 
-    def plans(self, z: Tensor, initial_states: Tensor | None) -> Tensor:
+    def plans(self, z: Tensor, observed: Observed) -> Tensor:
         """Behaviour ``(batch, horizon, state)``, normalised, of ``z (batch, z)``."""
-        observed = self.encode_initial(initial_states)
-        out: Tensor = self.decoder(z if observed is None else torch.cat((z, observed), dim=-1))
+        vector = self.vector(observed)
+        out: Tensor = self.decoder(z if vector is None else torch.cat((z, vector), dim=-1))
         return out.unflatten(-1, (self.config.horizon, self.config.state_dim))
 
-    def errors(self, states: Tensor, initial_states: Tensor | None, concepts: Tensor) -> Tensor:
+    def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
         """Squared error of the reconstruction ``(batch,)``."""
-        return (self.plans(concepts, initial_states) - self.encode(states, initial_states)).square().mean(dim=(1, 2))
+        return (self.plans(concepts, observed) - self.encode(states, observed)).square().mean(dim=(1, 2))
 
     @torch.no_grad()
     def sample(
         self,
-        concepts: Sequence[Tensor],
-        weights: Sequence[Tensor],
+        compositions: Sequence[Composition],
         count: int,
-        sampler: Sampler,
-        steps: int,
-        temperature: float,
+        sampling: Sampling,
         generators: Sequence[torch.Generator],
-        initial_states: Tensor | None = None,
+        observed: Observed | None = None,
     ) -> Tensor:
-        """``temperature`` is the variance of the noise that is added to z; ``sampler`` and ``steps`` do not matter."""
+        """The temperature is the variance of the noise that is added to z; sampler and steps do not matter."""
         shape = (count, self.config.concept_dim)
         noise = torch.stack([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
-        z = added(concepts, weights)[:, None] + temperature**0.5 * noise
-        plans = self.plans(z.flatten(0, 1), initial_states)
-        return self.decode(plans, initial_states).unflatten(0, (len(concepts), count))
+        z = added(compositions)[:, None] + sampling.temperature**0.5 * noise
+        seen = observed or {}
+        return self.decode(self.plans(z.flatten(0, 1), seen), seen).unflatten(0, (len(compositions), count))
 
 
 class VAEPretraining(Pretraining):
@@ -114,25 +115,25 @@ class VAEPretraining(Pretraining):
         latent = self.hparams["latent_dim"]
         config = VAEConfig(**dict(shared) | {"concept_dim": latent, "hidden_dim": self.hparams["hidden_dim"]})
         self._first = data.first_windows()
-        return VAEModel(config, normalization, torch.zeros(len(embeddings), latent), initial_normalization)
+        return VAEModel(config, data.domain, normalization, torch.zeros(len(embeddings), latent), initial_normalization)
 
     def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """The negative evidence lower bound, per number of the behaviour (Kingma & Welling, 2014)."""
         assert isinstance(model, VAEModel)
-        states, initial = model.perturbed(batch.states, batch.initial_states, draw)
-        mean, log_variance = model.posterior(states, initial)
+        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        mean, log_variance = model.posterior(states, seen)
         noise = torch.randn(mean.shape, generator=draw, device=mean.device)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
         numbers = model.config.horizon * model.config.state_dim
-        errors = model.errors(states, initial, mean + (0.5 * log_variance).exp() * noise)
+        errors = model.errors(states, seen, mean + (0.5 * log_variance).exp() * noise)
         return errors + self.hparams["beta"] * divergence / numbers
 
     def _represent(self) -> None:
         model = self.model
         assert isinstance(model, VAEModel)
-        states, _, initial = self._first
+        states, _, seen = self._first
         with torch.no_grad():
-            mean, _ = model.posterior(states.to(self.device), None if initial is None else initial.to(self.device))
+            mean, _ = model.posterior(states.to(self.device), moved(seen, self.device))
         model.training_embeddings.copy_(mean)
 
     def on_validation_start(self) -> None:

@@ -1,31 +1,50 @@
-"""Encoders of the initial state: the paper's, which takes it as one vector, and two that treat exchangeable entities alike."""
+"""Condition encoders: what a denoiser reads from observed features.
 
+Each has two halves: ``observe`` reads the features once a plan, ``attend`` brings in the concept at every step of denoising. The
+paper's encoder takes vectors as one; two others treat exchangeable entities alike.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.concepts.composition import Context
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.errors import UserError
 
 
-class FlatEncoder(nn.Module):
-    """The whole initial state through one network, as in the paper; it does not see the concept.
+class ConditionEncoder(nn.Module, ABC):
+    """What every condition encoder offers."""
+
+    @abstractmethod
+    def observe(self, vector: Tensor) -> Context:
+        """What is read of the observed vectors ``(batch, m)``, one after another and normalised, whatever the concept."""
+
+    @abstractmethod
+    def attend(self, context: Context, concept: Tensor) -> Tensor:
+        """Features ``(batch, width)`` of that for ``concept (batch, n)``."""
+
+
+class FlatEncoder(ConditionEncoder):
+    """All vectors through one network, as in the paper; it does not see the concept.
 
     Args:
-        sizes: of which the initial state's is used.
+        sizes: of which the observed vectors' is used.
         width: of the features.
     """
 
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(nn.Linear(sizes.initial_state_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.net = nn.Sequential(nn.Linear(sizes.vector_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
 
-    def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
-        """Features ``(batch, width)`` of ``initial_state (batch, m)``; ``concept (batch, n)`` is not used."""
-        features: Tensor = self.net(initial_state)
-        return features
+    def observe(self, vector: Tensor) -> Context:
+        return (self.net(vector),)
+
+    def attend(self, context: Context, concept: Tensor) -> Tensor:
+        return context[0]
 
 
 def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
@@ -36,22 +55,22 @@ def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
     own = set(columns.flatten().tolist())
     # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
     # columns are 0 after normalisation.
-    shared = [column for column in range(sizes.initial_state_dim) if column not in own]
+    shared = [column for column in range(sizes.vector_dim) if column not in own]
     return columns, torch.tensor(shared, dtype=torch.int64)
 
 
-class EntityEncoder(nn.Module):
-    """Every entity through the same network; the concept attends to them, so that it is a matter of looks and not of places.
+class EntityEncoder(ConditionEncoder):
+    """Every entity through the same network; the concept attends to them by their attributes, not by their places.
 
-    The concept is turned into a weight for each column of an entity's looks, and their sum decides which entity is attended to:
-    what makes red and what makes a bowl add up in a red bowl that was never seen, and no column is harder to ask for than another.
-    There is one head: several can disagree about where to go, which traps concepts that are learned through them. What is read from
-    the attended entity is all but its looks, so that a red bowl is reached like any other. Exchanging two entities changes nothing.
-    What belongs to no entity goes to each of them, and into the features.
+    The concept is turned into a weight for each column of an entity's attributes, and their sum decides which entity is attended
+    to: what makes red and what makes a bowl add up in a red bowl that was never seen. There is one head: several can disagree about
+    where to go, which traps concepts that are learned through them. What is read from the attended entity is all but its
+    attributes, so that a red bowl is reached like any other. Exchanging two entities changes nothing. What belongs to no entity
+    goes to each of them, and into the features.
 
     Args:
-        sizes: of the initial state and its entities, of whose columns those a concept asks for are not read; where none are named,
-            all are asked for and all are read.
+        sizes: of the observed vectors and their entities, of whose columns those a concept asks for are not read; where none are
+            named, all are asked for and all are read.
         width: of the features.
     """
 
@@ -61,42 +80,45 @@ class EntityEncoder(nn.Module):
     def __init__(self, sizes: Sizes, width: int) -> None:
         super().__init__()
         columns, shared = _entity_columns("entities", sizes)
-        self.looks = list(sizes.looks or range(columns.shape[1]))
-        self.rest = [column for column in range(columns.shape[1]) if column not in sizes.looks]
+        self.attributes = list(sizes.attributes or range(columns.shape[1]))
+        self.rest = [column for column in range(columns.shape[1]) if column not in sizes.attributes]
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("shared", shared, persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(len(self.rest) + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
         # Adam turns the query a little (with norm 20, as it is, it would flip it).
-        self.query = nn.Linear(sizes.concept_dim, len(self.looks))
+        self.query = nn.Linear(sizes.concept_dim, len(self.attributes))
         nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + len(self.rest), inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Where the attended entity is gets through without a bend: a plan ends there.
         self.direct = nn.Linear(inner + len(shared), width)
 
-    def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
-        """Features ``(batch, width)`` of ``initial_state (batch, m)``, normalised, for ``concept (batch, n)``."""
-        shared = initial_state[:, self.shared]
-        each = initial_state[:, self.columns]  # (batch, entity, columns)
+    def observe(self, vector: Tensor) -> Context:
+        """What tells the entities apart, what is read from each, and what belongs to none."""
+        shared = vector[:, self.shared]
+        each = vector[:, self.columns]  # (batch, entity, columns)
         rest = each[..., self.rest]
         hidden = self.entity(torch.cat((rest, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
-        value = self.value(torch.cat((hidden, rest), dim=-1))
+        return each[..., self.attributes], self.value(torch.cat((hidden, rest), dim=-1)), shared
+
+    def attend(self, context: Context, concept: Tensor) -> Tensor:
+        attributes, value, shared = context
         query = self.query(concept / concept.shape[-1] ** 0.5)[:, None]
-        attended = functional.scaled_dot_product_attention(query, each[..., self.looks], value, scale=1.0)[:, 0]
+        attended = functional.scaled_dot_product_attention(query, attributes, value, scale=1.0)[:, 0]
         both = torch.cat((attended, shared), dim=-1)
         features: Tensor = self.out(both) + self.direct(both)
         return features
 
 
-class SetEncoder(nn.Module):
+class SetEncoder(ConditionEncoder):
     """Every entity through the same network, of whose features the largest and the mean are read (deep sets, Zaheer et al., 2017).
 
     What belongs to no entity goes to each of them, and into the features. The concept is not seen.
 
     Args:
-        sizes: of the initial state and its entities.
+        sizes: of the observed vectors and their entities.
         width: of the features.
     """
 
@@ -112,19 +134,20 @@ class SetEncoder(nn.Module):
         self.entity = nn.Sequential(nn.Linear(columns.shape[1] + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
         self.out = nn.Sequential(nn.Linear(2 * inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
 
-    def forward(self, initial_state: Tensor, concept: Tensor) -> Tensor:
-        """Features ``(batch, width)`` of ``initial_state (batch, m)``, normalised; ``concept (batch, n)`` is not used."""
-        shared = initial_state[:, self.shared]
-        each = initial_state[:, self.columns]  # (batch, entity, columns)
+    def observe(self, vector: Tensor) -> Context:
+        shared = vector[:, self.shared]
+        each = vector[:, self.columns]  # (batch, entity, columns)
         hidden = self.entity(torch.cat((each, shared[:, None].expand(-1, each.shape[1], -1)), dim=-1))
-        features: Tensor = self.out(torch.cat((hidden.amax(dim=1), hidden.mean(dim=1), shared), dim=-1))
-        return features
+        return (self.out(torch.cat((hidden.amax(dim=1), hidden.mean(dim=1), shared), dim=-1)),)
+
+    def attend(self, context: Context, concept: Tensor) -> Tensor:
+        return context[0]
 
 
-ENCODERS: dict[str, Callable[[Sizes, int], nn.Module]] = {"flat": FlatEncoder, "entities": EntityEncoder, "set": SetEncoder}
+ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {"flat": FlatEncoder, "entities": EntityEncoder, "set": SetEncoder}
 
 
-def initial_state_encoder(name: str, sizes: Sizes, width: int) -> nn.Module:
+def condition_encoder(name: str, sizes: Sizes, width: int) -> ConditionEncoder:
     """An encoder by its name in a configuration.
 
     Raises:

@@ -1,0 +1,106 @@
+"""What is observed, by name, and where behaviour starts."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Self
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.errors import UserError
+
+Observed = Mapping[str, Tensor]
+"""Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One part of what is observed.
+
+    Attributes:
+        shape: of one sample, such as ``(7,)`` or ``(3, 96, 96)``.
+        kind: ``'vector'`` (float32) or ``'image'`` (uint8, channels first).
+        entities: of a vector, the columns of each of its exchangeable entities, in the same order for each; the other columns say
+            nothing about a single entity.
+        attributes: which of an entity's columns, counted from its first, a concept asks for when it names an entity (its colour,
+            its shape); all where empty.
+        state: of a vector, the columns that hold the state a plan starts from, in a state's order; none where it holds no such state.
+    """
+
+    shape: tuple[int, ...]
+    kind: Literal["vector", "image"] = "vector"
+    entities: tuple[tuple[int, ...], ...] = ()
+    attributes: tuple[int, ...] = ()
+    state: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Numbers in one sample."""
+        return math.prod(self.shape)
+
+
+def take(observed: Observed, rows: Tensor | Sequence[int] | slice | int) -> dict[str, Tensor]:
+    """Some of the samples, or one."""
+    return {name: values[rows] for name, values in observed.items()}
+
+
+def moved(observed: Observed, device: torch.device) -> dict[str, Tensor]:
+    """The same on a device."""
+    return {name: values.to(device) for name, values in observed.items()}
+
+
+def joined(parts: Sequence[Observed]) -> dict[str, Tensor]:
+    """Samples of several batches one after another."""
+    return {name: torch.cat([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+
+
+def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None:
+    """Refuse observations that lack a feature or hold one of another shape.
+
+    Raises:
+        UserError: naming the feature.
+    """
+    for name, feature in expected.items():
+        if name not in observed:
+            found = ", ".join(observed) or "none"
+            raise UserError(f"key 'observed': expected the feature {name!r} of shape {feature.shape}, found {found}")
+        if (found_shape := tuple(observed[name].shape[1:])) != feature.shape:
+            raise UserError(f"key 'observed/{name}': expected shape {feature.shape} a sample, found {found_shape}")
+
+
+@dataclass(frozen=True)
+class InitialStates:
+    """Where behaviour starts.
+
+    Attributes:
+        observed: what a model sees there.
+        scenes: ``(sample, scene)`` float32, what resets an environment and what a judge reads, never shown to a model; ``None``
+            where there is nothing of the kind.
+    """
+
+    observed: Observed = field(default_factory=dict)
+    scenes: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(next(iter([*self.observed.values(), *([] if self.scenes is None else [self.scenes])]), ()))
+
+    def take(self, rows: Tensor | Sequence[int] | slice) -> Self:
+        """Some of them."""
+        return type(self)(take(self.observed, rows), None if self.scenes is None else self.scenes[rows])
+
+    def require_scenes(self) -> Tensor:
+        """The scenes.
+
+        Raises:
+            UserError: if there are none.
+        """
+        if self.scenes is None:
+            raise UserError("key 'scenes': expected (sample, scene), what an environment is reset with, found none")
+        return self.scenes
+
+
+def join(parts: Sequence[InitialStates]) -> InitialStates:
+    """Several one after another."""
+    scenes = [part.scenes for part in parts if part.scenes is not None]
+    return InitialStates(joined([part.observed for part in parts]), torch.cat(scenes) if scenes else None)

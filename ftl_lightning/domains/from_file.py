@@ -1,0 +1,248 @@
+"""A user's own behaviour, without code: a file of demonstrations with a text for each is a domain.
+
+Its training concepts are the texts, in the order in which they first appear. Plans are as long as the longest demonstration, or as
+``horizon`` says. What it is judged by is named in a configuration, a name and a number each:
+
+``nearest_demonstration: K``
+    right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
+``end_point_within: R``
+    right if the plan ends within R (Euclidean, in the file's units) of where a demonstration of the goal ends.
+``dtw_within: R``
+    right if the mean distance a step to the nearest demonstration of the goal, after dynamic time warping, is at most R.
+``dtw_to_demonstrations: 1``
+    that distance itself; less is better. The number does not matter.
+
+Demonstrations that plans are compared with are held out from training; of a new concept, those that it was learned from.
+"""
+
+import importlib.util
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Show, Split
+from ftl_lightning.domains.line_plots import film, picture
+from ftl_lightning.domains.tasks import training_suite
+from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import generator
+
+OWN = "own"
+"""Name of the domain that a user's own file is."""
+
+
+@dataclass(frozen=True)
+class FileSource:
+    """Demonstrations of a file.
+
+    Attributes:
+        demonstrations: all of them.
+        held_out: which of them are for validation, ``(demo,)`` of bool.
+    """
+
+    demonstrations: Demonstrations
+    held_out: Tensor
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """All that are of it: how many there are is the file's matter, and so ``count`` and ``seed`` do not matter."""
+        wanted = self.held_out if name == "validation" else ~self.held_out
+        return self.demonstrations.rows(wanted.nonzero()[:, 0].tolist())
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        """The first of a concept.
+
+        Raises:
+            UserError: if there are fewer.
+        """
+        own = self.demonstrations.select(task) if task in self.demonstrations.concepts else None
+        if own is None or len(own) < count:
+            raise UserError(f"task: expected {count} demonstrations of {task!r} in the file, found {0 if own is None else len(own)}")
+        return own.rows(list(range(count)))
+
+    def starts(self, task: str, count: int, seed: int) -> InitialStates | None:
+        """Initial states of held-out demonstrations, drawn with replacement."""
+        if not self.demonstrations.observed:
+            return None
+        known = self.split("validation", count, seed).initial_states
+        return known.take(torch.randint(len(known), (count,), generator=generator("cpu", seed)))
+
+
+def own_domain(
+    examples: Demonstrations,
+    training: Sequence[str],
+    horizon: int,
+    metrics: Mapping[str, float],
+    source: FileSource | None = None,
+) -> Domain:
+    """The domain of a user's own behaviour.
+
+    Args:
+        examples: demonstrations that plans are compared with, at least one of each concept that is judged.
+        training: training concepts.
+        horizon: states in a plan.
+        metrics: names and numbers, see this module.
+        source: of demonstrations; ``None`` for the examples.
+
+    Raises:
+        UserError: for a metric that is none.
+    """
+    if unknown := set(metrics) - set(METRICS):
+        raise UserError(f"data.metrics: expected some of {', '.join(METRICS)}, found {', '.join(sorted(unknown))}")
+    texts = tuple(dict.fromkeys(examples.concepts))
+    every = source or FileSource(examples, torch.ones(len(examples), dtype=torch.bool))
+    return Domain(
+        name=OWN,
+        plans=Plans(horizon, examples.state_names, examples.state_units),
+        concepts=Concepts(
+            training=tuple(training),
+            suites={"training": training_suite(tuple(training))},
+            descriptions=tuple(training),
+            reads=lambda text: text in texts,
+        ),
+        source=lambda root: every,
+        show=Show(picture=picture(examples.state_names), film=film if examples.states.shape[2] in (2, 3) else None),
+        observed=examples.features,
+        metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
+        headline=next(iter(metrics), ""),
+    )
+
+
+def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float], share: float) -> Domain:
+    """The domain that a file is.
+
+    Args:
+        path: the file, or the name of an installed Minari data set.
+        horizon: states in a plan; ``None`` for the longest demonstration's.
+        metrics: see :func:`own_domain`.
+        share: of each concept's demonstrations that is held out, at least one.
+
+    Raises:
+        UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
+    """
+    found = read_own(path)
+    training = tuple(dict.fromkeys(found.concepts))
+    if len(training) < 2:
+        raise UserError(f"{path}: key 'concepts': expected texts of two concepts or more to pretrain on, found {len(training)}")
+    held_out = torch.zeros(len(found), dtype=torch.bool)
+    for text in training:
+        rows = [row for row, own in enumerate(found.concepts) if own == text]
+        if len(rows) < 2:
+            raise UserError(f"{path}: concept {text!r}: expected two demonstrations or more (one is held out), found 1")
+        held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
+    source = FileSource(found, held_out)
+    longest = int(found.lengths.max())
+    return own_domain(source.split("validation", 0, 0), training, horizon or longest, metrics, source)
+
+
+def read_own(path: str) -> Demonstrations:
+    """A file of one's own behaviour; demonstrations without a text are named after the file.
+
+    Args:
+        path: ``.npz`` or safetensors, or the name of an installed Minari data set such as ``strokes/test-v0``.
+
+    Raises:
+        UserError: naming it, if it is missing or damaged.
+    """
+    file = Path(path)
+    if file.suffix in (".npz", ".safetensors") or file.exists() or importlib.util.find_spec("minari") is None:
+        return Demonstrations.load(file).named(file.stem)
+    from ftl_lightning.demonstrations.minari import read_minari  # an extra
+
+    return read_minari(path)
+
+
+def _scaled(examples: Demonstrations, states: Tensor) -> tuple[Tensor, Tensor]:
+    """Examples and states with columns of standard deviation 1 over the examples; constant ones are left as they are."""
+    spread = examples.states.flatten(0, 1).std(dim=0)
+    spread = torch.where(spread > 0, spread, 1)
+    return examples.states / spread, states / spread
+
+
+def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_lengths: Tensor) -> Tensor:
+    """Mean distance a step after dynamic time warping (Sakoe & Chiba, 1978).
+
+    Args:
+        states: ``(n, time, state)``.
+        lengths: ``(n,)``, of each.
+        others: ``(m, other time, state)``.
+        other_lengths: ``(m,)``.
+
+    Returns:
+        ``(n, m)``: the least sum of Euclidean distances along a warping path, by the longer of both lengths.
+    """
+    total = []
+    for one, length in zip(states, lengths.tolist(), strict=True):
+        cost = torch.cdist(one[None, :length].expand(len(others), -1, -1), others)  # (m, length, other time)
+        far = torch.full((len(others),), math.inf)
+        before = torch.full((len(others), cost.shape[2] + 1), math.inf)
+        before[:, 0] = 0
+        for row in cost.unbind(dim=1):
+            here = [far]
+            for column in range(cost.shape[2]):
+                here.append(row[:, column] + torch.minimum(torch.minimum(before[:, column], before[:, column + 1]), here[-1]))
+            before = torch.stack(here, dim=1)
+        ends = before.gather(1, other_lengths[:, None])[:, 0]
+        total.append(ends / other_lengths.clamp(min=length))
+    return torch.stack(total)
+
+
+def _whole(states: Tensor) -> Tensor:
+    return torch.full((len(states),), states.shape[1])
+
+
+def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:
+    rows = [row for row, text in enumerate(examples.concepts) if text == goal]
+    if not rows:
+        raise UserError(f"goal: expected a concept with demonstrations to compare with, found {goal!r}")
+    return rows
+
+
+def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    count = int(number)
+    if count < 1:
+        raise UserError(f"data.metrics.nearest_demonstration: expected 1 or more neighbours, found {number:g}")
+
+    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        known, scaled = _scaled(examples, states)
+        near = warped_distances(scaled, _whole(states), known[:, :horizon], examples.lengths.clamp(max=horizon))
+        own = torch.zeros(len(examples), dtype=torch.bool)
+        own[_goal_rows(examples, goal)] = True
+        return own[near.topk(min(count, len(examples)), largest=False).indices].float().mean(dim=1) > 0.5
+
+    return Metric(measure, identity=examples.hash)
+
+
+def _end_point_within(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        rows = _goal_rows(examples, goal)
+        ends = examples.states[rows, examples.lengths[rows].clamp(max=horizon) - 1]
+        return torch.cdist(states[:, -1], ends).amin(dim=1) <= number
+
+    return Metric(measure, identity=examples.hash)
+
+
+def _to_demonstrations(examples: Demonstrations, horizon: int, goal: str, states: Tensor) -> Tensor:
+    rows = _goal_rows(examples, goal)
+    lengths = examples.lengths[rows].clamp(max=horizon)
+    return warped_distances(states, _whole(states), examples.states[rows, :horizon], lengths).amin(dim=1)
+
+
+def _dtw_within(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    return Metric(lambda goal, states, starts: _to_demonstrations(examples, horizon, goal, states) <= number, False, examples.hash)
+
+
+def _dtw_to_demonstrations(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    return Metric(lambda goal, states, starts: _to_demonstrations(examples, horizon, goal, states), True, examples.hash)
+
+
+METRICS: dict[str, Callable[[Demonstrations, int, float], Metric]] = {
+    "nearest_demonstration": _nearest_demonstration,
+    "end_point_within": _end_point_within,
+    "dtw_within": _dtw_within,
+    "dtw_to_demonstrations": _dtw_to_demonstrations,
+}

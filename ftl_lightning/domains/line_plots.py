@@ -1,0 +1,77 @@
+"""Pictures and films of behaviour of which nothing but its columns is known: paths in two or three dimensions, or lines over time."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import InitialStates
+
+MAX_COLUMNS = 8
+MAX_FRAMES = 60
+PATH, START, PLAIN, RIGHT, WRONG = "#3f6fb5", "#e4704a", "#8a8a8a", "#2e9e46", "#d03a3a"
+
+
+def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], Figure]:
+    """A renderer of plans with these columns, see :class:`ftl_lightning.domains.domain.Show`."""
+
+    def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
+        columns = min(len(states), MAX_COLUMNS)
+        rows = -(-len(states) // columns)
+        figure = Figure(figsize=(1.6 * columns, 1.6 * rows + 0.5), layout="constrained")
+        figure.suptitle(title, fontsize=9)
+        spatial = states.shape[2] == 3 and states.shape[1] > 1
+        grid = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"} if spatial else {}).flat
+        colours = [PLAIN] * len(states) if right is None else [RIGHT if good else WRONG for good in right]
+        flat = states.flatten(0, 1)
+        low, high = flat.amin(dim=0).tolist(), flat.amax(dim=0).tolist()
+        for axes, plan, colour in zip(grid, states.numpy(), colours, strict=False):
+            if states.shape[2] in (2, 3) and states.shape[1] > 1:
+                axes.plot(*plan.T, color=PATH, linewidth=1.2)
+                axes.plot(*plan[:1].T, "o", color=START, markersize=3)
+                axes.set(xlim=_room(low[0], high[0]), ylim=_room(low[1], high[1]))
+                if not spatial:
+                    axes.set_aspect("equal", adjustable="datalim")
+            else:
+                for column, name in enumerate(names):
+                    axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=name)
+            axes.set(xticks=[], yticks=[])
+            for spine in axes.spines.values():
+                spine.set(color=colour, linewidth=2.0)
+        for axes in figure.axes[len(states) :]:
+            axes.set_axis_off()
+        if states.shape[2] not in (2, 3) and len(names) <= MAX_COLUMNS:
+            figure.axes[0].legend(fontsize=6)
+        return figure
+
+    return render
+
+
+def _room(low: float, high: float) -> tuple[float, float]:
+    margin = 0.05 * max(high - low, 1e-6)
+    return low - margin, high + margin
+
+
+def film(states: Tensor) -> list[NDArray[np.uint8]]:
+    """Frames ``(height, width, 3)`` of one plan ``(horizon, 2 or 3)`` as it is drawn, at most :data:`MAX_FRAMES`."""
+    plan = states.numpy()
+    figure = Figure(figsize=(3, 3), dpi=80, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot(projection="3d") if plan.shape[1] == 3 else figure.add_subplot()
+    axes.plot(*plan.T, color="#d8d8d8", linewidth=1)
+    line: Any = axes.plot(*plan[:1].T, color=PATH, linewidth=2)[0]
+    axes.set(xticks=[], yticks=[])
+    if plan.shape[1] == 2:
+        axes.set_aspect("equal", adjustable="datalim")
+    pictures = []
+    for end in np.unique(np.linspace(1, len(plan), min(len(plan), MAX_FRAMES)).astype(int)):
+        line.set_data(*plan[:end, :2].T)
+        if plan.shape[1] == 3:
+            line.set_3d_properties(plan[:end, 2])
+        canvas.draw()
+        pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    return pictures

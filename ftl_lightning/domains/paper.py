@@ -1,0 +1,46 @@
+"""Numbers that a paper reports, to be shown beside ours."""
+
+from dataclasses import dataclass
+
+OURS = "FTL-IGM"
+"""The name of the paper's method."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A number of the paper.
+
+    Attributes:
+        setting: as in :class:`~ftl_lightning.domains.tasks.EvaluationTask`.
+        value: accuracy in [0, 1].
+        error: standard error over tasks; ``None`` for a single task or where it is not reported.
+        components: K.
+        omega: the fixed weight as text, or ``'learned'``.
+        task: name of the evaluation task; ``''`` for the mean of the setting.
+        metric: as in a row of the results.
+        method: ours, or a baseline's name.
+    """
+
+    setting: str
+    value: float
+    error: float | None = None
+    components: int = 2
+    omega: str = "learned"
+    task: str = ""
+    metric: str = "accuracy"
+    method: str = OURS
+
+
+@dataclass(frozen=True)
+class Paper:
+    """What the paper reports of a domain.
+
+    Attributes:
+        numbers: all of them.
+        omega: guidance weight of two components in its main figures, as text.
+        ours: the weight that our main tables put beside it, as text.
+    """
+
+    numbers: tuple[Published, ...]
+    omega: str
+    ours: str

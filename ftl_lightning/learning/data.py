@@ -1,0 +1,309 @@
+"""DataModules: of pretraining, which a domain's own names, and of inversion, one for all domains.
+
+Both deliver demonstrations in the domain's units; the model normalises them. What a step sees is a function of the seed and
+the step's number alone, so a run that is killed and resumed goes on exactly as the unbroken one would.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from ftl_lightning.concepts.encoder import Encoder, load_encoder
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
+
+
+class Batch(NamedTuple):
+    """What a step of pretraining sees.
+
+    Attributes:
+        states: ``(batch, horizon, state)`` in the domain's units.
+        concepts: ``(batch,)`` int64, rows of the domain's training concepts.
+        observed: features ``(batch, *shape)`` by name.
+    """
+
+    states: Tensor
+    concepts: Tensor
+    observed: dict[str, Tensor]
+
+
+class Steps(IterableDataset[int]):
+    """The numbers of the steps of one epoch, from wherever the trainer stands."""
+
+    def __init__(self, module: pl.LightningDataModule, length: int) -> None:
+        self.module, self.length = module, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __iter__(self) -> Iterator[int]:
+        assert self.module.trainer is not None
+        start = self.module.trainer.global_step
+        return iter(range(start, start + self.length - start % self.length))
+
+
+class PretrainingData(pl.LightningDataModule):
+    """Batches of (behaviour, concept) pairs of a domain. A subclass may name the domain.
+
+    Args:
+        domain: name of the domain, see :func:`ftl_lightning.domains.registry.load_domain`; empty for the class's own.
+        root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
+        samples_per_concept: demonstrations of each training concept.
+        validation_per_concept: others of each, for the validation loss.
+        seed: decides the demonstrations and the order they are seen in.
+        batch_size: windows a step.
+        steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
+        encoder: text encoder, ``'table'`` (shipped embeddings), ``'minilm'``, ``'hashing'``, or the name or path of a language
+            model, see :func:`ftl_lightning.concepts.encoder.load_encoder`.
+        revision: of a Hugging Face model.
+        horizon: states in a window; ``None`` for the domain's plans.
+        start_exponent: exponent u of the windows' starts, ``start = length * share^u``: 1 is uniform, with 3 half of the windows
+            start in the first eighth of a demonstration. ``None`` for the domain's where windows are as long as plans, else 1.
+
+    Raises:
+        UserError: for a value that is none.
+    """
+
+    own_domain: ClassVar[str] = ""
+    """Name of the class's domain."""
+
+    def __init__(
+        self,
+        domain: str = "",
+        root: str | None = None,
+        samples_per_concept: int = 100,
+        validation_per_concept: int = 10,
+        seed: int = 0,
+        batch_size: int = 128,
+        steps_per_epoch: int = 500,
+        encoder: str = "table",
+        revision: str = "main",
+        horizon: int | None = None,
+        start_exponent: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        if self.own_domain and domain not in ("", self.own_domain):
+            raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
+        self.domain = self._domain(self.own_domain or domain)
+        self._number = {text: number for number, text in enumerate(self.domain.concepts.training)}
+        self.metrics: Mapping[str, float] = {}
+        self.horizon = self.domain.plans.horizon if horizon is None else horizon
+        self.start_exponent = self.domain.plans.exponent(self.horizon) if start_exponent is None else start_exponent
+        if self.start_exponent < 1:
+            raise UserError(f"data.start_exponent: expected 1 or more, found {start_exponent}")
+        counts = {
+            "batch_size": batch_size,
+            "steps_per_epoch": steps_per_epoch,
+            "horizon": self.horizon,
+            "samples_per_concept": samples_per_concept,
+            "validation_per_concept": validation_per_concept,
+        }
+        for name, value in counts.items():
+            if value < 1:
+                raise UserError(f"data.{name}: expected 1 or more, found {value}")
+        self.root = None if root is None else Path(root)
+        self.samples_per_concept = samples_per_concept
+        self.validation_per_concept = validation_per_concept
+        self.seed = seed
+        self.batch_size = batch_size
+        self.steps_per_epoch = steps_per_epoch
+        self.encoder: Encoder = load_encoder(encoder, self.domain.concepts.table, revision)
+
+    def _domain(self, name: str) -> Domain:
+        return load_domain(name)
+
+    def setup(self, stage: str) -> None:
+        source = self.domain.source(self.root)
+        self.training = source.split("train", self.samples_per_concept, self.seed).fitted(self.domain.observed)
+        self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
+
+    @property
+    def examples(self) -> Demonstrations | None:
+        """Demonstrations that are kept beside a model, if it is of a user's own data."""
+        return None
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step: demonstrations drawn with replacement, and of each a window."""
+        draw = generator("cpu", self.seed, step)
+        rows = torch.randint(len(self.training), (self.batch_size,), generator=draw)
+        return self._windows(self.training, rows, draw)
+
+    def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
+        share = torch.rand(len(rows), generator=draw)
+        starts = demonstrations.starts(rows, share, self.start_exponent, self.horizon)
+        states, observed = demonstrations.windows(rows, starts, self.horizon)
+        return Batch(states, self._concepts(demonstrations, rows), observed)
+
+    def _concepts(self, demonstrations: Demonstrations, rows: Tensor) -> Tensor:
+        """Which training concept each of some demonstrations shows ``(window,)``."""
+        return torch.tensor([self._number[demonstrations.concepts[row]] for row in rows.tolist()])
+
+    def every_window(self) -> Batch:
+        """One window from each time of each demonstration."""
+        lengths = self.training.lengths
+        rows = torch.arange(len(lengths)).repeat_interleave(lengths)
+        starts = torch.cat([torch.arange(length) for length in lengths.tolist()])
+        states, observed = self.training.windows(rows, starts, self.horizon)
+        return Batch(states, self._concepts(self.training, rows), observed)
+
+    def first_windows(self) -> Batch:
+        """One window from the start of the first demonstration of each training concept, in their order."""
+        concepts = self.domain.concepts.training
+        rows = torch.tensor([self.training.concepts.index(text) for text in concepts])
+        states, observed = self.training.windows(rows, torch.zeros_like(rows), self.horizon)
+        return Batch(states, torch.arange(len(concepts)), observed)
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        steps = Steps(self, self.steps_per_epoch)
+        return DataLoader(steps, batch_size=None, collate_fn=self.batch)  # type: ignore[arg-type]
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        whole = torch.arange(len(self.validation))
+        batch = self._windows(self.validation, whole, generator("cpu", self.seed))
+        return DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
+
+    test_dataloader = val_dataloader
+
+
+class OwnData(PretrainingData):
+    """Batches of a user's own demonstrations, a file with one concept text for each: the file is the domain.
+
+    A plan is as long as the longest demonstration, unless ``horizon`` says otherwise.
+
+    Args:
+        demonstrations: the file (``.npz`` or safetensors), see
+            :meth:`ftl_lightning.demonstrations.container.Demonstrations.load`; or the name of an installed Minari data set.
+        metrics: what plans are judged by, a name and a number each, see :mod:`ftl_lightning.domains.from_file`; empty for nothing.
+        validation_share: share of each concept's demonstrations that is held out, at least one.
+        seed, batch_size, steps_per_epoch, encoder, revision, horizon, start_exponent: see :class:`PretrainingData`; the default
+            encoder is ``'minilm'`` where it is installed, else ``'hashing'``.
+    """
+
+    def __init__(
+        self,
+        demonstrations: str,
+        metrics: dict[str, float] | None = None,
+        validation_share: float = 0.1,
+        seed: int = 0,
+        batch_size: int = 128,
+        steps_per_epoch: int = 500,
+        encoder: str = "auto",
+        revision: str = "main",
+        horizon: int | None = None,
+        start_exponent: float | None = None,
+    ) -> None:
+        if not 0 < validation_share < 1:
+            raise UserError(f"data.validation_share: expected a share between 0 and 1, found {validation_share}")
+        self._file, self._share, self._metrics, self._asked = demonstrations, validation_share, dict(metrics or {}), horizon
+        super().__init__(
+            domain=OWN,
+            seed=seed,
+            batch_size=batch_size,
+            steps_per_epoch=steps_per_epoch,
+            encoder=encoder,
+            revision=revision,
+            horizon=horizon,
+            start_exponent=start_exponent,
+        )
+        self.save_hyperparameters()
+        self.metrics = self._metrics
+
+    def _domain(self, name: str) -> Domain:
+        return domain_from_file(self._file, self._asked, self._metrics, self._share)
+
+    @property
+    def examples(self) -> Demonstrations:
+        """The demonstrations that are held out."""
+        return self.validation
+
+
+class InversionData(pl.LightningDataModule):
+    """A few demonstrations of each new concept, learned together.
+
+    Args:
+        domain: name of the domain; ``'own'`` for a user's own data.
+        suite: the concepts of this suite of the domain are learned, from demonstrations drawn from the seed.
+        demonstrations: a file of your own instead (safetensors or npz). Its concept texts name the concepts to learn;
+            demonstrations without a text belong to one concept named after the file.
+        demonstrations_per_concept: how many are drawn; the paper's number is 5.
+        seed: decides the demonstrations that are drawn.
+        steps: gradient steps, which is the length of the one epoch.
+        root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
+
+    Raises:
+        UserError: for a value that is none, or a file that does not fit the domain.
+    """
+
+    def __init__(
+        self,
+        domain: str,
+        suite: str = "paper",
+        demonstrations: str | None = None,
+        demonstrations_per_concept: int = 5,
+        seed: int = 0,
+        steps: int = 400,
+        root: str | None = None,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        if steps < 1 or demonstrations_per_concept < 1:
+            found = f"{steps} and {demonstrations_per_concept}"
+            raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {found}")
+        self.seed = seed
+        self.steps = steps
+        self.own = demonstrations is not None
+        self.domain_name = domain
+        if demonstrations is None and domain == OWN:
+            raise UserError("data.demonstrations: expected a file of the new concepts' demonstrations, found none")
+        if domain == OWN:
+            self.demonstrations = read_own(str(demonstrations))
+        elif demonstrations is None:
+            self.demonstrations = self._drawn(load_domain(domain), suite, demonstrations_per_concept, root)
+        else:
+            self.demonstrations = read_demonstrations(Path(demonstrations), load_domain(domain))
+        self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
+
+    def _drawn(self, domain: Domain, suite: str, count: int, root: str | None) -> Demonstrations:
+        suites = domain.concepts.suites
+        if suite not in suites:
+            raise UserError(f"data.suite: expected one of {', '.join(suites)}, found {suite!r}")
+        if not (learned := suites[suite].learned):
+            raise UserError(f"data.suite: expected a suite that learns concepts, found {suite!r}, which learns none")
+        source = domain.source(None if root is None else Path(root))
+        return concatenate([source.draw(task, count, DEMONSTRATION_SEED + self.seed) for task in learned])
+
+    def train_dataloader(self) -> DataLoader[int]:
+        return DataLoader(Steps(self, self.steps), batch_size=None)
+
+    def test_dataloader(self) -> DataLoader[int]:
+        return DataLoader(range(1), batch_size=None)  # type: ignore[arg-type]
+
+    val_dataloader = test_dataloader
+
+
+def read_demonstrations(path: Path, domain: Domain) -> Demonstrations:
+    """A file of a domain's demonstrations; those without a text are named after the file.
+
+    Raises:
+        UserError: naming the file, if it does not fit the domain.
+    """
+    found = Demonstrations.load(path)
+    columns = len(domain.plans.columns)
+    if found.domain not in ("", domain.name):
+        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {found.domain!r}")
+    if found.states.shape[2] != columns:
+        raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(found.states.shape)}")
+    try:
+        return found.fitted(domain.observed).named(path.stem)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None

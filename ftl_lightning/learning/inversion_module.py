@@ -1,0 +1,112 @@
+"""Inversion as a LightningModule: curves, checkpoints that resume exactly, and evaluation at the end."""
+
+from dataclasses import fields
+from typing import Any, Literal
+
+import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from torch import Tensor
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.baselines.additive import AdditiveModel
+from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.inversion import Inversion, InversionSettings, check_settings
+
+
+class InversionModule(Adaptation):
+    """Learns K embeddings and their weights for every concept of an :class:`~ftl_lightning.learning.data.InversionData`.
+
+    Its only parameters are those of an :class:`~ftl_lightning.learning.inversion.Inversion`. The pretrained model is frozen and
+    not part of a checkpoint.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        components, omega, initial_omega, off_span, initial_spread, restarts, learning_rate, weight_learning_rate, samples, loss,
+            timestep_power, seed: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
+        training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
+            omega, or 1 when weights are learned.
+        output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
+    """
+
+    adapts = (GenerativeModel, AdditiveModel)
+    learns = True
+    strict_loading = False
+
+    def __init__(
+        self,
+        pretrained: str,
+        components: int = 2,
+        omega: float | Literal["learned"] = 1.2,
+        initial_omega: float = 1.0,
+        off_span: float = 1.0,
+        initial_spread: float = 0.05,
+        restarts: int = 1,
+        learning_rate: float = 0.1,
+        weight_learning_rate: float = 3e-3,
+        samples: int = 32,
+        loss: str = "epsilon",
+        timestep_power: float = 1.0,
+        training_omega: float | None = None,
+        output: str | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(pretrained, 1.0 if omega == "learned" else omega, output)
+        self.save_hyperparameters()
+        self.settings = InversionSettings(**{field.name: self.hparams[field.name] for field in fields(InversionSettings)})
+        check_settings(self.model, self.settings)
+        self.inversion: Inversion
+
+    @property
+    def variant(self) -> str:
+        off_span, weight = self.settings.off_span, self.hparams["training_omega"]
+        form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
+        return ", ".join([*self.model.traits, form, *([] if weight is None else [f"training weight {weight:g}"])])
+
+    def configure_model(self) -> None:
+        """Create the parameters once the demonstrations are known. Does nothing the second time."""
+        if "inversion" not in self._modules:
+            with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
+                super().configure_model()
+                self.inversion = Inversion(self.model, self.demonstrations, self.settings)
+
+    def training_step(self, step: int) -> Tensor:
+        losses = self.inversion.step_losses(self.global_step)
+        self.log("train/loss", losses.detach().mean(), prog_bar=True)
+        # A sum over runs: each run's gradient is what it would be if it were learned alone.
+        return losses.mean(dim=1).sum()
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        """Adam with cosine decay; weights have a rate of their own."""
+        optimizer, decay = self.inversion.optimizer(int(self.trainer.estimated_stepping_batches))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Sign the checkpoint and leave the frozen model out; its folder is a hyper-parameter."""
+        sign(self, checkpoint, self._signature())
+        own = {key: value for key, value in checkpoint["state_dict"].items() if key.startswith("inversion.")}
+        checkpoint["state_dict"] = own
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse the checkpoint of another module, model, concepts or kind of weights."""
+        check_signature(self, checkpoint, self._signature())
+        self._found = {}
+
+    def _signature(self) -> dict[str, Any]:
+        """Settings that must match before a checkpoint is loaded."""
+        return {
+            "pretrained": self.model.hash,
+            "demonstrations": self.demonstrations.hash,
+            "components": self.settings.components,
+            "restarts": self.settings.restarts,
+            "omega": self.settings.omega,
+        }
+
+    def learned(self) -> dict[str, Concept]:
+        return self.inversion.learned()
+
+    def training_weight(self, task: EvaluationTask) -> float:
+        omega = self.hparams["training_omega"] if task.learned else None
+        return super().training_weight(task) if omega is None else omega
