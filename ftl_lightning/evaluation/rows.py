@@ -29,7 +29,7 @@ def configuration(module: Generates, data: pl.LightningDataModule, settings: Map
     own = data.hparams.get("demonstrations")
     return {
         **{f"model/{key}": value for key, value in _public(module.hparams) if key not in ("pretrained", "output")},
-        **{f"data/{key}": value for key, value in _public(data.hparams) if key != "demonstrations"},
+        **{f"data/{key}": value for key, value in _public(data.hparams) if key not in ("demonstrations", "root")},
         **{f"evaluation/{key}": value for key, value in settings.items()},
         "model/pretrained": module.model.hash,
         **({"data/demonstrations": file_hash(own)} if own else {}),
