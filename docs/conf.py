@@ -1,6 +1,14 @@
 """How the documentation's pages are built: ``make docs``. Nothing is fetched from a network."""
 
-from ftl_lightning import __version__
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
+
+from sphinx.application import Sphinx  # noqa: E402
+
+from ftl_lightning import __version__  # noqa: E402
 
 project = "ftl-lightning"
 author = "The ftl-lightning authors"
@@ -27,3 +35,20 @@ napoleon_use_ivar = True
 html_theme = "furo"
 html_title = f"ftl-lightning {__version__}"
 html_show_sourcelink = False
+
+
+# Links are written for readers of the repository. Pages below are links to files outside this folder, which Sphinx would not find.
+OUTSIDE = ((r"(?:\.\./)+notebooks/(\w+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
+DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:results|ftl_lightning)/[^)]*\.md)\)")
+
+
+def _links(app: Sphinx, page: str, source: list[str]) -> None:
+    """Turn links out of this folder into links to pages, or into downloads."""
+    for pattern, folder in OUTSIDE:
+        source[0] = re.sub(rf"\[([^]]*)\]\({pattern}\)", rf"{{doc}}`\1 <{folder}/\2>`", source[0])
+    source[0] = DOWNLOADS.sub(r"](path:\1)", source[0])
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", _links)
