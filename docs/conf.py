@@ -6,9 +6,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
-from sphinx.application import Sphinx  # noqa: E402
+from sphinx.application import Sphinx
 
-from ftl_lightning import __version__  # noqa: E402
+from ftl_lightning import __version__
 
 project = "ftl-lightning"
 author = "The ftl-lightning authors"
