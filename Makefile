@@ -1,11 +1,11 @@
 # Everything runs in .venv, made from pinned versions. PYTHON chooses the interpreter, TORCH another build of torch.
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := dev,notebooks,cluster
+EXTRAS := dev,notebooks,cluster,docs
 DOMAIN := object_rearrangement
 LOGS := logs/$(DOMAIN)
 
-.PHONY: install minilm run test lint format report ablation comparison benchmark
+.PHONY: install minilm run test lint format report ablation comparison benchmark docs
 
 install: .venv/installed
 
@@ -46,3 +46,6 @@ report: install # tables and figures of results/, and the table in the README
 
 benchmark: install
 	$(BIN)/python benchmarks/speed.py
+
+docs: install # the documentation's pages, in docs/_build/html; a warning is an error
+	$(BIN)/sphinx-build -W --keep-going --quiet -d docs/_build/doctrees docs docs/_build/html

@@ -1,0 +1,54 @@
+"""How the documentation's pages are built: ``make docs``. Nothing is fetched from a network."""
+
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
+
+from sphinx.application import Sphinx
+
+from ftl_lightning import __version__
+
+project = "ftl-lightning"
+author = "The ftl-lightning authors"
+copyright = "The ftl-lightning authors, MIT licence"
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
+nitpicky = False
+
+myst_enable_extensions = ["colon_fence"]
+myst_heading_anchors = 3
+nb_execution_mode = "off"  # the notebooks hold their output
+
+autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False  # Lightning's and torch's own documentation is theirs
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = f"ftl-lightning {__version__}"
+html_show_sourcelink = False
+
+
+# Links are written for readers of the repository. Pages below are links to files outside this folder, which Sphinx would not find.
+OUTSIDE = ((r"(?:\.\./)+notebooks/(\w+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
+DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:results|ftl_lightning)/[^)]*\.md)\)")
+
+
+def _links(app: Sphinx, page: str, source: list[str]) -> None:
+    """Turn links out of this folder into links to pages, or into downloads."""
+    for pattern, folder in OUTSIDE:
+        source[0] = re.sub(rf"\[([^]]*)\]\({pattern}\)", rf"{{doc}}`\1 <{folder}/\2>`", source[0])
+    source[0] = DOWNLOADS.sub(r"](path:\1)", source[0])
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", _links)

@@ -1,0 +1,73 @@
+"""The documentation: its length, its links, and the commands that it shows."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
+
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+CARDS = (*ROOT.glob("pretrained/*/README.md"), *ROOT.glob("ftl_lightning/**/README.md"), ROOT / "results" / "README.md")
+PAGES = tuple(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts and not path.is_symlink())
+TEXTS = (README, *PAGES, *CARDS)
+
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+INCLUDED = re.compile(r"^`{3,}\{include\} (\S+)", re.MULTILINE)
+CODE = re.compile(r"^(`{3,})(?!\{include\}).*?^\1`*$", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"python -m ftl_lightning ([a-z]+)((?:[^\n`\\]|\\\n)*)")
+CONFIG = re.compile(r"--config[ =]([\w./-]+)")
+PLACEHOLDER = re.compile(r"[A-Z]{2,}")
+"""A word in capitals stands for any name, as in conf/DOMAIN.yaml."""
+
+
+def targets(text: str) -> list[str]:
+    """Files that a page links to, shows or includes, as written."""
+    found = LINK.findall(CODE.sub("", text)) + INCLUDED.findall(text)
+    return [target for target in found if not re.match(r"[a-z]+:|#", target)]
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """The verb and the configuration files of every command that a page shows."""
+    return [(verb, CONFIG.findall(options)) for verb, options in COMMAND.findall(text)]
+
+
+def test_the_readme_has_at_most_1500_words() -> None:
+    assert len(README.read_text(encoding="utf-8").split()) <= 1500
+
+
+def test_the_pages_are_found() -> None:
+    names = {path.name for path in PAGES}
+    assert {"index.md", "quick-start.md", "navigation.md"} <= names
+    assert targets("[a](b.md) ![c](d.png) [e](https://f.g) [h](#i)\n```python\n[j](k)\n```\n") == ["b.md", "d.png"]
+    assert targets("```{include} l.md\n```\n") == ["l.md"]
+    shown = (
+        "python -m ftl_lightning fit --a b \\\n  --config c.yaml\n`python -m ftl_lightning VERB` `python -m ftl_lightning report`"
+    )
+    assert commands(shown) == [("fit", ["c.yaml"]), ("report", [])]
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_relative_link_points_to_something(path: Path) -> None:
+    missing = [
+        target for target in targets(path.read_text(encoding="utf-8")) if not (path.parent / target.partition("#")[0]).exists()
+    ]
+    assert missing == []
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_command_names_a_verb_and_files_that_exist(path: Path) -> None:
+    for verb, files in commands(path.read_text(encoding="utf-8")):
+        assert verb in TRAINER_VERBS | COMMANDS, verb
+        for name in files:
+            assert any(ROOT.glob(PLACEHOLDER.sub("*", name))), f"{verb} --config {name}"
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = ROOT / "docs" / "index.md"
+    listed = {line for block in re.findall(r"```\{toctree\}\n(.*?)```", index.read_text(), re.DOTALL) for line in block.split()}
+    pages = {str(path.relative_to(index.parent).with_suffix("")) for path in PAGES} - {"index"}
+    pages |= {f"cards/{path.stem}" for path in (ROOT / "docs" / "cards").iterdir()}
+    pages |= {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert pages - listed == set()
