@@ -10,6 +10,7 @@ import torch
 from jsonargparse import set_parsing_settings
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
+from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.trainer import Trainer
@@ -100,7 +101,7 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=arguments,
+            args=expanded(arguments),
         )
     except OSError as error:
         raise UserError(
