@@ -54,8 +54,7 @@ def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
     values: dict[str, Any] = {}
     for path in configurations(arguments):
         values |= dict(_flat(load(path), ""))
-    for option, value in _options(arguments):
-        values[option.replace(".init_args.", ".")] = value
+    values |= {option.replace(".init_args.", "."): value for option, value in _options(arguments)}
     if {"help", "print_config"} & values.keys() or "-h" in arguments:
         return
     for option, check in checks.items():

@@ -116,7 +116,7 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "results.csv"
         try:
-            line = build([*cell.arguments, f"--evaluation.results={path}"])
+            line = build(cell.verb, [*cell.arguments, f"--evaluation.results={path}"])
             if cell.verb == "invert" and _hash(line) in known:
                 return Outcome(note="in the results already")
             getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule)
