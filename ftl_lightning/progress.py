@@ -80,7 +80,7 @@ def _display() -> "Progress":
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[told]}"),
-        console=Console(stderr=True),
+        console=Console(stderr=True, soft_wrap=True),  # paths that are printed stay in one line
         transient=True,
         # Standard output may be a file, where what is printed has to go, not to the terminal.
         redirect_stdout=sys.stdout.isatty(),

@@ -9,7 +9,6 @@ from lightning.pytorch.callbacks import ProgressBar
 
 from ftl_lightning.progress import Advance, bar
 
-
 REFRESH = 0.5
 """Seconds from one look at loss and accuracy to the next; at every step it would cost time."""
 

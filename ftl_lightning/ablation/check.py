@@ -1,4 +1,4 @@
-"""What is wrong with a plan, told before any of it runs."""
+"""Mistakes in a plan, found before any of it runs."""
 
 import importlib
 from argparse import ArgumentError
@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ftl_lightning.ablation.plan import Cell
+from ftl_lightning.configuration import find
 from ftl_lightning.errors import UserError
+from ftl_lightning.shipped import shipped
 
 if TYPE_CHECKING:
     from ftl_lightning.learning.adaptation import Adaptation
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Refuse cells that cannot run, before any does: for their files, keys, encoders and, of ``invert``, domains, suites and
-    pretrained models.
+    """Check every cell's files, keys and encoder and, for ``invert``, its domain, suites and pretrained model.
 
     Raises:
-        UserError: naming them.
+        UserError: one line with every mistake; nothing was started.
     """
     made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
@@ -26,7 +27,7 @@ def check(cells: Sequence[Cell]) -> None:
         try:
             _check(cell, made)
         except (UserError, ArgumentError) as error:
-            mistakes[str(cell)] = " ".join(str(error).split())
+            mistakes[cell.command] = " ".join(str(error).split())
     if mistakes:
         told = dict.fromkeys(mistakes.values())
         raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(told)}")
@@ -38,10 +39,7 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.learning.concept_model import read_config
     from ftl_lightning.lightning_cli import parse
 
-    if not Path(cell.config).is_file():
-        folder = next(parent for parent in Path(cell.config).parents if parent.is_dir())
-        there = ", ".join(sorted(entry.name for entry in folder.iterdir()))
-        raise UserError(f"config: {cell.config}: expected a configuration file, found nothing; {folder} holds {there}")
+    find(cell.config)
     config = parse(cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
     if cell.verb == "fit":
@@ -58,7 +56,7 @@ def _check(cell: Cell, made: set[str]) -> None:
             raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")
     if model["pretrained"] not in made:
         kinds = _class(config["model"]["class_path"]).kinds
-        found = read_config(model["pretrained"])
+        found = read_config(shipped(model["pretrained"]))
         if found["domain"] != domain.name or found["kind"] not in kinds:
             raise UserError(
                 f"model.pretrained: expected a model of {domain.name} ({' or '.join(kinds)}), found one of {found['domain']} "
