@@ -6,9 +6,9 @@ import re
 import sys
 from argparse import ArgumentError
 from collections.abc import Sequence
-from pathlib import Path
 
-from ftl_lightning import __version__
+from ftl_lightning import __version__, inputs
+from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError
 
 TRAINER_VERBS = {
@@ -62,8 +62,7 @@ def _one_line(message: str, arguments: list[str]) -> str:
     named = {key.split(".")[-1] for key in re.findall(r"""['"]([\w.]+)['"]""", told)} - _EVERYWHERE
     options = {argument.lstrip("-").split("=")[0].split(".")[-1] for argument in arguments}
     if not named & options:
-        candidates = [Path(argument.removeprefix("--config=")) for argument in arguments]
-        for path in filter(Path.is_file, candidates):
+        for path in (part for given in configurations(arguments) for part in reversed(parts(given))):
             if named & set(re.findall(r"([\w.]+)\s*:", path.read_text(encoding="utf-8", errors="replace"))):
                 return f"{path}: {told}"
     return f"{told}; see --help"
@@ -80,12 +79,14 @@ def _dispatch(arguments: list[str]) -> None:
     elif verb == "--version":
         print(__version__)
     elif verb in COMMANDS:
+        inputs.check_inputs(arguments[1:], inputs.COMMANDS)
         from jsonargparse import auto_cli
 
         function = getattr(importlib.import_module("ftl_lightning.commands"), verb)
         program = f"python -m ftl_lightning {verb}"
-        auto_cli(function, args=arguments[1:], as_positional=verb in POSITIONAL, prog=program, exit_on_error=False)
+        auto_cli(function, args=expanded(arguments[1:]), as_positional=verb in POSITIONAL, prog=program, exit_on_error=False)
     elif verb in TRAINER_VERBS:
+        inputs.check_inputs(arguments[1:], inputs.TRAINER)
         from ftl_lightning.lightning_cli import run
 
         run(arguments)

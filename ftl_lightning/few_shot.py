@@ -1,6 +1,7 @@
 """The few-shot learner in a few lines of Python: load a pretrained model, learn a concept, sample, compose, judge, draw, execute."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
@@ -9,7 +10,6 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
-from rich.progress import Progress
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition, parse_composition
@@ -24,7 +24,9 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import CONFIG, ConceptModel
 from ftl_lightning.learning.inversion import InversionSettings, invert
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.progress import bar
 from ftl_lightning.seeding import EVALUATION_SEED, generator
+from ftl_lightning.shipped import pretrained_folder, shipped
 from ftl_lightning.tensor_file import atomic
 
 Start = InitialStates | Mapping[str, ArrayLike] | ArrayLike
@@ -170,15 +172,13 @@ class FewShot:
         Raises:
             UserError: naming the place, if there is no model.
         """
-        from ftl_lightning.configuration import find
-        from ftl_lightning.shipped import pretrained_folder
-
-        model = load_model(pretrained_folder(str(name))).to(device)
+        folder = pretrained_folder(name)
+        if not folder.is_dir() and str(name).count("/") == 1 and not str(name).startswith((".", "~")):
+            folder = _from_hub(str(name))
+        model = load_model(folder).to(device)
         if settings is None:
-            own = find(f"conf/invert/{model.config.domain}.yaml")
-            settings = own or find("conf/invert/own.yaml")
-        if settings is None:
-            raise UserError("settings: expected a configuration file of invert, found none; name one")
+            own = shipped(f"conf/invert/{model.config.domain}.yaml")
+            settings = own if own.is_file() else "conf/invert/own.yaml"
         return cls(model, Tuned.read(settings))
 
     @property
@@ -298,9 +298,8 @@ class FewShot:
         except TypeError as error:
             raise UserError(f"learn: expected settings of an inversion, found others ({error})") from None
         total = steps or self.tuned.learning_steps
-        with Progress(transient=True, disable=not progress) as bar:
-            task = bar.add_task(f"learning {own.concepts[0]!r}", total=total)
-            learned = invert(self.model, own, settings, total, lambda loss: bar.advance(task))
+        with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
+            learned = invert(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
         self._examples.append(own)
         return self._learned(learned[own.concepts[0]])
 
@@ -466,6 +465,21 @@ class FewShot:
             self.save_pretrained(folder)
             hub.create_repo(repository, private=private, exist_ok=True)
             return str(hub.upload_folder(repo_id=repository, folder_path=folder))
+
+
+def _from_hub(repository: str) -> Path:
+    """The folder of a model that is downloaded from the Hugging Face Hub, or was before.
+
+    Raises:
+        UserError: if it cannot be had.
+    """
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(repository, allow_patterns=["*.json", "*.safetensors", "*.md"]))
+    except Exception as error:  # the Hub, the network and the cache raise kinds of their own
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{repository}: expected a folder, a model that ships or one on the Hub, found none ({reason})") from error
 
 
 def _card(model: ConceptModel) -> str:

@@ -1,5 +1,6 @@
 """The verbs that need a trainer: Lightning's command line with ``invert`` added."""
 
+import itertools
 import logging
 import warnings
 from pathlib import Path
@@ -7,12 +8,15 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from jsonargparse import set_parsing_settings
+from jsonargparse import Namespace, set_parsing_settings
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
+from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.trainer import Trainer
+from ftl_lightning.training_bar import TrainingBar, accuracies
 
 
 class CommandLine(LightningCLI):
@@ -28,7 +32,36 @@ class CommandLine(LightningCLI):
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """One seed for everything, unless a configuration says otherwise, and the evaluator's options."""
         parser.add_lightning_class_args(Evaluator, "evaluation")
-        parser.set_defaults({"seed_everything": 0})
+        parser.set_defaults({"seed_everything": 0, "trainer.enable_model_summary": False})
+
+    def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
+        """The trainer, with our progress bar in place of Lightning's."""
+        configured = self._get(self.config_init, "trainer")
+        callbacks = list(configured["callbacks"] or [])
+        if configured["enable_progress_bar"] is not False and not any(isinstance(one, ProgressBar) for one in callbacks):
+            callbacks.append(TrainingBar())
+        return super().instantiate_trainer(**kwargs, callbacks=callbacks)
+
+    def before_instantiate_classes(self) -> None:
+        """An inversion gets a log folder of its own: ``invert``, then ``invert_1`` and so on."""
+        if self._verb == "invert" and not self._get(self.config, "ckpt_path"):  # else it goes on where it was
+            logger = self._get(self.config, "trainer").get("logger")
+            options = logger.get("init_args") if isinstance(logger, Namespace) else None
+            if options and isinstance(options.get("version"), str) and {"save_dir", "name"} <= set(options.keys()):
+                options["version"] = unused(Path(options["save_dir"]) / options["name"], options["version"])
+
+    @property
+    def _verb(self) -> str:
+        return self.subcommand or ""
+
+    def after_fit(self) -> None:
+        """Say where the model is."""
+        folder = self.model.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
+        print(", ".join((f"pretrained model: {folder}", *accuracies(self.trainer))))
+
+    def after_invert(self) -> None:
+        """Say where the run was logged."""
+        print(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
     def before_validate(self) -> None:
         """A checkpoint is needed; Lightning would evaluate random weights."""
@@ -55,8 +88,23 @@ class CommandLine(LightningCLI):
                 raise UserError(f"{path}: expected a checkpoint, found a damaged or foreign file") from error
 
 
+class _Inversion(CommandLine):
+    """The same for building an inversion without running it."""
+
+    _verb = "invert"
+
+
+def unused(folder: Path, name: str) -> str:
+    """The name, or with the smallest number after it, that nothing in a folder has: ``invert``, ``invert_1``, ``invert_2``."""
+    numbered = (f"{name}_{number}" if number else name for number in itertools.count())
+    return next(free for free in numbered if not (folder / free).exists())
+
+
 class _Parser(CommandLine):
     """The same without building anything."""
+
+    def before_instantiate_classes(self) -> None:
+        """Nothing."""
 
     def instantiate_classes(self) -> None:
         """Nothing."""
@@ -67,9 +115,9 @@ def run(arguments: list[str]) -> None:
     _command_line(CommandLine, arguments, run=True)
 
 
-def build(options: list[str]) -> CommandLine:
-    """Parse the options of a verb and build trainer, model and data without running anything."""
-    return _command_line(CommandLine, options, run=False)
+def build(verb: str, options: list[str]) -> CommandLine:
+    """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
+    return _command_line(_Inversion if verb == "invert" else CommandLine, options, run=False)
 
 
 def parse(options: list[str]) -> dict[str, Any]:
@@ -100,7 +148,7 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=arguments,
+            args=expanded(arguments),
         )
     except OSError as error:
         raise UserError(

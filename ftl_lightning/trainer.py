@@ -9,7 +9,13 @@ from ftl_lightning.learning.adaptation import Adaptation
 
 
 class Trainer(pl.Trainer):
-    """A trainer that can also ``invert``."""
+    """A trainer that can also ``invert``.
+
+    Attributes:
+        verb: what it does, for the progress bar.
+    """
+
+    verb = "fit"
 
     def fit(self, model: pl.LightningModule, *arguments: Any, **options: Any) -> None:
         """As Lightning's, for what learns."""
@@ -29,6 +35,7 @@ class Trainer(pl.Trainer):
             raise UserError(f"model.class_path: expected a module that adapts a pretrained model, found {type(model).__name__}")
         if ckpt_path and not model.learns:
             raise UserError(f"ckpt_path: expected none for {model.method}, which learns nothing, found {ckpt_path}")
+        self.verb = "invert"
         if model.learns:
             self.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
         self.test(model, datamodule=datamodule, verbose=False)

@@ -9,6 +9,7 @@ from nbclient import NotebookClient
 
 from ftl_lightning.ablation import Stage
 from ftl_lightning.cli import main
+from ftl_lightning.configuration import load
 from ftl_lightning.evaluation.results import read_rows
 from tests.conftest import CONF, ROOT
 
@@ -34,6 +35,21 @@ def test_cells_are_the_product_of_names_and_grid() -> None:
     assert len(cells) == 8
     expected = ["--config=b.yaml", "--model.pretrained=p7/b", "--model.components=1", "--model.omega=learned"]
     assert cells[5].arguments == expected
+    assert str(cells[5]) == "invert b, components 1, omega learned, seed 7"
+    assert cells[5].folder == "invert_b_components_1_omega_learned_seed_7"
+    assert cells[5].command == " ".join(["python -m ftl_lightning invert", *expected])
+
+
+def test_a_cell_is_named_by_what_its_configuration_does_not_say() -> None:
+    stage = Stage("invert", "{method}/{domain}.yaml", {"method": ["bc"], "domain": ["agent"]}, name="flat")
+    assert [str(cell) for cell in stage.cells(0)] == ["invert agent, bc, flat, seed 0"]
+
+
+@pytest.mark.parametrize("path", sorted((CONF / "ablation").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_cell_of_an_ablation_has_a_name_of_its_own(path: Path) -> None:
+    plan = load(path)
+    names = [str(cell) for stage in plan["stages"] for seed in plan["seeds"] for cell in Stage(**stage).cells(seed)]
+    assert len(set(names)) == len(names)
 
 
 @pytest.fixture
@@ -123,6 +139,12 @@ def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(quick: dict[str, o
     assert main(["ablate", "--config", plan("a.yaml", failing, quick)]) == 2
     told = capsys.readouterr()
     assert "1 of 2 cells failed" in told.err
+    # The failed one with its command, the other without.
+    assert "[1/2, about" in told.out
+    assert "invert object_rearrangement, seed 0: failed: " in told.out
+    assert "--model.learning_rate=1e+30" in told.out
+    assert told.out.count("python -m ftl_lightning") == 1
+    assert (Path("logs") / "object_rearrangement" / "invert_object_rearrangement_seed_0_1" / "results.csv").is_file() is False
     assert "the loss became" in told.err
     assert len(read_rows("r.csv")) > 0
 

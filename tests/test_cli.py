@@ -13,10 +13,13 @@ import yaml
 
 from ftl_lightning.cli import COMMANDS, TRAINER_VERBS, main
 from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations
 from tests.conftest import CONF, ROOT, TINY
 
-CONFIGS = sorted(path.relative_to(CONF) for path in CONF.rglob("*.yaml"))
+PARTS = {"verb", "domain", "sampling", "method"}
+"""Folders of what configurations are built from."""
+CONFIGS = sorted(path for path in (path.relative_to(CONF) for path in CONF.rglob("*.yaml")) if path.parts[0] not in PARTS)
 PRETRAINING = str(CONF / "object_rearrangement.yaml")
 INVERSION = str(CONF / "invert" / "object_rearrangement.yaml")
 
@@ -56,8 +59,38 @@ def test_every_configuration_file_parses(path: Path, capsys: pytest.CaptureFixtu
     base = ["fit", "--config", PRETRAINING] if kind == "size" else [verb]
     assert main([*base, "--config", str(CONF / path), "--print_config"]) == 0
     printed = yaml.safe_load(capsys.readouterr().out)
-    for key in yaml.safe_load((CONF / path).read_text()):
+    for key in load(CONF / path):
         assert key in printed
+
+
+def test_a_missing_input_file_is_told_before_anything_slow_is_imported() -> None:
+    for arguments in (
+        ["invert", "--config", "nothing.yaml"],
+        ["invert", "--config", INVERSION, "--model.pretrained", "nowhere"],
+        ["fit", "--config", PRETRAINING, "--ckpt_path=no.ckpt"],
+        ["sample", "--pretrained", "nowhere"],
+    ):
+        code = (
+            f"import sys; from ftl_lightning.cli import main; code = main({arguments!r});"
+            "sys.exit(code if not {'lightning', 'torch', 'transformers', 'jsonargparse'} & sys.modules.keys() else 99)"
+        )
+        done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True, text=True)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+def test_configurations_are_found_in_a_folder_without_any(capsys: pytest.CaptureFixture[str]) -> None:
+    assert not Path("conf").exists()
+    assert main(["fit", "--config", "conf/baseline/bc/agent.yaml", "--print_config"]) == 0
+    assert "CloningPretraining" in capsys.readouterr().out
+
+
+def test_a_mistaken_key_in_a_part_is_told_with_the_part(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("part.yaml").write_text("model: {init_args: {depht: 3}}\n")
+    Path("whole.yaml").write_text(f"defaults: ['{PRETRAINING}', part.yaml]\ntrainer: {{max_steps: 1}}\n")
+    told = error(capsys, "fit", "--config", "whole.yaml")
+    assert told.startswith("error: part.yaml: ")
+    assert "'depht' is not accepted" in told
 
 
 def test_configuration_keys_can_be_read_back(capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +104,9 @@ def test_configuration_keys_can_be_read_back(capsys: pytest.CaptureFixture[str])
     ("arguments", "expected"),
     [
         (["fly"], "verb: expected one of fit, invert"),
-        (["fit", "--config", "nothing.yaml"], "nothing.yaml"),
+        (["fit", "--config", "nothing.yaml"], "nothing.yaml: expected a configuration file, found nothing"),
+        (["fit", "--config", "conf/nothing.yaml"], "conf/nothing.yaml: expected a configuration file, found nothing; conf holds"),
+        (["fit", f"--config={CONF}"], "conf: expected a configuration file, found a folder"),
         (["fit", "--config", PRETRAINING, "--model.depht=3"], "depht"),
         (["fit", "--config", PRETRAINING, "--trainer.max_steps=many"], "max_steps"),
         (["fit", "--config", PRETRAINING, "--ckpt_path=no.ckpt"], "ckpt_path: expected a checkpoint file"),
@@ -81,6 +116,12 @@ def test_configuration_keys_can_be_read_back(capsys: pytest.CaptureFixture[str])
         (["fit", "--config", PRETRAINING, *TINY, "--data.encoder=no/such/model"], "encoder: expected a folder"),
         (["invert", "--config", INVERSION, "--model.pretrained=nowhere"], "nowhere/config.json: expected a pretrained model"),
         (["sample", "--pretrained=nowhere"], "nowhere/config.json: expected a pretrained model"),
+        (["sample", "--pretrained", "nowhere"], "nowhere/config.json: expected a pretrained model"),
+        (["explain", "--concept", "no.safetensors"], "no.safetensors: expected a concept file, found nothing"),
+        (
+            ["invert", "--config", INVERSION, "--data.demonstrations", "no.npz"],
+            "no.npz: expected a demonstrations file, found nothing",
+        ),
         (["generate", "chess"], "domain: expected one of"),
         (["generate", "object_rearrangement", "--task=circle on square"], "expected 'A <relation> B'"),
         (["generate", "object_rearrangement", "--task=circle above squaretriangle above square"], "found 'triangle above square'"),
@@ -175,6 +216,29 @@ def test_a_checkpoint_of_the_other_module_is_refused(tiny: Path, capsys: pytest.
     Path("damaged.ckpt").write_bytes(checkpoint.read_bytes()[:1000])
     told = error(capsys, "test", "--config", PRETRAINING, "--ckpt_path=damaged.ckpt")
     assert "damaged.ckpt: expected a checkpoint, found a damaged or foreign file" in told
+
+
+def test_fit_says_where_the_model_is_and_how_accurate(capsys: pytest.CaptureFixture[str]) -> None:
+    options = [*TINY, "--trainer.max_steps=4", "--data.steps_per_epoch=2", "--evaluation.samples=2"]
+    assert main(["fit", "--config", PRETRAINING, *options]) == 0
+    assert "pretrained model: logs/object_rearrangement/fit/pretrained, accuracy 0." in capsys.readouterr().out
+    assert Path("logs/object_rearrangement/fit/pretrained/config.json").is_file()
+
+
+def test_an_inversion_overwrites_no_other(invert: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+    short = [
+        "--data.suite=validation",
+        "--evaluation.suites=[validation]",
+        "--evaluation.samples=1",
+        "--evaluation.references=false",
+    ]
+    first = invert(*short)
+    before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    assert capsys.readouterr().out.endswith("logged in logs/object_rearrangement/invert\n")
+    invert(*short)
+    assert capsys.readouterr().out.endswith("logged in logs/object_rearrangement/invert_1\n")
+    assert before == {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    assert (first.parent / "invert_1" / "results.csv").is_file()
 
 
 def test_fit_validate_and_test_of_a_checkpoint_agree(tiny: Path) -> None:

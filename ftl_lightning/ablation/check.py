@@ -1,4 +1,4 @@
-"""What is wrong with a plan, told before any of it runs."""
+"""Mistakes in a plan, found before any of it runs."""
 
 import importlib
 from argparse import ArgumentError
@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ftl_lightning.ablation.plan import Cell
+from ftl_lightning.configuration import find
 from ftl_lightning.errors import UserError
+from ftl_lightning.shipped import pretrained_folder
 
 if TYPE_CHECKING:
     from ftl_lightning.learning.adaptation import Adaptation
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Refuse cells that cannot run, before any does: for their files, keys, encoders and, of ``invert``, domains, suites and
-    pretrained models.
+    """Check every cell's files, keys and encoder and, for ``invert``, its domain, suites and pretrained model.
 
     Raises:
-        UserError: naming them.
+        UserError: one line with every mistake; nothing was started.
     """
     made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
@@ -26,7 +27,7 @@ def check(cells: Sequence[Cell]) -> None:
         try:
             _check(cell, made)
         except (UserError, ArgumentError) as error:
-            mistakes[str(cell)] = " ".join(str(error).split())
+            mistakes[cell.command] = " ".join(str(error).split())
     if mistakes:
         told = dict.fromkeys(mistakes.values())
         raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(told)}")
@@ -36,12 +37,10 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.concepts.encoder import load_encoder
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.learning.concept_model import read_config
+    from ftl_lightning.learning.pretrained import MODELS, model_class
     from ftl_lightning.lightning_cli import parse
 
-    if not Path(cell.config).is_file():
-        folder = next(parent for parent in Path(cell.config).parents if parent.is_dir())
-        there = ", ".join(sorted(entry.name for entry in folder.iterdir()))
-        raise UserError(f"config: {cell.config}: expected a configuration file, found nothing; {folder} holds {there}")
+    find(cell.config)
     config = parse(cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
     if cell.verb == "fit":
@@ -53,19 +52,20 @@ def _check(cell: Cell, made: set[str]) -> None:
         )
     domain = load_domain(data["domain"])
     for key, names in (("evaluation.suites", config["evaluation"]["suites"]), ("data.suite", [data["suite"]])):
-        if unknown := set(names) - set(domain.suites):
-            expected = ", ".join(domain.suites)
+        if unknown := set(names) - set(domain.concepts.suites):
+            expected = ", ".join(domain.concepts.suites)
             raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")
     if model["pretrained"] not in made:
-        kinds = _class(config["model"]["class_path"]).kinds
-        found = read_config(model["pretrained"])
+        adapts = _class(config["model"]["class_path"]).adapts
+        kinds = [kind for kind in MODELS if issubclass(model_class(kind), adapts)]
+        found = read_config(pretrained_folder(model["pretrained"]))
         if found["domain"] != domain.name or found["kind"] not in kinds:
             raise UserError(
                 f"model.pretrained: expected a model of {domain.name} ({' or '.join(kinds)}), found one of {found['domain']} "
                 f"({found['kind']}) in {model['pretrained']}"
             )
     if "encoder" in model:
-        load_encoder(model["encoder"], domain.table, model["revision"])
+        load_encoder(model["encoder"], domain.concepts.table, model["revision"])
 
 
 def _class(path: str) -> type["Adaptation"]:

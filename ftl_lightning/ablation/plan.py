@@ -3,8 +3,10 @@
 import itertools
 import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from ftl_lightning.errors import UserError
@@ -17,11 +19,12 @@ class Stage:
     Attributes:
         verb: ``fit`` or ``invert``.
         config: its configuration file.
+        name: stands in the names of the cells, for stages that differ in their options alone.
         each: names with a list of texts each, which stand in the other values; the stage runs for their product.
         options: that all cells share, by their names on the command line.
         grid: options with a list of values each; the cells are their product.
-        done: a file whose presence means that the stage need not run, such as a pretrained model; empty for never. It is the
-            file alone that counts: remove it after a change of the stage's configuration.
+        done: a file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content
+            is not looked at: remove it after a change of the stage's configuration.
     """
 
     verb: Literal["fit", "invert"]
@@ -30,6 +33,7 @@ class Stage:
     options: Mapping[str, Any] = field(default_factory=dict)
     grid: Mapping[str, list[Any]] = field(default_factory=dict)
     done: str = ""
+    name: str = ""
 
     def cells(self, seed: int) -> Iterator["Cell"]:
         """Every cell for one seed."""
@@ -37,26 +41,41 @@ class Stage:
             names = {"seed": str(seed), **dict(zip(self.each, texts, strict=True))}
             for values in itertools.product(*self.grid.values()):
                 options = {**self.options, **dict(zip(self.grid, values, strict=True))}
-                told = {key: _text(value, names) for key, value in options.items()}
-                yield Cell(self.verb, _text(self.config, names), told, _text(self.done, names))
+                texts_of = {key: _text(value, names) for key, value in options.items()}
+                config = _text(self.config, names)
+                said = [text for text in texts if text != Path(config).stem]
+                varied = [f"{key.rpartition('.')[2]} {texts_of[key]}" for key in self.grid]
+                parts = [f"{self.verb} {Path(config).stem}", *said, _text(self.name, names), *varied, f"seed {seed}"]
+                yield Cell(self.verb, config, texts_of, _text(self.done, names), ", ".join(filter(None, parts)))
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One run: a verb, its configuration file, options, and the file that says that it need not run."""
+    """One run: a verb, its configuration file, options, the file that says that it need not run, and what it is called."""
 
     verb: Literal["fit", "invert"]
     config: str
     options: Mapping[str, str]
     done: str
+    name: str
 
     @property
     def arguments(self) -> list[str]:
         """As on the command line, without the verb."""
         return [f"--config={self.config}", *(f"--{key}={value}" for key, value in self.options.items())]
 
+    @property
+    def command(self) -> str:
+        """What runs the cell by hand."""
+        return shlex.join(("python", "-m", "ftl_lightning", self.verb, *self.arguments))
+
+    @property
+    def folder(self) -> str:
+        """The name as that of a folder."""
+        return re.sub(r"[^\w.+-]+", "_", self.name).strip("_")
+
     def __str__(self) -> str:
-        return " ".join((self.verb, *self.arguments))
+        return self.name
 
 
 def _text(value: Any, names: Mapping[str, str]) -> str:
@@ -67,7 +86,7 @@ def _text(value: Any, names: Mapping[str, str]) -> str:
 
 
 def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
-    """Of every stage the cells of a shard: each so-manieth."""
+    """Every n-th cell of each stage, for shard i of n (``'i/n'``); counting goes on from stage to stage."""
     found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if not found or int(found[1]) > int(found[2]):
         raise UserError(f"shard: expected 'number/shards' such as 3/8, found {shard!r}")

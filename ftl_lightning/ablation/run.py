@@ -1,11 +1,11 @@
-"""Running a plan, here or on a cluster; the work itself is the same."""
+"""Running a plan, here or on a cluster, cell by cell in the same way."""
 
 import os
 import tempfile
 import time
 import traceback
 from argparse import ArgumentError
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 from ftl_lightning.ablation.check import check
 from ftl_lightning.ablation.plan import Cell, Stage, part
+from ftl_lightning.configuration import load
 from ftl_lightning.errors import UserError
+from ftl_lightning.progress import bar
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cell: rows of results (``None`` for none), what there is to say, and the mistake, if it failed."""
+    """The end of a cell: rows of results (``None`` for none), a note, and the error, if it failed."""
 
     rows: "pd.DataFrame | None" = None
     note: str = ""
@@ -33,7 +35,7 @@ class Outcome:
 def run_ablation(
     stages: Sequence[Stage], seeds: Sequence[int], results: str, shard: str = "1/1", executor: Literal["local", "ray"] = "local"
 ) -> None:
-    """Run all cells of all seeds, stage after stage; a cell that fails is told at the end and does not stop the others.
+    """Run all cells of all seeds, stage after stage. A cell that fails does not stop the others; failures are listed at the end.
 
     Args:
         stages: in order; a later one may read what an earlier one wrote.
@@ -53,13 +55,14 @@ def run_ablation(
     check([cell for cells in plan for cell in cells])
     total, number, failed = sum(map(len, plan)), 0, []
     start = time.monotonic()
-    with _executor(executor) as run:
+    with _executor(executor) as run, bar("cells", total, lines=False) as advance:
         for cells in plan:
             for cell, outcome in run(cells, _known(results)):
                 number += 1
                 left = (time.monotonic() - start) / number * (total - number) / 60
-                told = f"failed: {outcome.error}" if outcome.error else outcome.note
+                told = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
                 print(f"[{number}/{total}, about {left:.0f} min left] {cell}: {told}", flush=True)
+                advance()
                 if outcome.rows is not None:
                     add_rows(results, outcome.rows)
                 if outcome.error:
@@ -106,7 +109,7 @@ def _executor(name: str) -> Iterator[Run]:
 
 
 def attempt(cell: Cell, known: set[str]) -> Outcome:
-    """Run a cell, unless what it would measure is known; whatever goes wrong is its outcome."""
+    """Run a cell, unless its results are known; an error of any kind becomes its outcome."""
     if cell.done and Path(cell.done).is_file():
         return Outcome(note="done before")
     from ftl_lightning.evaluation.results import read_rows
@@ -116,7 +119,7 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "results.csv"
         try:
-            line = build([*cell.arguments, f"--evaluation.results={path}"])
+            line = build(cell.verb, [*cell.arguments, *_log(cell), f"--evaluation.results={path}"])
             if cell.verb == "invert" and _hash(line) in known:
                 return Outcome(note="in the results already")
             getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule)
@@ -129,8 +132,16 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
     return Outcome(rows, note="done" if rows is None else f"{len(rows)} rows")
 
 
+def _log(cell: Cell) -> list[str]:
+    """The option that names the log folder of a cell after it, unless the plan names it."""
+    option = "trainer.logger.init_args.version"
+    logger = load(cell.config).get("trainer", {}).get("logger")
+    named = cell.options.get(option, "null") != "null" or "trainer.logger" in cell.options or not isinstance(logger, Mapping)
+    return [] if named else [f"--{option}={cell.folder}"]
+
+
 def _attempt_in(folder: str, cell: Cell, known: set[str]) -> Outcome:
-    """Run a cell in a folder, which all machines of a cluster share."""
+    """Run a cell in the folder that all machines of a cluster share."""
     os.chdir(folder)
     return attempt(cell, known)
 

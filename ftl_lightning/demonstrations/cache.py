@@ -5,10 +5,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.progress import Progress
-
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.errors import UserError
+from ftl_lightning.progress import bar
 from ftl_lightning.tensor_file import content_hash
 
 Tell = Callable[[], None]
@@ -33,12 +32,11 @@ def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demon
             return Demonstrations.load(path)
         except UserError:
             path.unlink()  # of another version of this package, or damaged from outside: made again
-    with Progress(transient=True, disable=total < SLOW) as bar:
-        task = bar.add_task(f"{settings['domain']}: demonstrations", total=total)
-        made = make(lambda: bar.advance(task))
+    with bar(f"{settings['domain']}: demonstrations", total, lines=total >= SLOW) as advance:
+        made = make(advance)
     made.save(path)
     return made
 
 
 SLOW = 20
-"""So many and more get a progress bar."""
+"""So many and more are told in lines where there is no terminal."""

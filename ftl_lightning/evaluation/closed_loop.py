@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from rich.progress import Progress
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
@@ -17,6 +16,7 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop, Policy
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.progress import Advance, bar
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,10 +41,9 @@ def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout
         name: starts.observed[name][:, None].repeat(1, loop.steps + 1, *(1,) * (starts.observed[name].dim() - 1)) for name in kept
     }
     found = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
-    with Progress(transient=True) as progress:
-        bar = progress.add_task(f"{count} episodes", total=loop.steps * math.ceil(count / SIDE_BY_SIDE))
+    with bar(f"{count} episodes", loop.steps * math.ceil(count / SIDE_BY_SIDE), lines=False) as advance:
         for rows in torch.arange(count).split(SIDE_BY_SIDE):
-            _lock_step(loop, rows.tolist(), found, policy, lambda: progress.advance(bar))
+            _lock_step(loop, rows.tolist(), found, policy, advance)
     return found
 
 
@@ -58,7 +57,7 @@ def reset(loop: ClosedLoop, scenes: Tensor) -> InitialStates:
     return InitialStates({name: torch.stack([torch.as_tensor(one[name]) for one in seen]) for name in seen[0]}, scenes)
 
 
-def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy, advance: Callable[[], None]) -> None:
+def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy, advance: Advance) -> None:
     """Run these episodes together, one step of each after the other, and fill in what happened."""
     environments: dict[int, gymnasium.Env[Any, Any]] = {}
     scenes = found.starts.require_scenes()

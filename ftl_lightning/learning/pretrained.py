@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import CONFIG, ConceptModel, read_config
+from ftl_lightning.shipped import pretrained_folder
 
 MODELS = {
     "diffusion": "generative_model:GenerativeModel",
@@ -24,11 +25,15 @@ def model_class(kind: str) -> type[ConceptModel]:
 
 
 def load_model(folder: str | Path) -> ConceptModel:
-    """Read a folder that :meth:`~ftl_lightning.learning.concept_model.ConceptModel.save` wrote; the model is frozen.
+    """Read a model; it is frozen.
+
+    Args:
+        folder: that :meth:`~ftl_lightning.learning.concept_model.ConceptModel.save` wrote, or the name of one that ships.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, of an unknown method, or its files do not belong together.
     """
+    folder = pretrained_folder(folder)
     if (kind := read_config(folder)["kind"]) not in MODELS:
         raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {kind!r}")
     return model_class(kind).load(folder)

@@ -1,0 +1,131 @@
+"""Configuration files that build on others.
+
+A file may have the key ``defaults``, a list of files that are merged in order before its own keys: mappings key by key, of
+everything else, lists too, the later value stands. So an experiment says only what differs::
+
+    defaults: [trainer/fit.yaml, domain/fit/agent.yaml, method/fit/bc.yaml]
+    trainer: {max_steps: 6000}
+
+Each name is looked for in the folder of the file that has it, then in the folders above, at last in what is shipped with the
+package (:mod:`ftl_lightning.shipped`). Interpolations such as ``${seed_everything}`` are left as they are.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.shipped import shipped
+
+DEFAULTS = "defaults"
+_OPTIONS = ("--config", "-c")
+
+
+def find(path: str | Path) -> Path:
+    """A configuration file by its path from the current folder or, if there is none, among the shipped ones.
+
+    Raises:
+        UserError: if there is none, naming what is there instead.
+    """
+    found = shipped(path)
+    if not found.is_file():
+        raise UserError(f"{path}: expected a configuration file, found {'a folder' if found.is_dir() else 'nothing'}{_near(path)}")
+    return found
+
+
+def _near(path: str | Path) -> str:
+    """What the nearest folder holds, to help with a wrong name; nothing for the current folder."""
+    parent = next(parent for parent in Path(path).parents if shipped(parent).is_dir())
+    folder = shipped(parent)
+    there = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() or entry.suffix == ".yaml")
+    return f"; {parent} holds {', '.join(there)}" if there and folder.resolve() != Path.cwd() else ""
+
+
+def load(path: str | Path) -> dict[str, Any]:
+    """The keys of a configuration file and of all that it builds on.
+
+    Raises:
+        UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
+    """
+    found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
+def parts(path: str | Path) -> list[Path]:
+    """The files that :func:`load` merges, in order; the last is the file itself."""
+    return [part for part, _ in _parts(find(path), ())]
+
+
+def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConfig]]:
+    """Every file with its own keys. ``above`` are the files that led here."""
+    if path.resolve() in (one.resolve() for one in above):
+        raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
+    keys = _read(path)
+    names = keys.pop(DEFAULTS, None) or []
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {names}")
+    for name in names:
+        yield from _parts(_beside(path, name), (*above, path))
+    yield path, keys
+
+
+def _beside(path: Path, name: str) -> Path:
+    """The file that ``defaults`` of a file name."""
+    for folder in path.absolute().parents:
+        if (folder / name).is_file():
+            # As the user writes it: relative where the file is.
+            return folder / name if path.is_absolute() else _relative(folder / name)
+    if (found := shipped(name)).is_file():
+        return found
+    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found no {name} beside it or in a folder above it")
+
+
+def _relative(path: Path) -> Path:
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _read(path: Path) -> DictConfig:
+    try:
+        keys = OmegaConf.load(path)
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{path}: expected a configuration file (YAML), found {' '.join(str(error).split())}") from error
+    if not isinstance(keys, DictConfig):
+        raise UserError(f"{path}: expected a mapping of keys, found a list")
+    return keys
+
+
+def configurations(arguments: Sequence[str]) -> list[str]:
+    """The configuration files that a command line names, in order."""
+    return [value for _, _, value in _given(arguments)]
+
+
+def expanded(arguments: Sequence[str]) -> list[str]:
+    """A command line with the content of configuration files, as :func:`load` has it, in place of their names.
+
+    Raises:
+        UserError: as :func:`load`.
+    """
+    result = list(arguments)
+    for index, prefix, value in _given(arguments):
+        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value)))
+    return result
+
+
+def _given(arguments: Sequence[str]) -> Iterator[tuple[int, str, str]]:
+    """For each configuration file the argument that holds its name, what stands before it there, and the name.
+
+    A configuration that is itself the argument (``--config '{seed_everything: 1}'``) is left out.
+    """
+    for index, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if argument in _OPTIONS and index + 1 < len(arguments):
+            index, equals, option, value = index + 1, "", "", arguments[index + 1]
+        elif option not in _OPTIONS or not equals:
+            continue
+        if "\n" not in value and not value.lstrip().startswith("{"):
+            yield index, option + equals, value

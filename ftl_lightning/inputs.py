@@ -1,0 +1,90 @@
+"""Input files that a command line names, looked for before anything slow is imported."""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.configuration import configurations, load
+from ftl_lightning.errors import UserError
+from ftl_lightning.shipped import pretrained_folder
+
+Check = Callable[[str], None]
+"""Raises a :class:`UserError` for a path where nothing is that could be meant."""
+
+
+def _model(path: str) -> None:
+    config = Path(path) / "config.json"
+    if not (pretrained_folder(path) / config.name).is_file():
+        raise UserError(f"{config}: expected a pretrained model, found nothing; run: python -m ftl_lightning fit")
+
+
+def _checkpoint(path: str) -> None:
+    if path not in ("last", "best") and not Path(path).is_file():
+        raise UserError(f"ckpt_path: expected a checkpoint file, 'last' or 'best', found {path!r}, which does not exist")
+
+
+def _demonstrations(path: str) -> None:
+    if not MINARI.fullmatch(path):
+        _file("demonstrations")(path)
+
+
+MINARI = re.compile(r"[\w./-]+-v\d+")
+"""How Minari names a data set."""
+
+
+def _file(kind: str) -> Check:
+    def check(path: str) -> None:
+        if not Path(path).is_file():
+            raise UserError(f"{path}: expected a {kind} file, found {'a folder' if Path(path).is_dir() else 'nothing'}")
+
+    return check
+
+
+TRAINER: Mapping[str, Check] = {
+    "model.pretrained": _model,
+    "data.demonstrations": _demonstrations,
+    "ckpt_path": _checkpoint,
+}
+"""Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
+COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _file("demonstrations")}
+"""Of the others."""
+
+
+def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
+    """Refuse a command line, its configuration files included, that names input files that are not there.
+
+    Args:
+        arguments: those of a verb, without it.
+        checks: by option.
+
+    Raises:
+        UserError: for the first one, or for a configuration file that cannot be read.
+    """
+    values: dict[str, Any] = {}
+    for path in configurations(arguments):
+        values |= dict(_flat(load(path), ""))
+    values |= {option.replace(".init_args.", "."): value for option, value in _options(arguments)}
+    if {"help", "print_config"} & values.keys() or "-h" in arguments:
+        return
+    for option, check in checks.items():
+        value = values.get(option)
+        if isinstance(value, str) and value not in ("", "null") and "${" not in value:
+            check(value)
+
+
+def _flat(keys: Mapping[str, Any], above: str) -> Iterator[tuple[str, Any]]:
+    """Every value with its keys joined by dots, without ``init_args``."""
+    for key, value in keys.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, above if key == "init_args" else f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Every option with its value, given as ``--option=value`` or ``--option value``."""
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        if argument.startswith("--"):
+            option, equals, value = argument[2:].partition("=")
+            yield option, value if equals else following

@@ -1,0 +1,36 @@
+"""Files that come with the package: configurations (``conf/...``) and pretrained models (``pretrained/...``).
+
+In the repository both folders stand at the root; the package holds links to them, which a wheel has as folders. So the paths in
+the documentation are true in a checkout and, after ``pip install``, in any folder.
+"""
+
+from pathlib import Path
+
+FOLDERS = ("conf", "pretrained")
+"""What is shipped."""
+_PACKAGE = Path(__file__).parent
+
+
+def shipped(path: str | Path) -> Path:
+    """The path as given, if something is there; else the same path among the shipped folders, if something is there.
+
+    Args:
+        path: for example ``conf/agent.yaml`` or ``pretrained/agent``, relative to the current folder.
+
+    Returns:
+        The path as given where nothing is found either way, so that errors name what the user wrote.
+    """
+    path = Path(path)
+    if not path.exists() and not path.is_absolute() and path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts:
+        inside = _PACKAGE / path
+        if inside.exists():
+            return inside
+    return path
+
+
+def pretrained_folder(name: str | Path) -> Path:
+    """The folder of a pretrained model by its path, or by the name of one that ships, such as ``agent``."""
+    for path in (Path(name), shipped(name), shipped(Path("pretrained") / name)):
+        if (path / "config.json").is_file():
+            return path
+    return Path(name)
