@@ -11,13 +11,16 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 @runtime_checkable
 class Generates(Protocol):
-    """The model, names of the method and of learned concepts, and embeddings."""
+    """The model, names of the method, of its variant and of learned concepts, and embeddings."""
 
     model: ConceptModel
     hparams: Any
 
     @property
     def method(self) -> str: ...
+
+    @property
+    def variant(self) -> str: ...
 
     @property
     def concepts(self) -> tuple[str, ...]: ...

@@ -46,6 +46,11 @@ class Adaptation(pl.LightningModule, ABC):
     def method(self) -> str:
         """The method's name in tables."""
 
+    @property
+    def variant(self) -> str:
+        """What tells it apart from others of the same method in tables; may be empty."""
+        return ""
+
     @abstractmethod
     def learned(self) -> dict[str, Concept]:
         """The concepts by name."""

@@ -102,10 +102,14 @@ class InversionModule(Adaptation):
     @property
     def method(self) -> str:
         """The method's name in tables."""
+        return self.model.name
+
+    @property
+    def variant(self) -> str:
         form = {1.0: "free", 0.0: "span"}.get(self.off_span, f"near span {self.off_span:g}")
         weight = self.hparams["training_omega"]
         parts = [*self.model.traits, form, *([] if weight is None else [f"training weight {weight:g}"])]
-        return f"{self.model.name} ({', '.join(parts)})"
+        return ", ".join(parts)
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
