@@ -13,7 +13,6 @@ from ftl_lightning import __version__
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import atomic
 
-
 METHOD, REFERENCE = "method", "reference"
 """Roles: what learns or is told a concept, and what stands beside it (chance, trivial policies, oracles)."""
 
@@ -96,8 +95,8 @@ def _alone(path: Path) -> Iterator[None]:
 def upgraded(table: pd.DataFrame) -> pd.DataFrame:
     """Rows of a file from before there were the columns ``variant`` and ``role``; nothing else changes, nor their order.
 
-    There a method told its variant in brackets, ``'FTL-IGM (entities, free)'``, and an empty omega marked a reference line, whose name
-    may have brackets of its own, ``'expert (oracle)'``.
+    There a method told its variant in brackets, ``'FTL-IGM (entities, free)'``, and an empty omega marked a reference line, whose
+    name may have brackets of its own, ``'expert (oracle)'``.
     """
     reference = table["omega"] == ""
     parts = table["method"].str.extract(r"^(?P<method>.*?)(?: \((?P<variant>.*)\))?$").fillna("")
