@@ -20,7 +20,7 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
     """One evaluation: the user's own concepts first, each with its numbers, then the mean of each setting.
 
     Below each, in lines that begin with a dash, stand the reference lines of the same tasks. Errors are standard errors over tasks;
-    a single task has none.
+    a single task has none. The column n tells tasks x samples of each.
 
     Args:
         rows: of one evaluation, see :func:`ftl_lightning.evaluation.rows.rows`.
@@ -28,9 +28,9 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
     """
     measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
     metrics = list(dict.fromkeys(row.metric for row in measured))
-    table = Table(title=_title(measured), box=box.SIMPLE, title_justify="left", padding=(0, 1, 0, 0))
-    table.add_column("mean ± error over tasks", overflow="fold", min_width=24)
-    for name in (*metrics, "samples"):
+    table = Table(title=_title(measured), box=box.SIMPLE, title_justify="left", padding=0)
+    table.add_column("mean ± error over tasks")
+    for name in (*metrics, "n"):
         table.add_column(name, justify="right")
     # Own concepts first, in their order; they are not part of their setting's mean.
     order = {name: number for number, name in enumerate(own)}
@@ -81,7 +81,7 @@ def _samples(rows: Sequence[Row]) -> str:
     counts = sorted({row.n for row in rows})
     each = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     tasks = len({row.task for row in rows})
-    return f"{tasks} x {each}" if tasks > 1 else each
+    return f"{tasks}x{each}" if tasks > 1 else each
 
 
 def plain(table: Table) -> str:

@@ -39,11 +39,11 @@ def cells(text: str) -> list[list[str]]:
 def test_own_concepts_come_first_and_settings_are_means_over_tasks() -> None:
     text = plain(summary_table(ROWS, ["my way"]))
     assert text.splitlines()[0].strip() == "agent: FTL-IGM (free), K = 2, omega 0.6"
-    assert cells(text)[0] == ["mean ± error over tasks", "accuracy", "closed loop success", "samples"]
+    assert cells(text)[0] == ["mean ± error over tasks", "accuracy", "closed loop success", "n"]
     assert cells(text)[2:] == [
         ["my way", "0.90", "0.70", "50"],
         ["- random", "0.30", "", ""],
-        ["training", "0.30 ± 0.10", "", "2 x 50"],
+        ["training", "0.30 ± 0.10", "", "2x50"],
         ["- random", "0.10", "", ""],
         ["new", "0.50", "", "50"],
     ]
