@@ -121,7 +121,7 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable
     assert "test/accuracy/new concept/square diagonal to triangle" in tags["scalars"]
     image = events.Images("new concept/square diagonal to triangle")[0]
     assert image.encoded_image_string.startswith(b"\x89PNG")
-    assert events.summary_metadata["_hparams_/session_start_info"]
+    assert EventAccumulator(str(log / "hparams")).Reload().summary_metadata["_hparams_/session_start_info"]
     labels = next(log.rglob("metadata.tsv")).read_text().splitlines()
     assert "square diagonal to triangle [component 2]" in labels
     assert "(empty)" in labels
