@@ -90,7 +90,7 @@ def plain(table: Table) -> str:
     own.box, own.padding = box.MARKDOWN, (0, 1, 0, 1)
     file = io.StringIO()
     Console(file=file, width=100_000, color_system=None).print(own)
-    return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
 
 
 def show(table: Table) -> None:

@@ -14,8 +14,8 @@ from ftl_lightning.domains.agent.scenes import COLOURS, PLANE, REACH, looks, obj
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """A bowl is an open triangle that points down."""
 MAX_COLUMNS = 4
-EVERY = 4
-"""Steps between two frames."""
+FRAMES = 40
+"""At most, of an episode."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, initial_states: Tensor | None) -> Figure:
@@ -57,16 +57,17 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
 
 
 def frames(observations: Tensor, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode ``(time, 52)``, every :data:`EVERY` steps, until nothing moves any more.
+    """At most :data:`FRAMES` pictures ``(height, width, 3)`` of an episode ``(time, 52)``, until nothing moves any more.
 
     Plans are not drawn: the pictures are the simulator's.
     """
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1
+    times = np.linspace(0, end - 1, min(end, FRAMES)).round().astype(int)  # the first and the last are among them
     environment = AgentEnvironment()
     pictures = []
-    for observation in observations[:end:EVERY]:
-        environment.reset(options={"initial_state": observation.numpy()})
+    for time in times:
+        environment.reset(options={"initial_state": observations[time].numpy()})
         pictures.append(environment.render())
     environment.close()
     return pictures
