@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
+from ftl_lightning.demonstrations.datamodule import InversionData
 from torch import Tensor
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.datamodule import InversionData
 from ftl_lightning.diffusion.samplers import ddpm
 from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.domain import load_domain

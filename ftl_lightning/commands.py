@@ -53,7 +53,6 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
     """
     from ftl_lightning.concepts.encoder import load_encoder, write_table
     from ftl_lightning.domains.registry import load_domain
-
     from ftl_lightning.errors import UserError
 
     concepts = load_domain(domain).concepts
@@ -107,7 +106,7 @@ def sample(
 
     from ftl_lightning.demonstrations.container import Demonstrations
     from ftl_lightning.errors import UserError
-    from ftl_lightning.evaluation.tensorboard import captioned, gif
+    from ftl_lightning.evaluation.animation import captioned, gif
     from ftl_lightning.few_shot import FewShot
     from ftl_lightning.tensor_file import atomic
 
@@ -137,9 +136,7 @@ def sample(
     changes = {name: value for name, value in chosen.items() if value is not None}
     composition = model.compose(" + ".join(part for part in (compose, concept) if part))
     plans = model.sample(composition, count, starts, seed=seed, **changes)
-    plans = replace(
-        plans, concepts=(goal,) * len(plans), provenance={**plans.provenance, "concept": concept, "compose": compose}
-    )
+    plans = replace(plans, concepts=(goal,) * len(plans), provenance={**plans.provenance, "concept": concept, "compose": compose})
     plans.save(out)
     print(f"{out}: {len(plans)} samples")
     if goal and domain.metrics:

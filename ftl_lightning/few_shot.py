@@ -1,4 +1,4 @@
-"""The few-shot learner in a few lines of Python: load a pretrained model, learn a concept, sample, compose, judge, draw, execute."""
+"""The few-shot learner in Python: load a pretrained model, learn a concept, sample, compose, judge, draw, execute."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -128,17 +128,14 @@ class Execution:
 
     def save(self, path: str | Path, episode: int = 0) -> None:
         """Write an episode as an animated .gif."""
-        from ftl_lightning.evaluation.tensorboard import captioned, gif
+        from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
 
         if Path(path).suffix != ".gif":
             raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
-        told = [self.goal] if self.goal else []
-        if self.goal:
-            outcomes = _loop(self.domain).judge(self.goal, self.rollout.take(episode, episode + 1))
-            told += [name for name, values in outcomes.items() if values.dtype == torch.bool and bool(values[0])]
-        pictures = self.frames(episode)
+        outcomes = _loop(self.domain).judge(self.goal, self.rollout) if self.goal else {}
+        pictures = captioned(self.frames(episode), outcome_text(self.goal, outcomes, episode))
         with atomic(path) as temporary:
-            temporary.write_bytes(gif(captioned(pictures, ": ".join(told)) if told else pictures))
+            temporary.write_bytes(gif(pictures))
 
 
 def _loop(domain: Domain) -> ClosedLoop:
@@ -535,5 +532,3 @@ def _by_name(observed: Any, features: Mapping[str, Feature]) -> dict[str, Any]:
     if len(features) != 1:
         raise UserError(f"observed: expected features by name ({', '.join(features) or 'none'}), found values without one")
     return {next(iter(features)): observed}
-
-

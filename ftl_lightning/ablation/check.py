@@ -51,7 +51,7 @@ def _check(cell: Cell, made: set[str]) -> None:
             f"verb: {cell.config}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)"
         )
     domain = load_domain(data["domain"])
-    for key, names in (("evaluation.suites", config["evaluation"]["suites"]), ("data.suite", [data["suite"]])):
+    for key, names in (("evaluation.suites", config["evaluation"]["suites"] or ()), ("data.suite", [data["suite"]])):
         if unknown := set(names) - set(domain.concepts.suites):
             expected = ", ".join(domain.concepts.suites)
             raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")

@@ -12,8 +12,8 @@ from ftl_lightning.errors import UserError
 Context = tuple[Tensor, ...]
 """What a condition encoder read from the observed features, each ``(batch, ...)``; empty where nothing is observed."""
 Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Context], Tensor]
-"""``(x (batch, horizon, state), t (batch,), concepts (concept, n), index (batch,), context) -> noise like x``, where ``index`` is each
-sample's row of ``concepts``."""
+"""``(x (batch, horizon, state), t (batch,), concepts (concept, n), index (batch,), context) -> noise like x``, where ``index`` is
+each sample's row of ``concepts``."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,7 @@ class Composition:
     weights: Tensor
 
     def __add__(self, other: "Composition") -> "Composition":
-        return Composition(
-            torch.cat((self.embeddings, other.embeddings), dim=-2), torch.cat((self.weights, other.weights), dim=-1)
-        )
+        return Composition(torch.cat((self.embeddings, other.embeddings), dim=-2), torch.cat((self.weights, other.weights), dim=-1))
 
     def __mul__(self, factor: float) -> "Composition":
         return Composition(self.embeddings, factor * self.weights)
@@ -44,7 +42,7 @@ class Composition:
 
 
 def batched(compositions: Sequence[Composition]) -> Composition:
-    """Compositions ``(K, n)`` of maybe different K as one of ``(composition, most K, n)``; empty ones of weight zero add nothing."""
+    """Compositions ``(K, n)`` of maybe different K as one ``(composition, most K, n)``, padded with weights of zero."""
     return Composition(
         nn.utils.rnn.pad_sequence([one.embeddings for one in compositions], batch_first=True),
         nn.utils.rnn.pad_sequence([one.weights for one in compositions], batch_first=True),

@@ -154,9 +154,7 @@ class Demonstrations:
             States ``(window, horizon, state)`` and what is observed where each starts, by name ``(window, *shape)``.
         """
         times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
-        seen = {
-            name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()
-        }
+        seen = {name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()}
         return self.states[rows[:, None], times], seen
 
     @property
@@ -208,9 +206,7 @@ class Demonstrations:
             raise UserError(f"{path}: key 'states': expected (demo, time, state), found only {', '.join(tensors) or 'nothing'}")
         states = tensors["states"]
         demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
-        observed = {
-            name.removeprefix(_OBSERVED): values for name, values in tensors.items() if name.startswith(_OBSERVED)
-        }
+        observed = {name.removeprefix(_OBSERVED): values for name, values in tensors.items() if name.startswith(_OBSERVED)}
         per_step, scenes = tuple(header.get("per_step", ())), tensors.get("scenes")
         if (initial := tensors.get("initial_states")) is not None:  # form 1
             observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()

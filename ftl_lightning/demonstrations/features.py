@@ -25,7 +25,7 @@ class Feature:
             nothing about a single entity.
         attributes: which of an entity's columns, counted from its first, a concept asks for when it names an entity (its colour,
             its shape); all where empty.
-        state: of a vector, the columns that hold the state a plan starts from, in a state's order; none where it holds no such state.
+        state: of a vector, the columns that hold the state a plan starts from, in its order; none where it holds no such state.
     """
 
     shape: tuple[int, ...]

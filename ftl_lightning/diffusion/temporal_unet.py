@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.concepts.composition import Context
 from ftl_lightning.diffusion.conditions import condition_encoder
+from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
 
 KERNEL, GROUPS = 5, 8

@@ -1,4 +1,4 @@
-"""What a domain is: one object in a few groups. Adding a domain adds a folder, here or in a package of one's own, with such an object."""
+"""What a domain is: one object in a few groups. Adding a domain adds such an object, here or in a package of one's own."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

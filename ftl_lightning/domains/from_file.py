@@ -61,7 +61,9 @@ class FileSource:
         """
         own = self.demonstrations.select(task) if task in self.demonstrations.concepts else None
         if own is None or len(own) < count:
-            raise UserError(f"task: expected {count} demonstrations of {task!r} in the file, found {0 if own is None else len(own)}")
+            raise UserError(
+                f"task: expected {count} demonstrations of {task!r} in the file, found {0 if own is None else len(own)}"
+            )
         return own.rows(list(range(count)))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates | None:

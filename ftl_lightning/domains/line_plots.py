@@ -1,4 +1,4 @@
-"""Pictures and films of behaviour of which nothing but its columns is known: paths in two or three dimensions, or lines over time."""
+"""Pictures and films of behaviour known by its columns alone: paths in two or three dimensions, or lines over time."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -19,20 +19,20 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import InitialStates, join, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import CLOSED, Domain
-from ftl_lightning.domains.tasks import EvaluationTask, Suite
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.evaluation.generates import Generates
-from ftl_lightning.evaluation.judged import Judged, executed, share, standard_error
+from ftl_lightning.evaluation.judged import Judged, executed, share
 from ftl_lightning.evaluation.references import references
-from ftl_lightning.evaluation.results import append_rows
+from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
-from ftl_lightning.evaluation.tensorboard import log_animation, log_hparams, log_projector
+from ftl_lightning.evaluation.summary import OWN, show, summary_table
+from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.data import InversionData
 from ftl_lightning.seeding import EVALUATION_SEED, generator
-
-OWN = "own demonstrations"
-"""The setting of learned concepts that no suite asks for."""
 
 
 def _key(task: EvaluationTask) -> tuple[int, ...]:
@@ -44,8 +44,9 @@ class Evaluator(pl.Callback):
     """Accuracy of generated behaviour.
 
     Args:
-        suites: names of suites of the domain. Tasks whose concept was not learned are left out; learned concepts that no suite
-            asks for are judged by their own name, if the domain can read it.
+        suites: names of suites of the domain; ``None`` for the training concepts while fitting, for ``training`` and ``paper`` of
+            concepts that a suite asks for, and for none of the user's own demonstrations. Tasks whose concept was not learned are
+            left out; learned concepts that no suite asks for are judged by their own name, if the domain can read it.
         samples: generated for each task; the paper's number is 50.
         sampler: ``'ddpm'`` (the paper's), ``'ddim'`` or ``'dpm_solver'``.
         steps: of the sampler, at most the model's T.
@@ -54,13 +55,14 @@ class Evaluator(pl.Callback):
         replan: steps that a plan is followed before a new one is made; the paper's number is 1.
         figures: how many samples of a task a TensorBoard figure shows; 0 for no figures.
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
-        references: also measure reference policies when testing; the same for every method, they are needed once a seed.
+        references: also measure reference policies when testing; the same for every method, they are needed once a seed. ``None``
+            for all but the user's own demonstrations.
         seed: of the samples.
     """
 
     def __init__(
         self,
-        suites: Sequence[str] = ("training",),
+        suites: Sequence[str] | None = None,
         samples: int = 50,
         sampler: str = "ddpm",
         steps: int = 100,
@@ -69,7 +71,7 @@ class Evaluator(pl.Callback):
         replan: int = 8,
         figures: int = 16,
         results: str | None = None,
-        references: bool = True,
+        references: bool | None = None,
         seed: int = 0,
     ) -> None:
         try:
@@ -80,10 +82,8 @@ class Evaluator(pl.Callback):
             raise UserError(f"evaluation.samples: expected 1 or more, found {samples}")
         if replan < 1:
             raise UserError(f"evaluation.replan: expected 1 or more, found {replan}")
-        self.suites = tuple(suites)
-        # The suites too: the size of a batch decides how its numbers are rounded.
-        self.settings: dict[str, Any] = {
-            "suites": ", ".join(suites),
+        self.suites = None if suites is None else tuple(suites)
+        self._settings: dict[str, Any] = {
             "samples": samples,
             "sampler": sampler,
             "steps": steps,
@@ -98,14 +98,28 @@ class Evaluator(pl.Callback):
         self.seed = seed
         self.judged: list[Judged] = []
         self.root: Path | None = None
+        self.asked: tuple[str, ...] = ("training",)
         self._projected = False
+
+    def _asked(self, data: object) -> tuple[str, ...]:
+        """The suites that are evaluated, given what is learned from."""
+        if self.suites is not None:
+            return self.suites
+        if not isinstance(data, InversionData):
+            return ("training",)
+        return () if data.own else ("training", "paper")
+
+    def settings(self, data: object) -> dict[str, Any]:
+        """What is configured here, given what is learned from."""
+        # The suites too: the size of a batch decides how its numbers are rounded.
+        return {"suites": ", ".join(self._asked(data)), **self._settings}
 
     def _tasks(self, domain: Domain, learned: Sequence[str]) -> list[EvaluationTask]:
         suites = domain.concepts.suites
-        for name in self.suites:
+        for name in self.asked:
             if name not in suites:
                 raise UserError(f"evaluation.suites: expected some of {', '.join(suites)}, found {name!r}")
-        tasks = [task for name in self.suites for task in suites[name].tasks]
+        tasks = [task for name in self.asked for task in suites[name].tasks]
         asked = {task.learned for task in tasks}
         own = [name for name in learned if name not in asked and (domain.concepts.reads(name) or not domain.metrics)]
         return tasks + [EvaluationTask(OWN, name, learned=name) for name in own]
@@ -166,11 +180,12 @@ class Evaluator(pl.Callback):
         """Tell mistakes before hours of training, not after."""
         if not isinstance(pl_module, Generates):
             raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(pl_module).__name__}")
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        self.asked, self.root = self._asked(data), getattr(data, "root", None)
         total = pl_module.model.max_steps
         if total is not None and self.sampling.steps > total:
             raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.sampling.steps}")
         self._tasks(pl_module.domain, pl_module.concepts)
-        self.root = getattr(trainer.datamodule, "root", None)  # type: ignore[attr-defined]
 
     on_fit_start = on_validation_start = on_test_start = _check
 
@@ -179,34 +194,29 @@ class Evaluator(pl.Callback):
             return
         assert isinstance(module, Generates)
         self.judged = self.evaluate(module, execute=self.closed_loop and stage == "test")
-        domain = module.domain
-        metrics: dict[str, float] = {}
-        for setting in Suite(tuple(one.task for one in self.judged)).settings:
-            own = [one.values for one in self.judged if one.task.setting == setting]
-            for name in own[0]:
-                values = [each[name] for each in own]
-                metrics[f"{stage}/{name}/{setting}"] = sum(values) / len(values)
-                metrics[f"{stage}/standard error of {name}/{setting}"] = standard_error(values)
-        each = {
-            f"{stage}/{name}/{one.task.setting}/{one.task.name}": value for one in self.judged for name, value in one.values.items()
-        }
-        module.log_dict(metrics | each, batch_size=1)
-        configured = configuration(module, trainer.datamodule, self.settings)  # type: ignore[attr-defined]
+        domain, data = module.domain, trainer.datamodule  # type: ignore[attr-defined]
+        by_task = {(one.task.setting, one.task.name): one.values for one in self.judged}
+        if stage == "val":  # a test is no curve
+            module.log_dict({f"val/{name}": value for name, value in setting_means(by_task).items()}, batch_size=1)
+        found: list[Row] = []
+        configured = configuration(module, data, self.settings(data))
+        if stage == "test" and self.judged:
+            compared = self.references if self.references is not None else not getattr(data, "own", False)
+            beside = references(self.judged, domain, module.demonstrated, self.seed) if compared else {}
+            found = rows(module, domain, self.judged, beside, configured)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 self._draw(logger, domain, trainer.global_step)
                 if stage == "test" or not self._projected:  # training embeddings do not change while fitting
                     log_projector(logger, module.concept_embeddings(), trainer.global_step)
                     self._projected = True
-                if stage == "test":
-                    log_hparams(logger, configured, metrics)
-        if stage == "test" and self.judged:
+                log_test(logger, configured, found, trainer.global_step)
+        if found:
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
-            found = references(self.judged, domain, module.demonstrated, self.seed) if self.references else {}
-            append_rows(path, rows(module, domain, self.judged, found, configured))
-            for name, value in metrics.items():
-                print(f"{name.removeprefix('test/')}: {value:.2f}")
-            print(f"rows written to {path}")
+            append_rows(path, found)
+            show(summary_table(found, [row.task for row in found if row.setting == OWN]))
+            if self.results is None:
+                print(f"{path}: {len(found)} rows")
 
     def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
         for one in self.judged if self.figures else ():
@@ -218,11 +228,17 @@ class Evaluator(pl.Callback):
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
             if one.rollout is not None and one.followed is not None and domain.closed_loop is not None:
                 pictures = domain.closed_loop.film(one.rollout.take(0, 1), one.followed)
-                log_animation(logger, f"{CLOSED}/{one.task.setting}/{one.task.name}", pictures, step)
+                log_animation(
+                    logger,
+                    f"{CLOSED}/{one.task.setting}/{one.task.name}",
+                    pictures,
+                    step,
+                    outcome_text(one.task.goal, one.outcomes),
+                )
 
     def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:
         """What the results file knows this evaluation by."""
-        return config_hash(configuration(module, data, self.settings))
+        return config_hash(configuration(module, data, self.settings(data)))
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

@@ -13,7 +13,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 @runtime_checkable
 class Generates(Protocol):
-    """The model, names of the method and of learned concepts, and embeddings."""
+    """The model, names of the method, of its variant and of learned concepts, and embeddings."""
 
     model: ConceptModel
     hparams: Any
@@ -22,10 +22,10 @@ class Generates(Protocol):
     def domain(self) -> Domain: ...
 
     @property
-    def variant(self) -> str: ...
+    def method(self) -> str: ...
 
     @property
-    def method(self) -> str: ...
+    def variant(self) -> str: ...
 
     @property
     def concepts(self) -> tuple[str, ...]: ...

@@ -13,13 +13,19 @@ from ftl_lightning import __version__
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import atomic
 
+METHOD, REFERENCE = "method", "reference"
+"""Roles: what learns or is told a concept, and what stands beside it (chance, trivial policies, oracles)."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One number.
 
     Attributes:
-        domain, setting, task, method: what was evaluated.
+        domain, setting, task: what was evaluated.
+        method: the method's family, for example ``'FTL-IGM'`` or ``'BC'``, or a reference line's name.
+        variant: what tells methods of one family apart, for example ``'entities, free'``; may be empty.
+        role: :data:`METHOD` or :data:`REFERENCE`.
         K: number of concept components; 0 where nothing was learned.
         omega: the fixed guidance weight as text, ``'learned'``, or ``'none'`` for a method without; empty for a reference line.
         demonstrations: that the task's concept was learned from; 0 where nothing was learned.
@@ -36,6 +42,8 @@ class Row:
     setting: str
     task: str
     method: str
+    variant: str = ""
+    role: str = METHOD
     K: int
     omega: str
     demonstrations: int
@@ -50,7 +58,9 @@ class Row:
 
 COLUMNS = [field.name for field in fields(Row)]
 _TEXT = {"omega": str, "model_hash": str, "config_hash": str, "version": str}
-_SUBJECT = ["domain", "setting", "task", "method", "K", "omega", "demonstrations", "seed", "metric"]
+_BEFORE_VARIANTS = [name for name in COLUMNS if name not in ("variant", "role")]
+"""The columns of files of version 0.1.0 and older."""
+_SUBJECT = ["domain", "setting", "task", "method", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
 _KEY = [*_SUBJECT, "n", "config_hash"]
 """What makes a row the same measurement as another, which it then replaces."""
 
@@ -82,6 +92,31 @@ def _alone(path: Path) -> Iterator[None]:
         os.close(handle)
 
 
+def upgraded(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a file from before there were the columns ``variant`` and ``role``; nothing else changes, nor their order.
+
+    There a method told its variant in brackets, ``'FTL-IGM (entities, free)'``, and an empty omega marked a reference line, whose
+    name may have brackets of its own, ``'expert (oracle)'``.
+    """
+    reference = table["omega"] == ""
+    parts = table["method"].str.extract(r"^(?P<method>.*?)(?: \((?P<variant>.*)\))?$").fillna("")
+    return table.assign(
+        method=parts["method"].where(~reference, table["method"]),
+        variant=parts["variant"].where(~reference, ""),
+        role=reference.map({False: METHOD, True: REFERENCE}),
+    )[COLUMNS]
+
+
+def label(method: str, variant: str = "") -> str:
+    """A method's name with its variant in brackets, for tables and legends."""
+    return f"{method} ({variant})" if variant else method
+
+
+def labels(rows: pd.DataFrame) -> pd.Series:
+    """:func:`label` of each row."""
+    return pd.Series([label(*pair) for pair in zip(rows["method"], rows["variant"], strict=True)], rows.index, dtype=str)
+
+
 def latest(rows: pd.DataFrame) -> pd.DataFrame:
     """Of rows about the same that differ only in how they were configured, the one that was measured last."""
     return rows.drop_duplicates(_SUBJECT, keep="last")
@@ -107,7 +142,7 @@ def read_rows(path: str | Path) -> pd.DataFrame:
     """Read one results file, or all ``.csv`` files of a folder.
 
     Raises:
-        UserError: if there is none, or a file has other columns.
+        UserError: if there is none, or a file has other columns. Files of older versions are read too, see :func:`upgraded`.
     """
     path = Path(path)
     files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
@@ -117,6 +152,8 @@ def read_rows(path: str | Path) -> pd.DataFrame:
             table = pd.read_csv(file, dtype=_TEXT, keep_default_na=False)
         except (OSError, ValueError) as error:
             raise UserError(f"{file}: expected a results file, found something else ({error})") from error
+        if list(table.columns) == _BEFORE_VARIANTS:
+            table = upgraded(table)
         if list(table.columns) != COLUMNS:
             raise UserError(f"{file}: expected the columns {', '.join(COLUMNS)}, found {', '.join(table.columns)}")
         tables.append(table)

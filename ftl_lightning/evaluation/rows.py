@@ -9,7 +9,7 @@ from ftl_lightning import __version__
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.generates import Generates
 from ftl_lightning.evaluation.judged import Judged, paired, share
-from ftl_lightning.evaluation.results import Row
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row
 from ftl_lightning.tensor_file import content_hash, file_hash
 
 
@@ -60,13 +60,15 @@ def rows(
     hparams = module.hparams
     ours = {
         "method": module.method,
+        "variant": module.variant,
+        "role": METHOD,
         "K": hparams.get("components", 0),
         "omega": str(hparams.get("omega", hparams.get("guidance", "none"))),
         "model_hash": module.model.hash,
         "config_hash": config_hash(configured),
     }
     alike = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
-    nobody = {"K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
+    nobody = {"variant": "", "role": REFERENCE, "K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
 
     policies = domain.closed_loop.policies if domain.closed_loop else {}
 

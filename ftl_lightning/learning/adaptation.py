@@ -52,7 +52,7 @@ class Adaptation(pl.LightningModule, ABC):
 
     @property
     def variant(self) -> str:
-        """What tables tell of it beside its name."""
+        """What tells it apart from others of the same method in tables; may be empty."""
         return ""
 
     @abstractmethod

@@ -54,8 +54,8 @@ class Pretraining(pl.LightningModule, ABC):
 
     method: str
     """The method's name in tables."""
-    variant = ""
-    """What tables tell of it beside its name."""
+    variant: str = ""
+    """What tells it apart from others of the same method in tables."""
     concepts: tuple[str, ...] = ()
     """Names of learned concepts; pretraining learns none."""
     stride: int = 1

@@ -1,71 +1,64 @@
 """Our method against the baselines, each number beside the paper's and their difference."""
 
 from collections.abc import Sequence
+from itertools import zip_longest
 
 import pandas as pd
 
-from ftl_lightning.domains.domain import OURS, Domain, Published, load_domain
-from ftl_lightning.evaluation.judged import ACCURACY, CLOSED, standard_error
-from ftl_lightning.evaluation.results import latest
-from ftl_lightning.reporting.tables import EXECUTED, MISSING, Number, Table, difference_to, paper, summarise
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.evaluation.judged import standard_error
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, latest
+from ftl_lightning.reporting.shown import domain_of, headlines, lookup, metrics, published, settings, training_settings
+from ftl_lightning.reporting.tables import MISSING, Number, Table, difference_to, make_table, paper, select, summarise
 
 LANGUAGE = "language"
 METHODS = (OURS, "BC", "CVAE", "in-context", LANGUAGE)
+"""The order of methods in tables; others come after them."""
 RESOLUTION = 0.005
 """What is nearer than that looks the same in the table."""
-
-
-def family(method: str) -> str:
-    """A method's name without what it tells of itself in brackets."""
-    return method.partition(" (")[0]
+LINES = 8
+"""At most, of the short overview."""
 
 
 def reference_lines(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
     """The latest rows of what stands beside all methods: chance, trivial policies and oracles."""
-    return latest(results[(results["domain"] == domain.name) & (results["omega"] == "")])
+    return latest(select(results, domain=domain.name, role=REFERENCE))
 
 
 def compared(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
-    """The latest rows of a domain's methods, with a column ``family``."""
-    rows = latest(results[(results["domain"] == domain.name) & (results["omega"] != "")])
-    return rows.assign(family=rows["method"].map(family))
+    """The latest rows of a domain's methods."""
+    return latest(select(results, domain=domain.name, role=METHOD))
 
 
-def metrics(domain: Domain) -> tuple[str, ...]:
-    """What the methods are compared by: the paper's metrics, and what our tables take for a success."""
-    headline = f"{CLOSED} {domain.closed_loop.headline}" if domain.closed_loop else EXECUTED
-    own = ([ACCURACY] if domain.succeeded else []) + ([EXECUTED, headline] if domain.closed_loop else [])
-    return tuple(dict.fromkeys((*own, *(one.metric for one in domain.published))))
-
-
-def published(domain: Domain, method: str, setting: str, metric: str) -> Published | None:
-    """The paper's number, if it has one; of ours, that of its main figures."""
-    for found in domain.published:
-        main = method != OURS or (found.components, found.omega) == (2, domain.published_omega)
-        if main and (found.method, found.setting, found.metric, found.task) == (method, setting, metric, ""):
-            return found
-    return None
-
-
-def settings(domain: Domain) -> list[str]:
-    """Of training and of the paper, in their order."""
-    return list(dict.fromkeys(name for suite in ("training", "paper") for name in domain.suites[suite].settings))
+def methods(rows: pd.DataFrame) -> list[str]:
+    """The methods among the rows: ours, the paper's baselines, and others as they appear."""
+    measured = dict.fromkeys(rows.loc[rows["role"] == METHOD, "method"])
+    return [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
 
 
 def comparison_table(domain: Domain, results: pd.DataFrame) -> Table:
     """One line for each setting, metric and method: measured, its errors, the paper's number, and the difference."""
     rows, references = compared(domain, results), reference_lines(domain, results)
     lines = []
-    for setting in settings(domain):
+    for setting in settings(domain, rows):
         for metric in metrics(domain):
-            own, around = (found[(found["setting"] == setting) & (found["metric"] == metric)] for found in (rows, references))
-            numbers = [(method, summarise(own[own["family"] == method])) for method in METHODS]
-            numbers += [(name, summarise(around[around["method"] == name])) for name in sorted(set(around["method"]))]
+            own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
+            numbers = [(method, summarise(select(own, method=method))) for method in methods(rows)]
+            numbers += [(name, summarise(select(around, method=name))) for name in sorted(set(around["method"]))]
             for method, number in numbers:
                 if number:
-                    lines.append([setting, metric, method, *beside(number, published(domain, method, setting, metric))])
-    caption = f"{domain.name}: all methods, learned from five demonstrations"
-    return Table("comparison", caption, pd.DataFrame(lines, columns=["setting", "metric", "method", *BESIDE], dtype=str))
+                    lines.append([setting, metric, method, *beside(number, lookup(domain, setting, metric, method=method))])
+    caption = f"{domain.name}: all methods{_learned_from(rows)}"
+    return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", *BESIDE])
+
+
+def _learned_from(rows: pd.DataFrame) -> str:
+    counts = sorted(set(rows.loc[rows["demonstrations"] > 0, "demonstrations"]))
+    if not counts:
+        return ""
+    few = "five" if counts == [5] else " to ".join(dict.fromkeys(str(count) for count in (counts[0], counts[-1])))
+    return f", learned from {few} demonstrations"
 
 
 BESIDE = ("measured", "standard error over tasks", "spread over seeds", "paper", "difference")
@@ -89,7 +82,7 @@ def lead(rows: pd.DataFrame, less: bool = False, others: Sequence[str] = METHODS
     """
     sign = -1 if less else 1
     by = "task" if len(set(rows["task"])) > 1 else "seed"
-    means = sign * rows.pivot_table(index=by, columns="family", values="value")
+    means = sign * rows.pivot_table(index=by, columns="method", values="value")
     others = [name for name in others if name in means]
     if OURS not in means or not others:
         return None
@@ -100,30 +93,57 @@ def lead(rows: pd.DataFrame, less: bool = False, others: Sequence[str] = METHODS
 
 def overview(results: pd.DataFrame) -> Table:
     """All domains on one screen: ours and the baselines, the paper's numbers in brackets."""
+    names = methods(results)
     lines = []
-    for name in sorted(set(results["domain"])):
-        domain = load_domain(name)
+    for domain in _domains(results):
         rows, references = compared(domain, results), reference_lines(domain, results)
-        training = domain.suites["training"].settings  # there language is ours: the same model and the same words
-        for setting in settings(domain):
-            others = [method for method in METHODS[1:] if not (method == LANGUAGE and setting in training)]
+        for setting in settings(domain, rows):
             for metric in metrics(domain):
-                own = rows[(rows["setting"] == setting) & (rows["metric"] == metric)]
+                own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
                 if not own.empty:
-                    less = domain.closed_loop is not None and metric.removeprefix(f"{CLOSED} ") in domain.closed_loop.costs
-                    cells = [_cell(domain, own, method, setting, metric) for method in METHODS]
-                    around = references[(references["setting"] == setting) & (references["metric"] == metric)]
-                    lines.append([name, f"{setting}, {metric}", *cells, _lead(lead(own, less, others)), _around(around)])
-    caption = "Ours and the baselines, mean ± standard error over tasks [the paper's]; then ours less the best baseline"
-    return Table(
-        "overview",
-        caption,
-        pd.DataFrame(lines, columns=["domain", "setting, metric", *METHODS, "lead", "reference lines"], dtype=str),
-    )
+                    lines.append([*_line(domain, own, setting, metric, names), _around(around)])
+    return Table("overview", _caption(results), pd.DataFrame(lines, columns=[*_head(names), "reference lines"], dtype=str))
+
+
+def short_overview(results: pd.DataFrame) -> Table:
+    """The overview in at most :data:`LINES` lines: of each domain in turn what says most, without reference lines."""
+    names = methods(results)
+    lines = {
+        domain.name: [
+            _line(domain, select(rows, setting=setting, metric=metric), setting, metric, names)
+            for setting, metric in headlines(domain, rows)
+        ]
+        for domain in _domains(results)
+        for rows in [compared(domain, results)]
+    }
+    shown = [line for turn in zip_longest(*lines.values()) for line in turn if line][:LINES]
+    shown.sort(key=lambda line: list(lines).index(line[0]))
+    return Table("overview", _caption(results), pd.DataFrame(shown, columns=_head(names), dtype=str))
+
+
+def _domains(results: pd.DataFrame) -> list[Domain]:
+    return [domain_of(name, results) for name in sorted(set(results["domain"]))]
+
+
+def _caption(results: pd.DataFrame) -> str:
+    papers = " [the paper's]" if any(map(published, _domains(results))) else ""
+    return f"Ours and the baselines, mean ± standard error over tasks{papers}; then ours less the best baseline"
+
+
+def _head(names: Sequence[str]) -> list[str]:
+    return ["domain", "setting, metric", *names, "lead"]
+
+
+def _line(domain: Domain, rows: pd.DataFrame, setting: str, metric: str, names: Sequence[str]) -> list[str]:
+    """The columns of :func:`_head`; on training concepts language is ours, the same model and the same words."""
+    same = setting in training_settings(domain)
+    others = [name for name in names if name != OURS and not (name == LANGUAGE and same)]
+    cells = [_cell(domain, rows, method, setting, metric) for method in names]
+    return [domain.name, f"{setting}, {metric}", *cells, _lead(lead(rows, domain.less_is_better(metric), others))]
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric: str) -> str:
-    number, theirs = summarise(rows[rows["family"] == method]), published(domain, method, setting, metric)
+    number, theirs = summarise(select(rows, method=method)), lookup(domain, setting, metric, method=method)
     if number is None:
         return MISSING
     error = "" if number.error is None else f" ± {number.error:.2f}"

@@ -3,9 +3,9 @@
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.judged import ACCURACY
-from ftl_lightning.evaluation.results import latest
-from ftl_lightning.reporting.tables import EXECUTED, MISSING, Table, summarise
+from ftl_lightning.evaluation.results import METHOD, latest
+from ftl_lightning.reporting.shown import main_omega
+from ftl_lightning.reporting.tables import LEARNED, MISSING, Table, select, summarise
 
 AXES = {"demonstrations": "K", "K": "demonstrations"}
 """What grows, and what stays meanwhile."""
@@ -23,11 +23,10 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
         results: rows of the results file.
         axis: ``'demonstrations'`` or ``'K'``.
     """
-    rows = latest(results[(results["domain"] == domain.name) & (results["K"] > 0) & (results["demonstrations"] > 0)])
-    metric = ACCURACY if domain.succeeded else EXECUTED
-    omega = domain.omega if axis == "demonstrations" else "learned"
-    own = (rows["metric"] == metric) & (rows[AXES[axis]] == USUAL[AXES[axis]]) & (rows["omega"] == omega)
-    return rows[own & (rows["n"] > rows["demonstrations"])]
+    rows = latest(select(results, domain=domain.name, role=METHOD))
+    omega = main_omega(domain) if axis == "demonstrations" else LEARNED
+    rows = select(rows, metric=domain.main_metric, omega=omega, **{AXES[axis]: USUAL[AXES[axis]]})
+    return rows[(rows["K"] > 0) & (rows["demonstrations"] > 0) & (rows["n"] > rows["demonstrations"])]
 
 
 def curves_table(domain: Domain, results: pd.DataFrame) -> Table:

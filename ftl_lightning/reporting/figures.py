@@ -1,5 +1,6 @@
 """Figures from results."""
 
+import itertools
 from collections.abc import Sequence
 
 import pandas as pd
@@ -8,12 +9,13 @@ from matplotlib.figure import Figure
 from sklearn.manifold import TSNE
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.domains.domain import OURS, Domain
-from ftl_lightning.evaluation.results import latest
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.results import REFERENCE, latest
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.reporting.comparison import METHODS, compared, published, reference_lines, settings
+from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
 from ftl_lightning.reporting.curves import AXES, points
-from ftl_lightning.reporting.tables import summarise
+from ftl_lightning.reporting.shown import lookup, main_omega, settings
+from ftl_lightning.reporting.tables import labelled, main_rows, select, summarise
 
 PAPER_COLOUR = "#9a9a9a"
 COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3", "#c9a227")
@@ -22,50 +24,45 @@ LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "s
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting beside the paper's and reference policies, K = 2; bars show standard errors over tasks.
+    """A metric of every setting beside the paper's and reference lines, K = 2 or else what there is; bars show standard errors.
+
+    Errors are over tasks.
 
     Args:
         domain: the domain.
         results: rows of the results file.
         metric: as in a row of the results.
     """
-    rows = latest(results[(results["domain"] == domain.name) & (results["metric"] == metric)])
-    ours = rows[(rows["K"] == 2) & (rows["omega"] == domain.omega)]
-    names = ("training", "paper")
-    settings = [s for name in names for s in domain.suites[name].settings if s in set(ours["setting"])]
-    methods = sorted(set(ours["method"]))
-    figure = Figure(figsize=(1.9 * max(len(settings), 2) + 3.5, 3.4), layout="constrained")
+    rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
+    ours, how = main_rows(rows, main_omega(domain))
+    shown, learned = settings(domain, ours), sorted(set(ours["label"]))
+    figure = Figure(figsize=(1.9 * max(len(shown), 2) + 3.5, 3.4), layout="constrained")
     axes = figure.subplots()
-    width = 0.8 / (len(methods) + 1)
-    theirs = {
-        found.setting: found
-        for found in domain.published
-        if (found.task, found.omega, found.metric, found.components, found.method) == ("", domain.published_omega, metric, 2, OURS)
-    }
-    references = rows[rows["omega"] == ""]
-    policies = sorted(set(references["method"]))
+    width = 0.8 / (len(learned) + 1)
+    references = select(rows, role=REFERENCE)
+    policies = sorted(set(references["label"]))
 
     def once(label: str) -> str | None:
         """For the legend, which names everything once, wherever it is seen first."""
         return None if label in axes.get_legend_handles_labels()[1] else label
 
-    for place, setting in enumerate(settings):
-        found = theirs.get(setting)
+    for place, setting in enumerate(shown):
+        found = lookup(domain, setting, metric)
         if found:
             axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label=once("paper"))
-        for index, method in enumerate(methods, start=1):
-            number = summarise(ours[(ours["setting"] == setting) & (ours["method"] == method)])
+        for index, label in enumerate(learned, start=1):
+            number = summarise(select(ours, setting=setting, label=label))
             if number:
                 colour, where = COLOURS[(index - 1) % len(COLOURS)], place + index * width
-                axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=once(method))
-        span = (place - width / 2, place + (len(methods) + 0.5) * width)
+                axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=once(label))
+        span = (place - width / 2, place + (len(learned) + 0.5) * width)
         for index, policy in enumerate(policies):
-            reference = summarise(references[(references["setting"] == setting) & (references["method"] == policy)])
+            reference = summarise(select(references, setting=setting, label=policy))
             if reference:
                 line = LINES[index % len(LINES)]
                 axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=once(policy))  # type: ignore[arg-type]
-    axes.set_xticks([place + width * len(methods) / 2 for place in range(len(settings))], settings)
-    axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, K = 2, omega = {domain.omega}")
+    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], shown)
+    axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, {how}")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
@@ -82,20 +79,22 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     """
     rows = compared(domain, results)
     rows = rows[rows["metric"] == metric]
-    shown = [setting for setting in settings(domain) if setting in set(rows["setting"])]
-    width = 0.8 / len(METHODS)
+    shown, names = settings(domain, rows), methods(compared(domain, results))
+    # The same colour in every domain, whichever methods it has.
+    colours = dict(zip(dict.fromkeys((*METHODS, *names)), itertools.cycle(COLOURS), strict=False))
+    width = 0.8 / len(names)
     figure = Figure(figsize=(1.9 * max(len(shown), 2) + 3, 3.4), layout="constrained")
     axes = figure.subplots()
-    for index, method in enumerate(METHODS):
-        own = rows[rows["family"] == method]
+    for index, method in enumerate(names):
+        own, colour = select(rows, method=method), colours[method]
         for place, setting in enumerate(shown):
-            where = place + (index - (len(METHODS) - 1) / 2) * width
+            where = place + (index - (len(names) - 1) / 2) * width
             label = None if place else method
             if number := summarise(own[own["setting"] == setting]):
-                axes.bar(where, number.mean, width, yerr=number.error, color=COLOURS[index], capsize=2, label=label)
+                axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
             elif label and not own.empty:
-                axes.bar(where, 0, width, color=COLOURS[index], label=label)
-            if found := published(domain, method, setting, metric):
+                axes.bar(where, 0, width, color=colour, label=label)
+            if found := lookup(domain, setting, metric, method=method):
                 named = "the paper's" not in axes.get_legend_handles_labels()[1]
                 axes.plot(where, found.value, "D", color="black", markersize=4, label="the paper's" if named else None)
     references = reference_lines(domain, results)

@@ -5,14 +5,14 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ftl_lightning.domains.domain import Domain, load_domain
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.judged import ACCURACY, CLOSED
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, read_rows, read_study
-from ftl_lightning.reporting.comparison import comparison_table, metrics, overview
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study
+from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, growth
-from ftl_lightning.reporting.tables import EXECUTED, Table, tables
+from ftl_lightning.reporting.shown import domain_of, metrics
+from ftl_lightning.reporting.tables import Table, select, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
@@ -25,8 +25,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     Args:
         results: a results file, or a folder of them.
         out: folder; each domain gets one of its own.
-        readme: a Markdown file whose part between two marks is replaced by the comparison's overview, or without a comparison by
-            the main tables.
+        readme: a Markdown file whose part between two marks is replaced by the comparison's overview in a few lines, or without a
+            comparison by each domain's main table. The complete overview is ``overview.md`` in ``out``.
 
     Returns:
         All tables as Markdown.
@@ -38,11 +38,9 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     ablations, comparison, curves = (read_study(results, name) for name in ("", COMPARISON, CURVES))
     everything, headline = [], []
     for name in sorted(set(rows["domain"])):
-        domain = load_domain(name)
+        domain = domain_of(name, rows)
         found = _ablations(domain, ablations, out / name)
-        # Where episodes alone are judged, all that happened in them.
-        shown = ("accuracy", "closed_loop" if domain.succeeded else "outcomes", "concept_count")
-        headline += [table for table in found if table.name in shown]
+        headline += found[:1]
         if name in set(comparison["domain"]):
             found.append(_written(comparison_table(domain, comparison), out / name))
             for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
@@ -52,8 +50,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
             _save(growth(domain, curves), out / name / "curves.png")
         everything += found
     if not comparison.empty:
-        headline = [_written(overview(comparison), out)]
-        everything += headline
+        everything.append(_written(overview(comparison), out))
+        headline = [short_overview(comparison)]
     if readme:
         _splice(readme, "\n".join(table.markdown() for table in headline))
     return "\n".join(table.markdown() for table in everything)
@@ -62,9 +60,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
 def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
     """Tables and figures of our method in all its forms."""
     found = [_written(table, folder) for table in tables(domain, rows)]
-    measured = set(rows.loc[(rows["domain"] == domain.name) & (rows["K"] == 2), "metric"])
-    executed = {EXECUTED, f"{CLOSED} {domain.closed_loop.headline}"} if domain.closed_loop else set()
-    for metric in sorted(measured & {ACCURACY, *executed, *(one.metric for one in domain.published)}):
+    measured = set(select(rows, domain=domain.name, role=METHOD)["metric"])
+    for metric in sorted(measured & set(metrics(domain))):
         _save(accuracy_bars(domain, rows, metric), folder / f"{_file(metric)}.png")
     return found
 

@@ -1,18 +1,33 @@
 """Tables from results, each number beside the paper's: Markdown to read, LaTeX to paste."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 
-from ftl_lightning.domains.domain import OURS, Domain, Published
-from ftl_lightning.evaluation.evaluator import OWN
-from ftl_lightning.evaluation.judged import ACCURACY, CLOSED, LOST, SUCCESS, WON, standard_error
-from ftl_lightning.evaluation.results import latest
+from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
+from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.evaluation.judged import LOST, WON, standard_error
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, labels, latest
+from ftl_lightning.reporting.shown import (
+    component_tasks,
+    learned_settings,
+    lookup,
+    main_omega,
+    paper_tasks,
+    papers_omega,
+    policies,
+    published,
+    settings,
+)
 
 MISSING = "-"
-EXECUTED = f"{CLOSED} {SUCCESS}"
+USUAL_K = 2
+"""Number of components of the main tables, the paper's."""
+LEARNED = "learned"
+"""The guidance weight of components whose weights are learned."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +102,8 @@ def _escape(text: str) -> str:
     return text
 
 
-def _select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
+def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
+    """The rows with these values in their columns."""
     for column, value in values.items():
         rows = rows[rows[column] == value]
     return rows
@@ -105,13 +121,29 @@ def difference_to(found: Published | None, number: Number | None) -> str:
     return MISSING if found is None or number is None else f"{number.mean - found.value:+.2f}"
 
 
-def _text(number: Number | None) -> str:
-    return MISSING if number is None else str(number)
+PAPERS = ("paper", "difference")
+"""Columns that tables of domains without a paper do not have."""
 
 
-def _beside(found: Published | None, numbers: Sequence[Number | None]) -> list[str]:
+def make_table(domain: Domain, name: str, caption: str, lines: Sequence[Sequence[str]], columns: Sequence[str]) -> Table:
+    """A table, without the paper's columns where the domain has no numbers of a paper."""
+    cells = pd.DataFrame(lines, columns=list(columns), dtype=str)
+    return Table(name, caption, cells if published(domain) else cells.loc[:, ~cells.columns.isin(PAPERS)])
+
+
+def _cell(rows: pd.DataFrame) -> tuple[str, Number | None]:
+    """A number as a table shows it, with a mark if it was not measured as the caption says."""
+    number = summarise(rows)
+    if number is None:
+        return MISSING, None
+    marks = dict.fromkeys(rows["mark"]) if "mark" in rows else ()
+    return str(number) + "".join(marks), number
+
+
+def _beside(found: Published | None, measured: Sequence[pd.DataFrame]) -> list[str]:
     """The paper's number, and each of ours with its difference from it."""
-    return [paper(found), *(text for number in numbers for text in (_text(number), difference_to(found, number)))]
+    cells = map(_cell, measured)
+    return [paper(found), *(text for shown, number in cells for text in (shown, difference_to(found, number)))]
 
 
 def _beside_head(methods: Sequence[str]) -> list[str]:
@@ -119,19 +151,62 @@ def _beside_head(methods: Sequence[str]) -> list[str]:
 
 
 def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
-    """Methods that learn concepts and reference policies among the results, each sorted."""
-    return sorted(set(rows.loc[rows["K"] > 0, "method"])), sorted(set(rows.loc[rows["omega"] == "", "method"]))
+    """Methods and reference lines among the results, each sorted."""
+    return tuple(sorted(set(rows.loc[rows["role"] == role, "label"])) for role in (METHOD, REFERENCE))  # type: ignore[return-value]
+
+
+def labelled(rows: pd.DataFrame) -> pd.DataFrame:
+    """With a column ``label``: the method with its variant."""
+    return rows.assign(label=labels(rows))
+
+
+def form(components: int, omega: str) -> str:
+    """How concepts were learned, in words."""
+    weights = "learned weights" if omega == LEARNED else f"fixed omega {omega}"
+    return f"K = {components}, {weights}" if components else weights
+
+
+def _forms(rows: pd.DataFrame) -> list[tuple[int, str]]:
+    """K and guidance weight of each row."""
+    return list(zip(map(int, rows["K"]), map(str, rows["omega"]), strict=True))
+
+
+def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
+    """What a main table shows of each method and setting: two components with the main weight, or else what was measured most.
+
+    Args:
+        rows: with labels, see :func:`labelled`.
+        omega: the main tables' guidance weight.
+
+    Returns:
+        The rows, with a column ``mark`` that says in brackets where ours was learned otherwise than the caption says; and the
+        caption's words for how it was learned.
+    """
+    rows = rows[rows["role"] == METHOD]
+    usual = (USUAL_K, omega)
+    chosen = []
+    for _, own in rows.groupby(["label", "setting"], sort=False):
+        measured = Counter(_forms(own))
+        components, weight = usual if usual in measured else measured.most_common(1)[0][0]
+        chosen.append(select(own, K=components, omega=weight))
+    found = pd.concat(chosen).loc[lambda some: rows.index.intersection(some.index)] if chosen else rows
+    ours = found["method"] == OURS
+    forms = set(_forms(found[ours]))
+    common = usual if usual in forms or not forms else next(iter(forms)) if len(forms) == 1 else None
+    marks = [
+        f" ({form(k, w)})" if own and (k, w) != common else "" for own, k, w in zip(ours, found["K"], found["omega"], strict=True)
+    ]
+    return found.assign(mark=marks), "K and weights in brackets" if common is None else form(*common)
 
 
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     """Every table of a domain for which there are results."""
-    every = latest(_select(results, domain=domain.name))
-    # Ablations are about plans where they are judged, else about episodes.
-    metric = ACCURACY if domain.succeeded else EXECUTED
-    rows = _select(every, metric=metric)
+    every = labelled(latest(select(results, domain=domain.name)))
+    metric = domain.main_metric
+    rows = select(every, metric=metric)
     candidates = (
-        _accuracy(domain, _select(every, metric=ACCURACY), ACCURACY, "accuracy"),
-        _accuracy(domain, _select(every, metric=EXECUTED), EXECUTED, "closed_loop"),
+        *(() if metric == EXECUTED else (_accuracy(domain, rows, metric, "accuracy"),)),
+        _accuracy(domain, select(every, metric=EXECUTED), EXECUTED, "closed_loop"),
         _outcomes(domain, every),
         _paired(domain, every),
         _count(domain, rows, metric),
@@ -141,65 +216,46 @@ def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     return [table for table in candidates if not table.cells.empty]
 
 
-def _lookup(domain: Domain, setting: str, task: str, components: int, omega: str, metric: str) -> Published | None:
-    asked = (setting, task, components, omega, metric, OURS)
-    for found in domain.published:
-        if (found.setting, found.task, found.components, found.omega, found.metric, found.method) == asked:
-            return found
-    return None
-
-
 def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> Table:
     """The bars of the paper's main figure, with trivial policies and the oracle beside them."""
     learned, references = _columns(rows)
+    ours, how = main_rows(rows, main_omega(domain))
     lines = []
-    for setting in _settings(domain):
-        alone = [
-            found.task
-            for found in domain.published
-            if found.setting == setting and found.task and found.omega == domain.published_omega
-        ]
-        for task in ("", *alone):
-            own = _select(rows, setting=setting) if not task else _select(rows, setting=setting, task=task)
-            ours = _select(own, K=2, omega=domain.omega)
-            if ours.empty:
+    for setting in settings(domain, ours):
+        for task in ("", *paper_tasks(domain, setting)):
+            one = {"setting": setting} | ({"task": task} if task else {})
+            own = select(ours, **one)
+            if own.empty:
                 continue
-            theirs = _lookup(domain, setting, task, 2, domain.published_omega, metric)
             line = [f"- {task}" if task else setting]
-            line += _beside(theirs, [summarise(_select(ours, method=method)) for method in learned])
-            line += [_text(summarise(_select(own, K=0, method=method))) for method in references]
+            line += _beside(lookup(domain, setting, metric, task), [select(own, label=label) for label in learned])
+            line += [_cell(select(rows, role=REFERENCE, label=label, **one))[0] for label in references]
             lines.append(line)
-    other = "" if domain.omega == domain.published_omega else f" (the paper's: {domain.published_omega})"
-    caption = (
-        f"{domain.name}: {metric}, K = 2, {_weights(domain.omega)}{other}. Mean ± standard error over tasks (spread over seeds)"
-    )
-    return Table(name, caption, pd.DataFrame(lines, columns=["setting", *_beside_head(learned), *references], dtype=str))
-
-
-def _weights(omega: str) -> str:
-    return "learned weights" if omega == "learned" else f"fixed omega {omega}"
+    other = "" if main_omega(domain) == papers_omega(domain) else f" (the paper's: {papers_omega(domain)})"
+    caption = f"{domain.name}: {metric}, {how}{other}. Mean ± standard error over tasks (spread over seeds)"
+    return make_table(domain, name, caption, lines, ["setting", *_beside_head(learned), *references])
 
 
 def _outcomes(domain: Domain, every: pd.DataFrame) -> Table:
     """All that happened in closed loop, by setting."""
     executed = every[every["metric"].str.startswith(CLOSED)]
-    ours = _select(executed, K=2, omega=domain.omega)
+    ours, how = main_rows(executed, main_omega(domain))
     learned, references = _columns(executed)
     lines = [
         [
             setting,
             metric.removeprefix(f"{CLOSED} "),
             *_beside(
-                _lookup(domain, setting, "", 2, domain.published_omega, metric),
-                [summarise(_select(ours, setting=setting, metric=metric, method=method)) for method in learned],
+                lookup(domain, setting, metric),
+                [select(ours, setting=setting, metric=metric, label=label) for label in learned],
             ),
-            *(_text(summarise(_select(executed, setting=setting, metric=metric, K=0, method=method))) for method in references),
+            *(_cell(select(executed, setting=setting, metric=metric, role=REFERENCE, label=label))[0] for label in references),
         ]
-        for setting in _settings(domain)
-        for metric in dict.fromkeys(_select(ours, setting=setting)["metric"])
+        for setting in settings(domain, ours)
+        for metric in dict.fromkeys(select(ours, setting=setting)["metric"])
     ]
-    caption = f"{domain.name}: what happened in closed loop, K = 2, {_weights(domain.omega)}"
-    return Table("outcomes", caption, pd.DataFrame(lines, columns=["setting", "", *_beside_head(learned), *references], dtype=str))
+    caption = f"{domain.name}: what happened in closed loop, {how}"
+    return make_table(domain, "outcomes", caption, lines, ["setting", "", *_beside_head(learned), *references])
 
 
 def difference(won: int, lost: int, count: int) -> str:
@@ -218,93 +274,83 @@ def difference(won: int, lost: int, count: int) -> str:
 
 def _paired(domain: Domain, every: pd.DataFrame) -> Table:
     """Our successes less those of reference policies from the same starts, over all seeds."""
-    ours = every[(every["K"] == 2) & (every["omega"] == domain.omega)]
+    ours, _ = main_rows(every, main_omega(domain))
     learned, _ = _columns(ours[ours["metric"].str.startswith(WON)])
     lines = []
-    for setting in _settings(domain):
-        for policy in domain.closed_loop.policies if domain.closed_loop else ():
+    for setting in settings(domain, ours):
+        for policy in policies(domain):
             line = []
-            for method in learned:
-                won, lost = (_select(ours, setting=setting, method=method, metric=f"{what}{policy}") for what in (WON, LOST))
+            for label in learned:
+                won, lost = (select(ours, setting=setting, label=label, metric=f"{what}{policy}") for what in (WON, LOST))
                 gains, losses = (round(float((rows["value"] * rows["n"]).sum())) for rows in (won, lost))
                 line.append(MISSING if won.empty else difference(gains, losses, int(won["n"].sum())))
             if set(line) - {MISSING}:
                 lines.append([setting, policy, *line])
-    headline = domain.closed_loop.headline if domain.closed_loop else ""
-    caption = f"{domain.name}: {headline} less that of policies from the same starts, 95 % interval, McNemar's exact p"
-    return Table("paired", caption, pd.DataFrame(lines, columns=["setting", "compared with", *learned], dtype=str))
-
-
-def _settings(domain: Domain) -> list[str]:
-    """Settings of the paper's suites, without the analysis of components, and the user's own demonstrations."""
-    names = [setting for suite in ("training", "paper") for setting in domain.suites[suite].settings]
-    return [*dict.fromkeys(names), OWN]
+    compared = domain.headline.removeprefix(f"{CLOSED} ")
+    caption = f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p"
+    return make_table(domain, "paired", caption, lines, ["setting", "compared with", *learned])
 
 
 def _grid(
+    domain: Domain,
     name: str,
     caption: str,
-    learned: Sequence[str],
+    rows: pd.DataFrame,
     lines: Sequence[tuple[str, str, Published | None, pd.DataFrame]],
     heads: tuple[str, str],
 ) -> Table:
+    learned, _ = _columns(rows)
     cells = [
-        [first, second, *_beside(theirs, [summarise(_select(ours, method=method)) for method in learned])]
+        [first, second, *_beside(theirs, [select(ours, label=label) for label in learned])]
         for first, second, theirs, ours in lines
         if not ours.empty
     ]
-    return Table(name, caption, pd.DataFrame(cells, columns=[*heads, *_beside_head(learned)], dtype=str))
+    return make_table(domain, name, caption, cells, [*heads, *_beside_head(learned)])
 
 
 def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The ablation on the number of learned concepts, with learned weights."""
-    own = _select(rows, omega="learned")
-    learned, _ = _columns(own)
+    own = select(rows, method=OURS, omega=LEARNED)
     lines = [
         (
             setting,
             str(count),
-            _lookup(domain, setting, "", count, "learned", metric),
-            _select(own, setting=setting, K=count),
+            lookup(domain, setting, metric, components=count, omega=LEARNED),
+            select(own, setting=setting, K=count),
         )
-        for setting in domain.suites["paper"].settings
+        for setting in learned_settings(domain, own)
         for count in sorted(set(own.loc[own["K"] > 0, "K"]))
     ]
     caption = f"{domain.name}: number of learned concepts K, with learned weights"
-    return _grid("concept_count", caption, learned, lines, ("setting", "K"))
+    return _grid(domain, "concept_count", caption, own, lines, ("setting", "K"))
 
 
 def _omega(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
-    """The effect of the guidance weight, K = 2."""
-    own = _select(rows, K=2)
-    learned, _ = _columns(own)
-    settings = domain.suites["paper"].settings
+    """The effect of the guidance weight, K = 2, or the K that was measured most."""
+    own = select(rows, method=OURS)
+    counts = Counter(components for components, _ in _forms(own) if components)
+    count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
+    own = select(own, K=count)
     lines = [
-        (
-            setting,
-            omega,
-            _lookup(domain, setting, "", 2, omega, metric),
-            _select(own, setting=setting, omega=omega),
-        )
-        for setting in settings
+        (setting, omega, lookup(domain, setting, metric, components=count, omega=omega), select(own, setting=setting, omega=omega))
+        for setting in learned_settings(domain, own)
         for omega in sorted(set(own["omega"]))
     ]
-    return _grid("omega", f"{domain.name}: guidance weight omega, K = 2", learned, lines, ("setting", "omega"))
+    return _grid(domain, "omega", f"{domain.name}: guidance weight omega, K = {count}", own, lines, ("setting", "omega"))
 
 
 def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
-    """What each learned component generates alone, with learned weights."""
-    own = _select(rows, K=2, omega="learned")
-    learned, _ = _columns(own)
-    suite = domain.suites.get("components")
+    """What each learned component generates alone, with learned weights, or as it was measured most."""
+    tasks = component_tasks(domain)
+    own, how = main_rows(rows[rows["setting"].isin({task.setting for task in tasks})], LEARNED)
     lines = [
         (
             task.name,
             task.setting,
-            _lookup(domain, task.setting, task.name, 2, "learned", metric),
-            _select(own, setting=task.setting, task=task.name),
+            lookup(domain, task.setting, metric, task.name, omega=LEARNED),
+            select(own, setting=task.setting, task=task.name),
         )
-        for task in (suite.tasks if suite else ())
+        for task in tasks
     ]
-    caption = f"{domain.name}: accuracy of what each learned component generates alone, learned weights"
-    return _grid("components", caption, learned, lines, ("concept", "generated from"))
+    caption = f"{domain.name}: {metric} of what each learned component generates alone, {how.removeprefix(f'K = {USUAL_K}, ')}"
+    return _grid(domain, "components", caption, own, lines, ("concept", "generated from"))

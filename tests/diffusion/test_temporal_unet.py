@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from ftl_lightning.diffusion.initial_state import EntityEncoder
 
 from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet
 from ftl_lightning.diffusion.denoiser import Sizes
-from ftl_lightning.diffusion.initial_state import EntityEncoder
 from ftl_lightning.diffusion.prediction import LOSSES, Prediction, loss_weights
 from ftl_lightning.diffusion.schedule import add_noise, cosine_alpha_bar
 from ftl_lightning.errors import UserError

@@ -43,7 +43,7 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     ours = rows[rows["K"] == 2]
     assert set(ours["metric"]) == {"accuracy", "closed loop success", "closed loop distractor", "closed loop progress"}
     assert set(ours["setting"]) == {"training concept", "training composition", "new initial state"}
-    assert set(ours["method"]) == {"FTL-IGM (entities, free)"}
+    assert set(zip(ours["method"], ours["variant"], strict=True)) == {("FTL-IGM", "entities, free")}
     assert len(ours) == 4 * (4 + 5 + 5)
     oracle = rows[rows["method"] == "expert (oracle)"]
     assert (oracle.loc[oracle["metric"] == "accuracy", "value"] == 1).all()

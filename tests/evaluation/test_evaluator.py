@@ -12,7 +12,7 @@ from ftl_lightning.domains.domain import EvaluationTask, load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import Judged, standard_error
-from ftl_lightning.evaluation.results import Row, append_rows, read_rows
+from ftl_lightning.evaluation.results import Row, append_rows, labels, read_rows
 from ftl_lightning.learning.generative_model import GenerativeModel
 
 
@@ -20,6 +20,7 @@ class Trained:
     """The least that an evaluated module offers: a model and its training concepts."""
 
     method = "trained"
+    variant = ""
     concepts: tuple[str, ...] = ()
 
     def __init__(self, model: GenerativeModel, seed: int = 0) -> None:
@@ -75,6 +76,34 @@ def test_rows_are_added_replaced_and_keep_their_types(tmp_path: Path) -> None:
     assert set(table["model_hash"]) == {"00e1"}  # not read as a number
 
 
+OLD = """domain,setting,task,method,K,omega,demonstrations,seed,n,metric,value,model_hash,config_hash,version
+d,s,"a, b","FTL-IGM (steps, set, near span 0.1)",2,1.2,5,0,50,accuracy,0.5,00e1,c,0.1.0
+d,s,"a, b",expert (oracle),0,,0,0,50,accuracy,1.0,,r,0.1.0
+d,s,"a, b",language,0,1.2,5,0,50,accuracy,0.25,00e1,e,0.1.0
+d,s,"a, b",in-context,0,none,5,0,50,accuracy,0.1,00e1,f,0.1.0
+"""
+
+
+def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(OLD)
+    table = read_rows(path)
+    assert table[["method", "variant", "role"]].to_numpy().tolist() == [
+        ["FTL-IGM", "steps, set, near span 0.1", "method"],
+        ["expert (oracle)", "", "reference"],
+        ["language", "", "method"],
+        ["in-context", "", "method"],
+    ]
+    assert labels(table).tolist() == pd.read_csv(path)["method"].tolist()
+    old = pd.read_csv(path, dtype=str, keep_default_na=False)
+    append_rows(path, [row()])
+    new = pd.read_csv(path, dtype=str, keep_default_na=False)
+    kept = [name for name in old.columns if name != "method"]
+    assert new[kept].head(len(old)).equals(old[kept])  # text for text
+    append_rows(path, [row(task="a, b", method="FTL-IGM", variant="steps, set, near span 0.1", value=0.75)])
+    assert read_rows(path)["value"].tolist() == [1.0, 0.25, 0.1, 0.5, 0.75]  # the same measurement, replaced
+
+
 def test_a_foreign_results_file_is_refused(tmp_path: Path) -> None:
     pd.DataFrame({"a": [1]}).to_csv(tmp_path / "r.csv", index=False)
     with pytest.raises(UserError, match=r"r\.csv: expected the columns domain, setting"):
@@ -92,7 +121,7 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable
     assert "test/accuracy/new concept/square diagonal to triangle" in tags["scalars"]
     image = events.Images("new concept/square diagonal to triangle")[0]
     assert image.encoded_image_string.startswith(b"\x89PNG")
-    assert events.summary_metadata["_hparams_/session_start_info"]
+    assert EventAccumulator(str(log / "hparams")).Reload().summary_metadata["_hparams_/session_start_info"]
     labels = next(log.rglob("metadata.tsv")).read_text().splitlines()
     assert "square diagonal to triangle [component 2]" in labels
     assert "(empty)" in labels

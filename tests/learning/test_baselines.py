@@ -190,8 +190,8 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
     assert learned.origin.pretrained == model.hash
     if domain != "driving":  # which judges episodes alone
         rows = read_rows("r.csv")
-        own = rows[rows["omega"] != ""]
-        assert set(own["method"].str.partition(" (")[0]) == {model.name}
+        own = rows[rows["role"] == "method"]
+        assert set(own["method"]) == {model.name}
         assert set(own["demonstrations"]) == {2}
 
 
@@ -259,7 +259,7 @@ def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[s
     ]
     assert main(["invert", "--config", LANGUAGE, *options]) == 0
     model = load_model(ROOT / "pretrained" / "agent")
-    assert set(read_rows("r.csv").query("omega != ''")["method"]) == {"language"}
+    assert set(read_rows("r.csv").query("role == 'method'")["method"]) == {"language"}
     for path in Path("c").iterdir():
         concept = Concept.load(path)
         assert concept.embeddings.shape == (1, model.config.concept_dim)

@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from ftl_lightning.demonstrations.datamodule import InversionData
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.datamodule import InversionData
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.generative_model import GenerativeModel
@@ -139,6 +139,7 @@ def test_inverting_twice_gives_the_same_rows(invert: Callable[..., Path]) -> Non
     assert read_rows("r.csv").equals(first)  # replaced, not added
     ours = first[first["K"] == 2]
     assert set(ours["setting"]) == {"training composition", "new concept", "new + training", "component 1", "component 2"}
-    assert set(first["method"]) == {"FTL-IGM (free, training weight 0.8)", "random scenes", "generator (oracle)"}
+    assert set(first["method"]) == {"FTL-IGM", "random scenes", "generator (oracle)"}
+    assert set(ours["variant"]) == {"free, training weight 0.8"}
     oracle = first[(first["method"] == "generator (oracle)")]
     assert (oracle["value"] == 1).all()

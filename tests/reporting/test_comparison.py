@@ -10,13 +10,13 @@ from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.reporting.comparison import comparison_table, lead, overview
+from ftl_lightning.reporting.comparison import comparison_table, lead, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
 from tests.conftest import ROOT
 
 DOMAIN = load_domain("object_rearrangement")
-METHODS = {"FTL-IGM (free)": (0.9, 0.7), "BC (free)": (0.8, 0.2), "CVAE (free)": (0.1, 0.1), "language": (0.3, 0.1)}
+METHODS = {"FTL-IGM": (0.9, 0.7), "BC": (0.8, 0.2), "CVAE": (0.1, 0.1), "language": (0.3, 0.1)}
 
 
 def row(method: str, task: str, value: float, **changes: object) -> Row:
@@ -25,6 +25,7 @@ def row(method: str, task: str, value: float, **changes: object) -> Row:
         "setting": "new concept",
         "task": task,
         "method": method,
+        "variant": "" if method == "language" else "free",
         "K": 1,
         "omega": "1.0",
     }
@@ -43,11 +44,11 @@ def row(method: str, task: str, value: float, **changes: object) -> Row:
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
     rows = [row(method, task, value) for method, values in METHODS.items() for task, value in zip("ab", values, strict=True)]
-    rows += [row("random scenes", task, 0.15, K=0, omega="") for task in "ab"]
+    rows += [row("random scenes", task, 0.15, variant="", role="reference", K=0, omega="") for task in "ab"]
     append_rows(tmp_path / "r" / "comparison.csv", rows)
-    grown = [row("FTL-IGM (free)", "a", 0.1 * count, K=2, omega="1.2", demonstrations=count) for count in (1, 2, 5)]
-    wider = [row("FTL-IGM (free)", "a", value, K=K, omega="learned") for K, value in ((2, 0.5), (4, 0.7))]
-    few = row("FTL-IGM (free)", "b", 0.0, K=2, omega="1.2", n=5)  # starts where the demonstrations did
+    grown = [row("FTL-IGM", "a", 0.1 * count, K=2, omega="1.2", demonstrations=count) for count in (1, 2, 5)]
+    wider = [row("FTL-IGM", "a", value, K=K, omega="learned") for K, value in ((2, 0.5), (4, 0.7))]
+    few = row("FTL-IGM", "b", 0.0, K=2, omega="1.2", n=5)  # starts where the demonstrations did
     append_rows(tmp_path / "r" / "curves.csv", [*grown, *wider, few])
     return tmp_path / "r"
 
@@ -62,8 +63,8 @@ def test_every_number_stands_beside_the_papers_with_their_difference(results: Pa
 def test_the_lead_is_taken_task_for_task() -> None:
     rows = pd.DataFrame(
         [
-            {"family": family, "task": task, "seed": 0, "value": value}
-            for family, values in (("FTL-IGM", (0.9, 0.7)), ("BC", (0.8, 0.2)), ("CVAE", (0.1, 0.1)))
+            {"method": method, "task": task, "seed": 0, "value": value}
+            for method, values in (("FTL-IGM", (0.9, 0.7)), ("BC", (0.8, 0.2)), ("CVAE", (0.1, 0.1)))
             for task, value in zip("ab", values, strict=True)
         ]
     )
@@ -71,13 +72,13 @@ def test_the_lead_is_taken_task_for_task() -> None:
     assert lead(rows, less=True) == pytest.approx((-0.7, 0.1))  # of crashes CVAE has the fewest
     one = pd.DataFrame(
         [
-            {"family": f, "task": "a", "seed": s, "value": v}
+            {"method": f, "task": "a", "seed": s, "value": v}
             for f, vs in (("FTL-IGM", (0.5, 0.7)), ("BC", (0.4, 0.5)))
             for s, v in enumerate(vs)
         ]
     )
     assert lead(one) == pytest.approx((0.15, 0.05))  # a single task: seed for seed
-    assert lead(rows[rows["family"] != "FTL-IGM"]) is None
+    assert lead(rows[rows["method"] != "FTL-IGM"]) is None
     assert lead(rows[rows["task"] == "a"]) is None  # of a single difference nobody knows the error
 
 
@@ -86,9 +87,33 @@ def test_the_overview_fits_on_one_screen_and_says_who_is_ahead(results: Path) ->
     assert len(cells) == 1
     line = cells.iloc[0]
     assert line["FTL-IGM"] == "0.80 ± 0.10 [0.82]"
-    assert line["in-context"] == "-"
+    assert "in-context" not in cells
     assert line["lead"] == "+0.30 ± 0.20, ahead"
     assert line["reference lines"] == "random scenes 0.15"
+
+
+def test_the_short_overview_has_at_most_eight_lines_and_all_domains() -> None:
+    committed = read_study(ROOT / "results", "comparison")
+    cells = short_overview(committed).cells
+    assert len(cells) == 8
+    assert list(dict.fromkeys(cells["domain"])) == ["agent", "driving", "object_rearrangement"]
+    whole = overview(committed).cells
+    assert len(whole) > 8
+    assert set(map(tuple, cells.to_numpy())) < set(map(tuple, whole[cells.columns].to_numpy()))  # the same lines
+    assert "[" in "".join(cells["FTL-IGM"])
+    one = short_overview(committed[committed["domain"] == "driving"]).cells
+    assert one["setting, metric"].tolist() == [
+        f"new initial state, closed loop {name}" for name in ("success", "crash", "strict success")
+    ]
+
+
+def test_a_method_of_ones_own_stands_beside_the_others(results: Path) -> None:
+    append_rows(results / "comparison.csv", [row("mine", task, 1.0, variant="") for task in "ab"])
+    rows = read_study(results, "comparison")
+    cells = overview(rows).cells
+    assert list(cells.columns[2:-2]) == ["FTL-IGM", "BC", "CVAE", "language", "mine"]
+    assert cells.iloc[0]["lead"] == "-0.20 ± 0.10, behind"
+    assert "mine" in comparison_table(DOMAIN, rows).cells["method"].tolist()
 
 
 def test_figures_show_measured_bars_and_the_papers_diamonds(results: Path) -> None:
@@ -109,7 +134,7 @@ def test_curves_keep_the_other_axis_as_usual(results: Path) -> None:
 
 
 def test_ablations_comparison_and_curves_are_not_mixed(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    append_rows(results / "own.csv", [row("FTL-IGM (free)", "a", 0.33, K=2, omega="1.2")])
+    append_rows(results / "own.csv", [row("FTL-IGM", "a", 0.33, K=2, omega="1.2")])
     assert set(read_study(results)["value"]) == {0.33}
     assert len(read_study(results, "comparison")) == 10
     assert len(read_rows(results)) == 17

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -5,6 +6,7 @@ import pytest
 from ftl_lightning.cli import main
 from ftl_lightning.domains.domain import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows
+from ftl_lightning.reporting.comparison import comparison_table
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END
 from ftl_lightning.reporting.tables import difference, summarise, tables
@@ -18,7 +20,8 @@ def row(setting: str, task: str, value: float, seed: int = 0, **changes: object)
         "domain": DOMAIN.name,
         "setting": setting,
         "task": task,
-        "method": "FTL-IGM (free)",
+        "method": "FTL-IGM",
+        "variant": "free",
         "K": 2,
         "omega": "1.2",
         "demonstrations": 5,
@@ -36,7 +39,10 @@ def results(tmp_path: Path) -> Path:
         for task, value in zip(("one", "two"), values, strict=True)
         for seed in (0, 1)
     ]
-    rows += [row("new concept", task, 0.1, method="random scenes", K=0, omega="") for task in ("one", "two")]
+    rows += [
+        row("new concept", task, 0.1, method="random scenes", variant="", role="reference", K=0, omega="")
+        for task in ("one", "two")
+    ]
     rows += [row("new concept", "one", 0.7, omega="learned", K=1, config_hash="d")]
     append_rows(tmp_path / "r" / "rows.csv", rows)
     return tmp_path / "r"
@@ -57,14 +63,11 @@ def test_a_number_tells_error_over_tasks_from_spread_over_seeds(tmp_path: Path) 
 
 def test_a_figure_names_everything_once_and_shows_the_papers_number_of_two_components(tmp_path: Path) -> None:
     driving = {"domain": "driving", "omega": "learned", "metric": "closed loop success"}
-    everywhere, once = "FTL-IGM (steps)", "FTL-IGM (map)"
-    rows = [
-        row(setting, "a", 0.5, method=method, **driving)
-        for setting, method in (("training concept", everywhere), ("new initial state", everywhere), ("new initial state", once))
-    ]
+    places = (("training concept", "steps"), ("new initial state", "steps"), ("new initial state", "map"))
+    rows = [row(setting, "a", 0.5, variant=variant, **driving) for setting, variant in places]
     append_rows(tmp_path / "r.csv", rows)
     axes = accuracy_bars(load_domain("driving"), read_rows(tmp_path / "r.csv"), "closed loop success").axes[0]
-    assert sorted(axes.get_legend_handles_labels()[1]) == sorted([everywhere, once, "paper"])
+    assert sorted(axes.get_legend_handles_labels()[1]) == ["FTL-IGM (map)", "FTL-IGM (steps)", "paper"]
     heights = {bars.get_label(): [bar.get_height() for bar in bars] for bars in axes.containers if hasattr(bars, "patches")}
     assert heights["paper"] == [0.24]
 
@@ -105,6 +108,44 @@ def test_the_readmes_table_is_what_the_committed_results_say(tmp_path: Path) -> 
     copy.write_text((ROOT / "README.md").read_text())
     assert main(["report", f"--results={ROOT / 'results'}", "--out=out", f"--readme={copy}"]) == 0
     assert copy.read_text() == (ROOT / "README.md").read_text()
+
+
+def test_the_main_table_shows_what_there_is_and_says_how_it_was_learned(tmp_path: Path) -> None:
+    append_rows(tmp_path / "r.csv", [row("new concept", "one", 0.7, omega="learned", K=1)])
+    table = tables(DOMAIN, read_rows(tmp_path / "r.csv"))[0]
+    assert table.caption.startswith("object_rearrangement: accuracy, K = 1, learned weights. ")
+    assert table.cells["FTL-IGM (free)"].tolist() == ["0.70"]
+    # Beside the usual ones, others say in brackets how they were learned.
+    append_rows(tmp_path / "r.csv", [row("training composition", "one", 0.8), row("training composition", "one", 0.1, omega="1.4")])
+    table = tables(DOMAIN, read_rows(tmp_path / "r.csv"))[0]
+    assert table.caption.startswith("object_rearrangement: accuracy, K = 2, fixed omega 1.2. ")
+    assert table.cells["FTL-IGM (free)"].tolist() == ["0.80", "0.70 (K = 1, learned weights)"]
+
+
+def test_settings_of_ones_own_come_last_and_components_apart(tmp_path: Path) -> None:
+    named = ("component 1", "own demonstrations", "another", "new concept", "training concept")
+    append_rows(tmp_path / "r.csv", [row(setting, "one", 0.5) for setting in named])
+    table = tables(DOMAIN, read_rows(tmp_path / "r.csv"))[0]
+    assert table.cells["setting"].tolist() == ["training concept", "new concept", "own demonstrations", "another"]
+
+
+def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_columns(tmp_path: Path) -> None:
+    alone = replace(DOMAIN, published=(), suites={"mine": DOMAIN.suites["validation"]})
+    rows = [row(setting, task, 0.5, K=K) for setting in ("mine", "new concept") for task in "ab" for K in (1, 2)]
+    rows += [row("mine", "a", 0.1, method="random scenes", variant="", role="reference", K=0, omega="")]
+    append_rows(tmp_path / "r.csv", rows)
+    results = read_rows(tmp_path / "r.csv")
+    found = {table.name: table.cells for table in tables(alone, results)}
+    assert found["accuracy"].columns.tolist() == ["setting", "FTL-IGM (free)", "random scenes"]
+    assert found["accuracy"]["setting"].tolist() == ["mine", "new concept"]
+    assert found["omega"].columns.tolist() == ["setting", "omega", "FTL-IGM (free)"]
+    assert comparison_table(alone, results).cells.columns.tolist()[2:] == [
+        "method",
+        "measured",
+        "standard error over tasks",
+        "spread over seeds",
+    ]
+    assert [label.get_text() for label in accuracy_bars(alone, results).axes[0].get_xticklabels()] == ["mine", "new concept"]
 
 
 def test_every_published_number_belongs_to_a_task_or_setting() -> None:

@@ -83,7 +83,9 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP)}  # noqa: RUF012 (gymnasium's)
     render_mode = "rgb_array"
-    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict({OBSERVED: gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)})
+    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
+        {OBSERVED: gymnasium.spaces.Box(-np.inf, np.inf, (INITIAL,), np.float32)}
+    )
     action_space = gymnasium.spaces.Box(-MAX_FORCE, MAX_FORCE, (len(PLANE),), np.float32)
 
     def __init__(self) -> None:
@@ -95,9 +97,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._agent = -1
         self._steps = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Seen, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Build a scene.
 
         Args:

@@ -16,8 +16,8 @@ from ftl_lightning.domains.rollout import Rollout
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """A bowl is an open triangle that points down."""
 MAX_COLUMNS = 4
-EVERY = 4
-"""Steps between two frames."""
+FRAMES = 40
+"""At most, of an episode."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
@@ -59,17 +59,18 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode, every :data:`EVERY` steps, until nothing moves any more.
+    """At most :data:`FRAMES` pictures ``(height, width, 3)`` of an episode, until nothing moves any more.
 
     Plans are not drawn: the pictures are the simulator's.
     """
     observations = rollout.observed[OBSERVED][0]
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1
+    times = np.linspace(0, end - 1, min(end, FRAMES)).round().astype(int)  # the first and the last are among them
     environment = AgentEnvironment()
     pictures = []
-    for observation in observations[:end:EVERY]:
-        environment.reset(options={"scene": observation.numpy()})
+    for time in times:
+        environment.reset(options={"scene": observations[time].numpy()})
         pictures.append(environment.render())
     environment.close()
     return pictures

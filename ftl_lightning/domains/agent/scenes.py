@@ -47,9 +47,10 @@ OBSERVED = "world"
 """Name of the observed feature: the agent and both objects."""
 FEATURE = Feature(
     shape=(INITIAL,),
-    # Position, and as attributes colour and shape, of each object; its type (object 1 or 2) would tell apart what should be alike.
+    # Of each object its position and, as attributes, colour and shape; its type would tell apart what should be alike.
     entities=tuple(
-        (*range(columns.start, columns.start + 3), *range(columns.start + 3 + len(TYPES), columns.stop)) for columns in OBJECT_COLUMNS
+        (*range(columns.start, columns.start + 3), *range(columns.start + 3 + len(TYPES), columns.stop))
+        for columns in OBJECT_COLUMNS
     ),
     attributes=tuple(range(3, 3 + _TAIL - len(TYPES))),
     state=tuple(range(STATE)),

@@ -72,9 +72,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._return = 0.0
         self._length = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Seen, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Go to a start.
 
         Args:

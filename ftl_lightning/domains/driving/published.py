@@ -1,7 +1,7 @@
 """The paper's numbers for driving, to stand beside ours. Its success rate counts a vehicle past the roundabout, crashed or not."""
 
-from ftl_lightning.domains.paper import Published
 from ftl_lightning.domains.driving.tasks import NEW
+from ftl_lightning.domains.paper import Published
 
 SUCCESS, CRASH = "closed loop success", "closed loop crash"
 

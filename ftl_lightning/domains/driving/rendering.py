@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,11 +17,24 @@ from ftl_lightning.domains.driving.environment import NAMES, SCENARIO, TRAFFIC
 from ftl_lightning.domains.driving.scenarios import VEHICLES, make
 from ftl_lightning.domains.rollout import Rollout
 
-MAX_COLUMNS = 4
-EGO, OTHER, ROAD, PLAN = "#4c9f70", "#3f6fb5", "#d8d8d8", "#e4704a"
-LENGTH, WIDTH = 5.0, 2.0
-MARGIN = 30.0
+MAX_COLUMNS, MAX_PANELS = 4, 8
+EGO, OTHER, ROAD, PLAN = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a"
+RIGHT, WRONG = "#2e9e46", "#d03a3a"
+LENGTH, WIDTH, LANE = 5.0, 2.0, 4.0
+"""Metres: of a vehicle, and a lane's width."""
+MARGIN = 20.0
 """Metres of road that are shown around what moves."""
+MAX_ASPECT = 1.8
+"""Nothing is shown that is longer than so many times its width."""
+AREA, PAGE = 9.0, 13.0
+"""Square inches of a panel, and inches of a figure's width."""
+PLAN_REACH = 25.0
+"""Metres around the way driven within which plans decide what is shown of an episode."""
+LEGEND = (
+    Patch(color=EGO, label="controlled vehicle, its way"),
+    Patch(color=OTHER, label="other vehicles"),
+    Line2D([], [], color=PLAN, marker=".", label="plan"),
+)
 
 
 @functools.cache
@@ -36,40 +50,64 @@ def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
     return tuple(lanes)
 
 
-def _draw(axes: Axes, seen: Observed, plan: NDArray[np.float32] | None, around: NDArray[np.float32]) -> None:
-    """What is observed in one scene; ``around (points, 2)`` decides what part of the map is shown."""
-    low, high = around.min(axis=0) - MARGIN, around.max(axis=0) + MARGIN
+def _window(around: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper corner ``(2,)`` of the part of the map that holds points ``(points, 2)``, not too long and narrow."""
+    low, high = around.min(axis=0).astype(float) - MARGIN, around.max(axis=0).astype(float) + MARGIN
+    missing = np.maximum((high - low).max() / MAX_ASPECT - (high - low), 0) / 2
+    return low - missing, high + missing
+
+
+def _draw(
+    axes: Axes,
+    seen: Observed,
+    plan: NDArray[np.float32] | None,
+    window: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    """What is observed in one scene, to scale."""
+    low, high = window
     for lane in _lanes(NAMES[int(seen[SCENARIO].item())]):
-        axes.plot(*lane.T, color=ROAD, linewidth=3, zorder=0)
+        along = np.gradient(lane, axis=0)
+        length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+        across = np.stack((-along[:, 1], along[:, 0]), axis=1) / length * LANE / 2
+        axes.add_patch(Polygon(np.concatenate((lane + across, (lane - across)[::-1])), color=ROAD, linewidth=0, zorder=0))
+        for side in (lane + across, lane - across):
+            axes.plot(*side.T, color="white", linewidth=0.6, zorder=0.5)
     for number, (present, x, y, _, _, cos, sin) in enumerate(seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).tolist()):
         if present:
-            along, across = np.array((cos, sin)) * LENGTH / 2, np.array((-sin, cos)) * WIDTH / 2
-            corners_around = (along + across, along - across, -along - across, -along + across)
-            axes.add_patch(Polygon([(x + dx, y + dy) for dx, dy in corners_around], color=OTHER if number else EGO, zorder=2))
+            ahead, aside = np.array((cos, sin)) * LENGTH / 2, np.array((-sin, cos)) * WIDTH / 2
+            corners = (ahead + aside, ahead - aside, -ahead - aside, -ahead + aside)
+            axes.add_patch(Polygon([(x + dx, y + dy) for dx, dy in corners], color=OTHER if number else EGO, zorder=2))
     if plan is not None:
-        axes.plot(plan[:, 1], plan[:, 2], ".-", color=PLAN, linewidth=1, markersize=4, zorder=3)
+        axes.plot(plan[:, 1], plan[:, 2], ".-", color=PLAN, linewidth=1.2, markersize=5, zorder=3)
     axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xticks=[], yticks=[], aspect="equal")  # y points down the page
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """A grid of scenes with the plan from each.
+    """A grid of at most :data:`MAX_PANELS` scenes with the plan from each, to scale, and a legend.
 
     Args:
         states: plans ``(scene, horizon, 7)``.
-        right: not used: plans are judged by what comes of them.
+        right: green and red frames, where plans are judged and not only what comes of them; ``None`` for grey frames.
         title: above the grid.
         starts: of the scenes.
     """
     assert starts is not None
-    columns = min(len(states), MAX_COLUMNS)
-    rows = -(-len(states) // columns)
-    figure = Figure(figsize=(2.6 * columns, 1.8 * rows + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=9)
-    grid = figure.subplots(rows, columns, squeeze=False).flat
-    for number, (axes, plan) in enumerate(zip(grid, states.numpy(), strict=False)):
-        _draw(axes, take(starts.observed, number), plan, plan[:, 1:3])
-    for axes in figure.axes[len(states) :]:
-        axes.set_axis_off()
+    shown = states[:MAX_PANELS].numpy()
+    windows = [_window(plan[:, 1:3]) for plan in shown]
+    sizes = np.array([high - low for low, high in windows]).max(axis=0)
+    width = float(np.sqrt(AREA * sizes[0] / sizes[1]))
+    columns = min(len(shown), MAX_COLUMNS, max(1, int(PAGE / width)))
+    rows = -(-len(shown) // columns)
+    figure = Figure(figsize=(max(width * columns, 5.0), AREA / width * rows + 0.8), layout="constrained")
+    figure.suptitle(title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)", fontsize=11)
+    for number, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
+        if number >= len(shown):
+            axes.set_axis_off()
+            continue
+        _draw(axes, take(starts.observed, number), shown[number], windows[number])
+        for spine in axes.spines.values():
+            spine.set(color="#8a8a8a" if right is None else RIGHT if right[number] else WRONG, linewidth=1.5)
+    figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False)
     return figure
 
 
@@ -83,13 +121,18 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     moving = (observations[1:, 1:3] - observations[:-1, 1:3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1
     ways = observations[:end, 1:3].numpy()
+    planned = plans[:end, :, 1:3].reshape(-1, 2).numpy()
+    near = np.clip(planned[np.isfinite(planned).all(axis=1)], ways.min(axis=0) - PLAN_REACH, ways.max(axis=0) + PLAN_REACH)
+    window = _window(np.concatenate((ways, near)))
+    width, height = np.sqrt(1.7 * AREA) * np.sqrt((window[1] - window[0]) / (window[1] - window[0])[::-1])
     pictures = []
     for time in range(end):
-        figure = Figure(figsize=(3.2, 3.2), dpi=80, layout="constrained")
+        figure = Figure(figsize=(max(width, 4.0), height + 0.4), dpi=90, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         axes = figure.subplots()
-        _draw(axes, take(episode, time), plans[time].numpy() if time < len(plans) else None, ways)
-        axes.plot(*ways[: time + 1].T, color=EGO, linewidth=1, zorder=1)
+        _draw(axes, take(episode, time), plans[time].numpy() if time < len(plans) else None, window)
+        axes.plot(*ways[: time + 1].T, color=EGO, linewidth=1.5, zorder=1)
+        figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False, fontsize=7, columnspacing=1)
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return pictures

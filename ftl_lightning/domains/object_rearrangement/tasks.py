@@ -1,7 +1,7 @@
 """The paper's settings for object rearrangement, as data, and the validation suite on which everything is tuned."""
 
-from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, TRAINING_RELATIONS, Relation
+from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 
 TRAINING_CONCEPTS = tuple(str(relation) for relation in TRAINING_RELATIONS)
 

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
@@ -17,6 +16,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
+from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.learning.pretraining import Pretraining
 
 

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Observed, moved
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.denoiser import Sizes
@@ -19,6 +18,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.learning.pretraining import Pretraining
 
 

@@ -9,8 +9,8 @@ from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
-from ftl_lightning.learning.inversion import origin
 from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.inversion import origin
 
 
 class LanguageAdaptation(Adaptation):
@@ -55,7 +55,10 @@ class LanguageAdaptation(Adaptation):
 
     def learned(self) -> dict[str, Concept]:
         weights = torch.tensor([self._omega])
-        return {name: Concept(self._embedding(name).cpu(), weights, origin(self.model, self.demonstrations, name, "fixed", 0.0)) for name in self.concepts}
+        return {
+            name: Concept(self._embedding(name).cpu(), weights, origin(self.model, self.demonstrations, name, "fixed", 0.0))
+            for name in self.concepts
+        }
 
     def composition(self, task: EvaluationTask) -> Composition | None:
         """The description of the whole task, with its weight."""

@@ -4,8 +4,8 @@ import torch
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.learning.adaptation import Adaptation
-from ftl_lightning.learning.inversion import origin
 from ftl_lightning.learning.baselines.in_context import InContextModel
+from ftl_lightning.learning.inversion import origin
 
 
 class InContextAdaptation(Adaptation):

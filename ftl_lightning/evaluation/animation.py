@@ -1,0 +1,85 @@
+"""Animated GIFs of episodes, at a speed at which they can be followed."""
+
+import io
+import textwrap
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+SECONDS = 4.0
+"""An animation takes, if its frames allow it."""
+FRAME_SECONDS = (0.05, 0.8)
+"""The shortest and the longest that a frame is shown; browsers slow down what is shorter than 0.02 s."""
+END_SECONDS = 1.5
+"""The last frame stays, before the animation starts again."""
+FONT_SIZE = 14
+MARGIN = 6
+INK, PAPER = (32, 32, 32), (255, 255, 255)
+
+
+def frame_milliseconds(count: int, seconds: float | None = None) -> int:
+    """How long each of some frames is shown, in the format's steps of 10 ms.
+
+    Args:
+        count: of frames.
+        seconds: that all of them take together; ``None`` for about :data:`SECONDS`, within the bounds of :data:`FRAME_SECONDS`.
+    """
+    low, high = FRAME_SECONDS
+    each = min(max(SECONDS / count, low), high) if seconds is None else seconds / count
+    return max(10 * round(100 * each), 20)
+
+
+def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, pause: float = END_SECONDS) -> bytes:
+    """An endless animation.
+
+    Args:
+        pictures: ``(height, width, 3)`` each, of one size.
+        seconds: that all pictures take together; ``None`` for a speed at which their number can be followed.
+        pause: seconds that the last picture stays longer.
+    """
+    first, *rest = (Image.fromarray(picture).quantize(64) for picture in pictures)
+    each = frame_milliseconds(len(pictures), seconds)
+    last = each + 10 * round(100 * pause)
+    content = io.BytesIO()
+    durations = [*[each] * len(rest), last]
+    first.save(content, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
+    return content.getvalue()
+
+
+def captioned(pictures: Sequence[NDArray[np.uint8]], text: str) -> list[NDArray[np.uint8]]:
+    """Pictures ``(height, width, 3)`` with a caption below each; long lines are broken where the picture ends."""
+    if not pictures or not text:
+        return list(pictures)
+    font = ImageFont.load_default(FONT_SIZE)
+    width = pictures[0].shape[1]
+    letters = max(1, int((width - 2 * MARGIN) / font.getlength("n")))
+    lines = [part for line in text.splitlines() for part in textwrap.wrap(line, letters) or [""]]
+    spacing = round(1.35 * FONT_SIZE)
+    strip = Image.new("RGB", (width, spacing * len(lines) + 2 * MARGIN), PAPER)
+    draw = ImageDraw.Draw(strip)
+    for number, line in enumerate(lines):
+        draw.text((MARGIN, MARGIN + number * spacing), line, fill=INK, font=font)
+    below = np.asarray(strip, dtype=np.uint8)
+    return [np.concatenate((picture, below)) for picture in pictures]
+
+
+def outcome_text(goal: str, outcomes: Mapping[str, Tensor], episode: int = 0) -> str:
+    """A caption: what was asked and how an episode ended.
+
+    Args:
+        goal: in words.
+        outcomes: a domain's judgement of episodes, by name ``(episode,)``; of bool, or numbers.
+        episode: which one.
+    """
+    ends = [f"{name}: {_end(values[episode])}" for name, values in outcomes.items()]
+    return "\n".join(part for part in (goal, ", ".join(ends)) if part)
+
+
+def _end(value: Tensor) -> str:
+    if value.dtype == torch.bool:
+        return "yes" if value else "no"
+    return f"{value.item():.2f}"

@@ -1,0 +1,101 @@
+"""The end of a run: one table in the terminal in place of a line for every number."""
+
+import copy
+import io
+import sys
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from ftl_lightning.evaluation.judged import LOST, WON, standard_error
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row, label
+
+OWN = "own demonstrations"
+"""The setting of learned concepts that no suite asks for."""
+
+
+def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
+    """One evaluation: the user's own concepts first, each with its numbers, then the mean of each setting.
+
+    Below each, in lines that begin with a dash, stand the reference lines of the same tasks. Errors are standard errors over tasks;
+    a single task has none. The column n tells tasks x samples of each.
+
+    Args:
+        rows: of one evaluation, see :func:`ftl_lightning.evaluation.rows.rows`.
+        own: names of tasks that get a line of their own, for example the concepts of the user's own demonstrations.
+    """
+    measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
+    metrics = list(dict.fromkeys(row.metric for row in measured))
+    table = Table(title=_title(measured), box=box.SIMPLE, title_justify="left", padding=0)
+    table.add_column("mean ± error over tasks")
+    for name in (*metrics, "n"):
+        table.add_column(name, justify="right")
+    # Own concepts first, in their order; they are not part of their setting's mean.
+    order = {name: number for number, name in enumerate(own)}
+    single = sorted((row for row in measured if row.task in order), key=lambda row: order[row.task])
+    subjects = dict.fromkeys(_subject(row, own) for row in (*single, *(row for row in measured if row.task not in order)))
+    for subject in subjects:
+        alike = [row for row in rows if _subject(row, own) == subject]
+        found = [row for row in measured if _subject(row, own) == subject]
+        table.add_row(_name(found, own), *(_mean(found, name) for name in metrics), _samples(found))
+        references = [row for row in alike if row.role == REFERENCE]
+        for name in dict.fromkeys(row.method for row in references):
+            beside = [row for row in references if row.method == name]
+            table.add_row(f"- {name}", *(_mean(beside, metric, False) for metric in metrics), "", style="dim")
+    return table
+
+
+def _subject(row: Row, own: Sequence[str]) -> tuple[str, str]:
+    """What a line is about: a task of one's own, or a setting."""
+    return (row.setting, row.task if row.task in own else "")
+
+
+def _name(rows: Sequence[Row], own: Sequence[str]) -> str:
+    setting, task = rows[0].setting, rows[0].task
+    if task in own:
+        return task if setting == OWN else f"{task} ({setting})"
+    return setting
+
+
+def _title(rows: Sequence[Row]) -> str:
+    if not rows:
+        return "nothing was evaluated"
+    row = rows[0]
+    components = f", K = {row.K}" if row.K else ""
+    weight = "" if row.omega == "none" else ", learned weights" if row.omega == "learned" else f", omega {row.omega}"
+    return f"{row.domain}: {label(row.method, row.variant)}{components}{weight}"
+
+
+def _mean(rows: Sequence[Row], metric: str, error: bool = True) -> str:
+    values = [row.value for row in rows if row.metric == metric]
+    if not values:
+        return ""
+    spread = f" ± {standard_error(values):.2f}" if error and len(values) > 1 else ""
+    return f"{sum(values) / len(values):.2f}{spread}"
+
+
+def _samples(rows: Sequence[Row]) -> str:
+    """Of each task, and of how many tasks."""
+    counts = sorted({row.n for row in rows})
+    each = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    tasks = len({row.task for row in rows})
+    return f"{tasks}x{each}" if tasks > 1 else each
+
+
+def plain(table: Table) -> str:
+    """The table as Markdown, as wide as it needs to be: for log files, pipes and TensorBoard."""
+    own = copy.copy(table)
+    own.box, own.padding = box.MARKDOWN, (0, 1, 0, 1)
+    file = io.StringIO()
+    Console(file=file, width=100_000, color_system=None).print(own)
+    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
+
+
+def show(table: Table) -> None:
+    """Print a table: as wide as the terminal, or where there is none as :func:`plain`."""
+    if sys.stdout.isatty():
+        Console().print(table)
+    else:
+        print(plain(table))

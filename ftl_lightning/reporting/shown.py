@@ -1,0 +1,136 @@
+"""What reports show of a domain: the only place of the reports that knows what a domain is made of."""
+
+from collections.abc import Sequence
+from typing import NoReturn
+
+import pandas as pd
+
+from ftl_lightning.domains.domain import CLOSED, EXECUTED, Concepts, Domain, Metric, Plans, Show
+from ftl_lightning.domains.line_plots import picture
+from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.judged import LOST, WON
+
+TRAINING, PAPER = "training", "paper"
+"""Suites that come first in reports, in domains that have them."""
+
+
+def domain_of(name: str, rows: pd.DataFrame) -> Domain:
+    """The domain that results are about; of one that is not installed, or a user's own data, what the rows tell of it."""
+    try:
+        return load_domain(name)
+    except UserError:
+        own = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
+        metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(own)}
+        concepts = Concepts(training=(), suites={}, descriptions=(), reads=lambda text: False)
+        show = Show(picture(()))
+        return Domain(name, Plans(0, (), ()), concepts, _unknown, show, metrics=metrics, headline=next(iter(metrics), EXECUTED))
+
+
+def _unknown(*arguments: object) -> NoReturn:
+    raise NotImplementedError("this domain is known by its results alone")
+
+
+def _suite(domain: Domain, name: str) -> tuple[str, ...]:
+    return domain.concepts.suites[name].settings if name in domain.concepts.suites else ()
+
+
+def training_settings(domain: Domain) -> tuple[str, ...]:
+    """The settings of training concepts."""
+    return _suite(domain, TRAINING)
+
+
+def component_tasks(domain: Domain) -> tuple[EvaluationTask, ...]:
+    """Tasks that are generated from a single component; they have a table of their own."""
+    return tuple(task for suite in domain.concepts.suites.values() for task in suite.tasks if task.component is not None)
+
+
+def settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
+    """The settings that have results: those of training, then the paper's, then others as they appear."""
+    apart = {task.setting for task in component_tasks(domain)}
+    measured = [setting for setting in dict.fromkeys(rows["setting"]) if setting not in apart]
+    order = dict.fromkeys((*training_settings(domain), *_suite(domain, PAPER), *measured))
+    return [setting for setting in order if setting in measured]
+
+
+def learned_settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
+    """The settings that the ablations of K and omega are about: all but those of training concepts."""
+    return [setting for setting in settings(domain, rows) if setting not in training_settings(domain)]
+
+
+def judges_plans(domain: Domain) -> bool:
+    """Whether plans are judged, not only what comes of them."""
+    return bool(domain.metrics)
+
+
+def metrics(domain: Domain) -> tuple[str, ...]:
+    """What the methods are compared by: the main metric, success in closed loop, the headline, and the paper's."""
+    executed = [EXECUTED] if domain.closed_loop else []
+    names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(one.metric for one in published(domain))))
+    return tuple(name for name in names if name)
+
+
+def policies(domain: Domain) -> Sequence[str]:
+    """Reference policies that act from the same initial states as the method."""
+    return tuple(domain.closed_loop.policies) if domain.closed_loop else ()
+
+
+def published(domain: Domain) -> tuple[Published, ...]:
+    """The paper's numbers; none where there is no paper, and then tables have no columns for them."""
+    return domain.paper.numbers if domain.paper else ()
+
+
+def main_omega(domain: Domain) -> str:
+    """The guidance weight of our main tables; empty for whatever was measured."""
+    return domain.paper.ours if domain.paper else ""
+
+
+def papers_omega(domain: Domain) -> str:
+    """The guidance weight of the paper's main figures; empty where there is no paper."""
+    return domain.paper.omega if domain.paper else ""
+
+
+def lookup(
+    domain: Domain, setting: str, metric: str, task: str = "", components: int = 2, omega: str = "", method: str = OURS
+) -> Published | None:
+    """The paper's number, if it has one.
+
+    Args:
+        domain: the domain.
+        setting, metric, task: as in a row of the results; without a task the mean of the setting.
+        components: K; of a baseline it does not matter.
+        omega: the guidance weight as text; empty for that of the paper's main figures. Of a baseline it does not matter.
+        method: ours, or a baseline.
+    """
+    form = (components, omega or papers_omega(domain))
+    for found in published(domain):
+        same = (found.setting, found.metric, found.task, found.method) == (setting, metric, task, method)
+        if same and (method != OURS or (found.components, found.omega) == form):
+            return found
+    return None
+
+
+def paper_tasks(domain: Domain, setting: str) -> list[str]:
+    """Tasks of a setting of which the paper's main figures show a number of their own."""
+    return [one.task for one in published(domain) if one.setting == setting and one.task and one.omega == papers_omega(domain)]
+
+
+def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
+    """Settings and metrics that say most in few lines: those that the paper has numbers of, then the same settings in closed loop.
+
+    Without a paper the main metric of each setting.
+    """
+    measured = set(zip(rows["setting"], rows["metric"], strict=True))
+    every = settings(domain, rows)
+    numbers = {
+        (one.setting, one.metric)
+        for one in published(domain)
+        if not one.task and (one.method != OURS or (one.components, one.omega) == (2, papers_omega(domain)))
+    }
+    if not numbers:
+        return [(setting, domain.main_metric) for setting in every if (setting, domain.main_metric) in measured]
+    reported = [(setting, metric) for setting in every for metric in metrics(domain) if (setting, metric) in numbers]
+    executed = [(setting, domain.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
+    return [one for one in dict.fromkeys((*reported, *executed)) if one in measured]

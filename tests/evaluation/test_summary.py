@@ -1,0 +1,67 @@
+import io
+
+import pytest
+from rich.console import Console
+
+from ftl_lightning.evaluation.results import Row
+from ftl_lightning.evaluation.summary import plain, show, summary_table
+
+
+def row(setting: str, task: str, metric: str, value: float, **changes: object) -> Row:
+    values: dict[str, object] = {
+        "domain": "agent",
+        "setting": setting,
+        "task": task,
+        "method": "FTL-IGM",
+        "variant": "free",
+        "K": 2,
+    }
+    values |= {"omega": "0.6", "demonstrations": 5, "seed": 0, "n": 50, "metric": metric, "value": value}
+    return Row(**(values | {"model_hash": "m", "config_hash": "c"} | changes))  # type: ignore[arg-type]
+
+
+REFERENCE = {"method": "random", "variant": "", "role": "reference", "K": 0, "omega": ""}
+ROWS = [
+    *(row("training", task, "accuracy", value) for task, value in (("a", 0.2), ("b", 0.4))),
+    row("own demonstrations", "my way", "accuracy", 0.9),
+    row("own demonstrations", "my way", "closed loop success", 0.7),
+    row("own demonstrations", "my way", "won against random", 0.6),
+    row("new", "their way", "accuracy", 0.5),
+    *(row("training", task, "accuracy", 0.1, **REFERENCE) for task in "ab"),
+    row("own demonstrations", "my way", "accuracy", 0.3, **REFERENCE),
+]
+
+
+def cells(text: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+
+
+def test_own_concepts_come_first_and_settings_are_means_over_tasks() -> None:
+    text = plain(summary_table(ROWS, ["my way"]))
+    assert text.splitlines()[0].strip() == "agent: FTL-IGM (free), K = 2, omega 0.6"
+    assert cells(text)[0] == ["mean ± error over tasks", "accuracy", "closed loop success", "n"]
+    assert cells(text)[2:] == [
+        ["my way", "0.90", "0.70", "50"],
+        ["- random", "0.30", "", ""],
+        ["training", "0.30 ± 0.10", "", "2x50"],
+        ["- random", "0.10", "", ""],
+        ["new", "0.50", "", "50"],
+    ]
+
+
+def test_a_task_of_a_suite_may_be_ones_own_too() -> None:
+    lines = cells(plain(summary_table(ROWS, ["their way", "b"])))[2:]
+    own = ["their way (new)", "b (training)", "- random"]
+    assert [line[0] for line in lines] == [*own, "training", "- random", "own demonstrations", "- random"]
+    assert lines[3] == ["training", "0.20", "", "50"]
+
+
+def test_a_terminal_of_eighty_columns_holds_it_and_a_pipe_gets_markdown(capsys: pytest.CaptureFixture[str]) -> None:
+    table = summary_table(ROWS, ["my way"])
+    show(table)
+    assert "| training " in capsys.readouterr().out
+    file = io.StringIO()
+    Console(file=file, width=80, force_terminal=True, color_system=None).print(table)
+    assert max(map(len, file.getvalue().splitlines())) <= 80
+    assert "0.30 ± 0.10" in file.getvalue()
+    assert "nothing was evaluated" in plain(summary_table([]))
