@@ -134,6 +134,7 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
     warnings.filterwarnings(
         "ignore", message=".*resuming from a checkpoint that ended before the epoch ended.*"
     )  # steps are stateless
+    warnings.filterwarnings("ignore", message=".*is smaller than the logging interval.*")  # in short runs
     warnings.filterwarnings("ignore", message=".*LightningCLI's args parameter is intended.*")
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay

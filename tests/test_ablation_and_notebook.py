@@ -154,6 +154,7 @@ def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], 
         "verb": "invert",
         "config": f"{CONF}/baseline/{{method}}/invert/driving.yaml",
         "each": {"method": ["bc", "telepathy"]},
+        "options": {"model.pretrained": "models/{method}"},
     }
     wrong = [
         with_options(quick, **{"model.pretrained": "nowhere"}),
@@ -180,7 +181,7 @@ def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], 
         "expected a model of agent (in-context), found one of agent (diffusion)",
         "telepathy/invert/driving.yaml: expected a configuration file, found nothing",
         "holds bc, cvae, in_context, language",
-        "pretrained/baseline/bc/driving/config.json: expected a pretrained model",
+        "models/bc/config.json: expected a pretrained model",
     ):
         assert part in told, part
     assert told.count("\n") == 1

@@ -225,6 +225,31 @@ def test_fit_says_where_the_model_is_and_how_accurate(capsys: pytest.CaptureFixt
     assert Path("logs/object_rearrangement/fit/pretrained/config.json").is_file()
 
 
+def test_progress_is_all_that_fit_and_invert_write_to_standard_error(
+    invert: Callable[..., Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    options = [*TINY, "--trainer.max_steps=10", "--data.steps_per_epoch=5", "--evaluation.samples=2"]
+    assert main(["fit", "--config", PRETRAINING, *options, "--trainer.enable_progress_bar=true"]) == 0
+    told = capfd.readouterr()
+    lines = told.err.splitlines()
+    assert lines[0] == "fit: 0/10"
+    assert [line.split(",")[0] for line in lines[1:-1]] == [f"fit: {step}/10" for step in range(1, 10)]
+    assert lines[-1].startswith("fit: 10 steps, 0:")
+    assert ", loss " in lines[-1]
+    assert "accuracy" in lines[-1]
+    assert told.out.count("\n") == 1  # the model's folder
+    invert("--data.suite=validation", "--evaluation.suites=[validation]", "--trainer.enable_progress_bar=true")
+    told = capfd.readouterr()
+    assert [line.split(",")[0] for line in told.err.splitlines()[:-1]] == [
+        *(f"invert: {step}/5" for step in range(5)),
+        "invert: 5 steps",
+        "evaluation",
+    ]
+    assert told.err.splitlines()[-1].startswith("evaluation: 0:")
+    assert "\x1b" not in told.err + told.out
+    assert "v_num" not in told.out
+
+
 def test_an_inversion_overwrites_no_other(invert: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     short = [
         "--data.suite=validation",

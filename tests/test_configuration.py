@@ -1,5 +1,9 @@
 """Configuration files: parts, their order, their mistakes, and what is shipped."""
 
+import shutil
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -7,7 +11,7 @@ import yaml
 
 from ftl_lightning.configuration import expanded, find, load, parts
 from ftl_lightning.errors import UserError
-from ftl_lightning.shipped import shipped
+from ftl_lightning.shipped import FOLDERS, shipped
 from tests.conftest import CONF, ROOT
 
 GROUPS = ("verb", "domain", "sampling", "method")
@@ -110,3 +114,26 @@ def test_a_configuration_says_only_what_differs() -> None:
             below = Path("below.yaml")
             below.write_text(yaml.safe_dump({"defaults": [str(CONF / name) for name in names]}))
             assert repeated(own, load(below), str(path)) == []
+
+
+def test_a_wheel_holds_every_configuration_and_model(tmp_path: Path) -> None:
+    setuptools = pytest.importorskip("setuptools", reason="builds a wheel without the package index")
+    if int(setuptools.__version__.split(".")[0]) < 77:
+        pytest.skip("needs setuptools 77")
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in ("ftl_lightning", "conf", "pretrained"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    offline = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", tmp_path, source], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        inside = set(archive.namelist())
+        (scripts,) = [archive.read(name).decode() for name in inside if name.endswith("entry_points.txt")]
+    for folder in FOLDERS:
+        files = [path.relative_to(ROOT) for path in (ROOT / folder).rglob("*") if path.is_file()]
+        assert files
+        assert {f"ftl_lightning/{path.as_posix()}" for path in files} <= inside
+    assert "ftl-lightning = ftl_lightning.cli:main" in scripts
