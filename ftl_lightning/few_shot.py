@@ -4,11 +4,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
@@ -28,6 +27,9 @@ from ftl_lightning.progress import bar
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 from ftl_lightning.shipped import pretrained_folder, shipped
 from ftl_lightning.tensor_file import atomic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Start = InitialStates | Mapping[str, ArrayLike] | ArrayLike
 """Where behaviour starts: initial states, observed features by name, or the only feature's values ``(sample, *shape)``."""
@@ -393,7 +395,7 @@ class FewShot:
         config = self.model.config
         return own_domain(concatenate(self._examples), config.training_concepts, config.horizon, config.metrics)
 
-    def render(self, plans: Demonstrations, goal: str = "") -> Figure:
+    def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """A picture of plans; with a goal, right ones are framed green and wrong ones red."""
         starts, right = plans.initial_states, None
         if goal:

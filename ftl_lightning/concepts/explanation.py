@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 from torch import Tensor
 
 ROUNDING = 1e-4
@@ -52,6 +51,8 @@ def explain(embedding: Tensor, names: Sequence[str], training: Tensor, nearest: 
         training: their embeddings ``(training concept, n)``.
         nearest: how many of the nearest are told.
     """
+    from scipy.optimize import nnls  # half a second of import, for what is explained later
+
     target, basis = embedding.double().numpy(), training.double().numpy()
     lengths = np.linalg.norm(basis, axis=1) * np.linalg.norm(target)
     cosines = basis @ target / np.where(lengths > 0, lengths, 1)

@@ -1,14 +1,14 @@
 """What a domain is: one object in a few groups. Adding a domain adds such an object, here or in a package of one's own."""
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import gymnasium
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -17,6 +17,9 @@ from ftl_lightning.demonstrations.features import Feature, InitialStates, Observ
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ACCURACY = "accuracy"
 SUCCESS = "success"
@@ -71,6 +74,16 @@ class Concepts:
     table: Path | None = None
 
 
+def deferred(reference: str) -> Callable[..., Any]:
+    """A function that is imported when it is called first, such as one that draws: matplotlib takes half a second to import.
+
+    Args:
+        reference: ``'package.module:function'``.
+    """
+    module, _, name = reference.partition(":")
+    return lambda *arguments: getattr(importlib.import_module(module), name)(*arguments)
+
+
 class Source(Protocol):
     """Where demonstrations come from: an expert, a generator, a folder of files."""
 
@@ -113,7 +126,7 @@ class Show:
         film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is no motion.
     """
 
-    picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], Figure]
+    picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
 
 

@@ -1,25 +1,28 @@
 """Pictures and films of behaviour known by its columns alone: paths in two or three dimensions, or lines over time."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
+
+if TYPE_CHECKING:  # half a second of import, for what is drawn later
+    from matplotlib.figure import Figure
 
 MAX_COLUMNS = 8
 MAX_FRAMES = 60
 PATH, START, PLAIN, RIGHT, WRONG = "#3f6fb5", "#e4704a", "#8a8a8a", "#2e9e46", "#d03a3a"
 
 
-def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], Figure]:
+def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]:
     """A renderer of plans with these columns, see :class:`ftl_lightning.domains.domain.Show`."""
 
-    def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
+    def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> "Figure":
+        from matplotlib.figure import Figure
+
         columns = min(len(states), MAX_COLUMNS)
         rows = -(-len(states) // columns)
         figure = Figure(figsize=(1.6 * columns, 1.6 * rows + 0.5), layout="constrained")
@@ -58,6 +61,9 @@ def _room(low: float, high: float) -> tuple[float, float]:
 
 def film(states: Tensor) -> list[NDArray[np.uint8]]:
     """Frames ``(height, width, 3)`` of one plan ``(horizon, 2 or 3)`` as it is drawn, at most :data:`MAX_FRAMES`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     plan = states.numpy()
     figure = Figure(figsize=(3, 3), dpi=80, layout="constrained")
     canvas = FigureCanvasAgg(figure)

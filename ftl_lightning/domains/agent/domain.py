@@ -14,17 +14,17 @@ from ftl_lightning.domains.agent import scenes as scene_settings
 from ftl_lightning.domains.agent.environment import LOOKAHEAD, MAX_STEPS, AgentEnvironment
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.published import PUBLISHED
-from ftl_lightning.domains.agent.rendering import film, render
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
-from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
+from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split, deferred
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import VALIDATION_SEED
 
 NAME = "agent"
 HORIZON = 128
+RENDERING = "ftl_lightning.domains.agent.rendering"
 STATE_NAMES = tuple(
     f"agent.{column}"
     for column in ("x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "angular vx", "angular vy", "angular vz")
@@ -158,9 +158,11 @@ DOMAIN = Domain(
     observed={OBSERVED: FEATURE},
     metrics={ACCURACY: Metric(progressed)},
     headline="closed loop success",
-    show=Show(render),
+    show=Show(deferred(f"{RENDERING}:render")),
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
     views=VIEWS,
-    closed_loop=ClosedLoop(environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, film=film),
+    closed_loop=ClosedLoop(
+        environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, film=deferred(f"{RENDERING}:film")
+    ),
     paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
 )

@@ -1,11 +1,13 @@
 """The physics: a cone that is pushed over a plane with two standing objects, in pybullet, as a gymnasium environment."""
 
 import functools
+import importlib
+import os
+from types import ModuleType
 from typing import Any
 
 import gymnasium
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.agent.bodies import Mesh, bowl, cone
@@ -25,6 +27,21 @@ from ftl_lightning.domains.agent.scenes import (
     scenes,
 )
 from ftl_lightning.errors import UserError
+
+
+def _import_pybullet() -> ModuleType:
+    """The simulator, without the line that importing it writes to standard error."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        return importlib.import_module("pybullet")
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+pybullet: Any = _import_pybullet()
 
 STEP = 0.05
 """Seconds between two states."""

@@ -8,19 +8,20 @@ from torch import Tensor
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split
+from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split, deferred
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, DrivingEnvironment, initial_states, scene
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.published import PUBLISHED
-from ftl_lightning.domains.driving.rendering import film, render
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.rollout import Rollout
+
+RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
 class Expert:
@@ -80,14 +81,14 @@ DOMAIN = Domain(
     source=lambda root: Expert(),
     observed=FEATURES_SEEN,
     headline="closed loop strict success",
-    show=Show(render),
+    show=Show(deferred(f"{RENDERING}:render")),
     views=VIEWS,
     closed_loop=ClosedLoop(
         environment=DrivingEnvironment,
         act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
         steps=MAX_STEPS,
         judge=judge,
-        film=film,
+        film=deferred(f"{RENDERING}:film"),
         less_is_better=("crash",),
         policies=policies.POLICIES,
     ),

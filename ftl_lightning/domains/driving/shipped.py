@@ -27,8 +27,7 @@ def training_set(name: Split, count: int) -> Demonstrations:
         rows = list(range(len(shipped)))
         pool = rows[-HELD_OUT:] if name == "validation" else rows[:-HELD_OUT]
         if count > len(pool):
-            raise UserError(
-                f"data.samples_per_concept, data.validation_per_concept: expected at most {len(pool)} episodes of {scenario!r}, found {count}"
-            )
+            key = "samples_per_concept" if name == "train" else "validation_per_concept"
+            raise UserError(f"data.{key}: expected at most {len(pool)} episodes of {scenario!r}, found {count}")
         parts.append(shipped.rows(pool[:count]))
     return concatenate(parts)

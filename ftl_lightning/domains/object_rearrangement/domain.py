@@ -7,11 +7,10 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, Split
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, Split, deferred
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse, sentence
-from ftl_lightning.domains.object_rearrangement.rendering import render
 from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
@@ -86,7 +85,7 @@ DOMAIN = Domain(
     ),
     source=lambda root: Generator(),
     metrics={ACCURACY: Metric(succeeded)},
-    show=Show(render),
+    show=Show(deferred("ftl_lightning.domains.object_rearrangement.rendering:render")),
     references={
         "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
         "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
