@@ -171,11 +171,12 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     from ftl_lightning.concepts.explanation import explain as explained
     from ftl_lightning.errors import UserError
     from ftl_lightning.learning.pretrained import find_model, load_model
+    from ftl_lightning.shipped import shipped
 
     if nearest < 1:
         raise UserError(f"nearest: expected 1 or more, found {nearest}")
     learned = Concept.load(concept)
-    model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"))))
+    model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), shipped("pretrained"))))
     model.check(learned, concept)
     names = model.config.training_concepts
     print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
