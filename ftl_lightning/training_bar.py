@@ -85,8 +85,11 @@ def told(trainer: pl.Trainer) -> str:
 
 
 def accuracies(trainer: pl.Trainer) -> list[str]:
-    """The accuracies that the evaluator logged while fitting, with their settings if there are several."""
-    prefix = "val/accuracy/"
-    found = {key.removeprefix(prefix): value for key, value in trainer.callback_metrics.items() if key.startswith(prefix)}
-    settings = {setting: value for setting, value in found.items() if "/" not in setting}
-    return [f"accuracy{f' ({setting})' if len(settings) > 1 else ''} {value:.2f}" for setting, value in settings.items()]
+    """What the evaluator logged while fitting, ``accuracy 0.98``, with the setting's name where a metric has several."""
+    logged = [key.split("/") for key in trainer.callback_metrics if key.startswith("val/")]
+    found = [(key[1], key[2]) for key in logged if len(key) == 3]  # val/METRIC/SETTING
+    settings = {name: [setting for metric, setting in found if metric == name] for name, _ in found}
+    return [
+        f"{name}{f' ({setting})' if len(settings[name]) > 1 else ''} {trainer.callback_metrics[f'val/{name}/{setting}']:.2f}"
+        for name, setting in found
+    ]

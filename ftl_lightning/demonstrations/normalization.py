@@ -6,8 +6,8 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-RESOLUTION = 1e-3
-"""In the domain's units: what varies less is the simulator's rounding, which scaling to [-1, 1] would blow up."""
+RELATIVE = 1e-6
+"""A column that varies by less than this share of its largest number counts as constant: float32 holds no more."""
 
 
 class Normalization(nn.Module):
@@ -26,13 +26,15 @@ class Normalization(nn.Module):
         self.register_buffer("high", high.float().clone())
 
     @classmethod
-    def fit(cls, states: Tensor, alike: Sequence[Sequence[int]] = ()) -> Self:
+    def fit(cls, states: Tensor, alike: Sequence[Sequence[int]] = (), resolution: float = 0.0) -> Self:
         """From states ``(..., state)``.
 
         Args:
-            states: in the domain's units. A column that varies by less than :data:`RESOLUTION` counts as constant.
+            states: in the domain's units.
             alike: columns of each exchangeable entity, in the same order: what is a position for one is a position for all, so
                 they share their extremes.
+            resolution: in the domain's units: what varies less is rounding, which scaling to [-1, 1] would blow up, and counts as
+                constant.
         """
         flat = states.flatten(0, -2)
         low, high = flat.amin(dim=0), flat.amax(dim=0)
@@ -40,7 +42,8 @@ class Normalization(nn.Module):
             columns = torch.tensor([list(entity) for entity in alike])
             low[columns] = low[columns].amin(dim=0).expand(columns.shape)
             high[columns] = high[columns].amax(dim=0).expand(columns.shape)
-        return cls(low, torch.where(high - low < RESOLUTION, low, high))
+        rounding = RELATIVE * torch.maximum(low.abs(), high.abs())
+        return cls(low, torch.where(high - low < torch.clamp(rounding, min=resolution), low, high))
 
     def share(self, columns: Sequence[int], other: Self) -> None:
         """Bring some columns on the scale of another normalisation's, of which there are as many."""

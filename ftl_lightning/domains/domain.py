@@ -40,12 +40,14 @@ class Plans:
         start_exponent: exponent u of the windows' starts in a demonstration, ``start = length * share^u``, for windows as long as a
             plan: 1 is uniform; 3 where a plan reaches over the whole behaviour, so that the first window matters most. Shorter
             windows start anywhere: all times are alike to them.
+        resolution: columns of states and observed vectors that vary by less, in their units, hold nothing but a simulator's rounding.
     """
 
     horizon: int
     columns: tuple[str, ...]
     units: tuple[str, ...]
     start_exponent: float = 1.0
+    resolution: float = 0.0
 
     def exponent(self, window: int) -> float:
         """That of windows of this length."""

@@ -36,9 +36,7 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
             if states.shape[2] in (2, 3) and states.shape[1] > 1:
                 axes.plot(*plan.T, color=PATH, linewidth=1.2)
                 axes.plot(*plan[:1].T, "o", color=START, markersize=3)
-                axes.set(xlim=_room(low[0], high[0]), ylim=_room(low[1], high[1]))
-                if not spatial:
-                    axes.set_aspect("equal", adjustable="datalim")
+                axes.set(**_limits(low, high), box_aspect=None if spatial else 1)
             else:
                 for column, name in enumerate(names):
                     axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=name)
@@ -54,9 +52,11 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
     return render
 
 
-def _room(low: float, high: float) -> tuple[float, float]:
-    margin = 0.05 * max(high - low, 1e-6)
-    return low - margin, high + margin
+def _limits(low: Sequence[float], high: Sequence[float]) -> dict[str, tuple[float, float]]:
+    """Limits of the axes, equally long around what is shown, so that a circle is round."""
+    half = 0.55 * max([b - a for a, b in zip(low, high, strict=True)] + [1e-6])
+    middles = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    return {f"{axis}lim": (middle - half, middle + half) for axis, middle in zip("xyz", middles, strict=False)}
 
 
 def film(states: Tensor) -> list[NDArray[np.uint8]]:
@@ -70,9 +70,9 @@ def film(states: Tensor) -> list[NDArray[np.uint8]]:
     axes = figure.add_subplot(projection="3d") if plan.shape[1] == 3 else figure.add_subplot()
     axes.plot(*plan.T, color="#d8d8d8", linewidth=1)
     line: Any = axes.plot(*plan[:1].T, color=PATH, linewidth=2)[0]
-    axes.set(xticks=[], yticks=[])
+    axes.set(**_limits(plan.min(axis=0).tolist(), plan.max(axis=0).tolist()), xticks=[], yticks=[])
     if plan.shape[1] == 2:
-        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_box_aspect(1)
     pictures = []
     for end in np.unique(np.linspace(1, len(plan), min(len(plan), MAX_FRAMES)).astype(int)):
         line.set_data(*plan[:end, :2].T)

@@ -389,6 +389,7 @@ class TextConceptModel(ConceptModel):
     ) -> None:
         centre = embeddings[1:].mean(dim=0)
         spread = (embeddings[1:] - centre).square().mean().sqrt()
+        spread = torch.where(spread > 0, spread, 1)  # of a single training concept
         super().__init__(config, domain, normalization, (embeddings - centre) / spread, initial_normalization)
         self.register_buffer("centre", centre)
         self.register_buffer("spread", spread)

@@ -3,7 +3,7 @@
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -115,6 +115,7 @@ class Pretraining(pl.LightningModule, ABC):
             raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
         concepts = data.domain.concepts.training
         embeddings = data.encoder((EMPTY, *concepts))
+        expect_different(concepts, embeddings[1:])
         view = find_view(data.domain, self.hparams["view"])
         features = data.domain.observed if view is None else view.features
         seen: Observed
@@ -144,11 +145,12 @@ class Pretraining(pl.LightningModule, ABC):
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            normalization = Normalization.fit(states, view.scales if view else ())
+            resolution = data.domain.plans.resolution
+            normalization = Normalization.fit(states, view.scales if view else (), resolution)
             beside = None
             if features:
                 sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
-                beside = Normalization.fit(joined_vectors(seen, features), sizes.entities)
+                beside = Normalization.fit(joined_vectors(seen, features), sizes.entities, resolution)
                 if sizes.state_columns and view is None:  # a view has another scale
                     beside.share(sizes.state_columns, normalization)
             self.model = self.build(shared, data, normalization, embeddings, beside)
@@ -245,6 +247,21 @@ class Pretraining(pl.LightningModule, ABC):
         """What decides the form of a checkpoint's parameters, and what they mean."""
         different = ("training", "training_concepts", "perturb", "metrics")
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
+
+
+def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
+    """Refuse concepts that the text encoder cannot tell apart, such as those that differ in capitals alone.
+
+    Raises:
+        UserError: naming two of them.
+    """
+    for number, text in enumerate(concepts):
+        same = (embeddings[:number] == embeddings[number]).all(dim=1).nonzero()
+        if len(same):
+            raise UserError(
+                f"concepts: {concepts[int(same[0])]!r} and {text!r} have the same embedding; expected texts that data.encoder tells "
+                "apart: change one"
+            )
 
 
 class PretrainingModule(Pretraining):

@@ -99,18 +99,17 @@ def overview(results: pd.DataFrame) -> Table:
         rows, references = compared(domain, results), reference_lines(domain, results)
         for setting in settings(domain, rows):
             for metric in metrics(domain):
-                own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
-                if not own.empty:
-                    lines.append([*_line(domain, own, setting, metric, names), _around(around)])
-    return Table("overview", _caption(results), pd.DataFrame(lines, columns=[*_head(names), "reference lines"], dtype=str))
+                if not select(rows, setting=setting, metric=metric).empty:
+                    lines.append(_line(domain, rows, references, setting, metric, names))
+    return _overview(results, lines)
 
 
 def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines: of each domain in turn what says most, without reference lines."""
+    """The overview in at most :data:`LINES` lines: of each domain in turn what says most."""
     names = methods(results)
     lines = {
         domain.name: [
-            _line(domain, select(rows, setting=setting, metric=metric), setting, metric, names)
+            _line(domain, rows, reference_lines(domain, results), setting, metric, names)
             for setting, metric in headlines(domain, rows)
         ]
         for domain in _domains(results)
@@ -118,28 +117,29 @@ def short_overview(results: pd.DataFrame) -> Table:
     }
     shown = [line for turn in zip_longest(*lines.values()) for line in turn if line][:LINES]
     shown.sort(key=lambda line: list(lines).index(line[0]))
-    return Table("overview", _caption(results), pd.DataFrame(shown, columns=_head(names), dtype=str))
+    return _overview(results, shown)
+
+
+def _overview(results: pd.DataFrame, lines: list[list[str]]) -> Table:
+    papers = " [the paper's]" if any(map(published, _domains(results))) else ""
+    caption = f"Ours and the baselines, mean ± standard error over tasks{papers}; then ours less the best baseline"
+    columns = ["domain", "setting, metric", *methods(results), "lead", "reference lines"]
+    return Table("overview", caption, pd.DataFrame(lines, columns=columns, dtype=str))
 
 
 def _domains(results: pd.DataFrame) -> list[Domain]:
     return [domain_of(name, results) for name in sorted(set(results["domain"]))]
 
 
-def _caption(results: pd.DataFrame) -> str:
-    papers = " [the paper's]" if any(map(published, _domains(results))) else ""
-    return f"Ours and the baselines, mean ± standard error over tasks{papers}; then ours less the best baseline"
-
-
-def _head(names: Sequence[str]) -> list[str]:
-    return ["domain", "setting, metric", *names, "lead"]
-
-
-def _line(domain: Domain, rows: pd.DataFrame, setting: str, metric: str, names: Sequence[str]) -> list[str]:
-    """The columns of :func:`_head`; on training concepts language is ours, the same model and the same words."""
+def _line(
+    domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, names: Sequence[str]
+) -> list[str]:
+    """A line of the overview; on training concepts language is ours, the same model and the same words."""
     same = setting in training_settings(domain)
     others = [name for name in names if name != OURS and not (name == LANGUAGE and same)]
-    cells = [_cell(domain, rows, method, setting, metric) for method in names]
-    return [domain.name, f"{setting}, {metric}", *cells, _lead(lead(rows, domain.less_is_better(metric), others))]
+    own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
+    cells = [_cell(domain, own, method, setting, metric) for method in names]
+    return [domain.name, f"{setting}, {metric}", *cells, _lead(lead(own, domain.less_is_better(metric), others)), _around(around)]
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric: str) -> str:

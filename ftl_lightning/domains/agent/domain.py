@@ -146,7 +146,7 @@ def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> T
 
 DOMAIN = Domain(
     name=NAME,
-    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0),
+    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0, resolution=1e-3),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,

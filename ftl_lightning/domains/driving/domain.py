@@ -70,7 +70,7 @@ def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
 
 DOMAIN = Domain(
     name=NAME,
-    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS),
+    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, resolution=1e-3),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,

@@ -74,7 +74,7 @@ def succeeded(goal: str, states: Tensor, starts: InitialStates | None = None) ->
 
 DOMAIN = Domain(
     name=NAME,
-    plans=Plans(1, STATE_NAMES, STATE_UNITS),
+    plans=Plans(1, STATE_NAMES, STATE_UNITS, resolution=1e-3),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
