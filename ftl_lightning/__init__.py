@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ftl_lightning.few_shot import FewShot
 
-__version__ = "0.1.0"
+from ftl_lightning.version import __version__
+
 __all__ = ["FewShot", "__version__"]
 
 

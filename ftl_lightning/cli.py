@@ -6,10 +6,12 @@ import re
 import sys
 from argparse import ArgumentError
 from collections.abc import Sequence
+from typing import Any
 
-from ftl_lightning import __version__, inputs
+from ftl_lightning import inputs
 from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError
+from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
     "fit": "pretrain a model on a domain's training concepts",
@@ -82,9 +84,18 @@ def _dispatch(arguments: list[str]) -> None:
         inputs.check_inputs(arguments[1:], inputs.COMMANDS)
         from jsonargparse import auto_cli
 
-        function = getattr(importlib.import_module("ftl_lightning.commands"), verb)
+        commands = importlib.import_module("ftl_lightning.commands")
+        function, kind = getattr(commands, verb), getattr(commands, f"{verb.capitalize()}Options", None)
         program = f"python -m ftl_lightning {verb}"
-        auto_cli(function, args=expanded(arguments[1:]), as_positional=verb in POSITIONAL, prog=program, exit_on_error=False)
+        read: dict[str, Any] = {
+            "args": expanded(arguments[1:]),
+            "as_positional": verb in POSITIONAL,
+            "prog": program,
+            "exit_on_error": False,
+        }
+        found = auto_cli(kind or function, **read)
+        if kind:  # options in a class of their own
+            function(found)
     elif verb in TRAINER_VERBS:
         inputs.check_inputs(arguments[1:], inputs.TRAINER)
         from ftl_lightning.lightning_cli import run

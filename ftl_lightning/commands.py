@@ -1,9 +1,14 @@
 """The verbs that need no trainer: plain typed functions. Their imports are inside, so that each starts at once."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ftl_lightning.ablation import Stage
+
+if TYPE_CHECKING:
+    from ftl_lightning.demonstrations.features import InitialStates
+    from ftl_lightning.domains.domain import Domain
 
 
 def generate(
@@ -63,26 +68,11 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
     print(path)
 
 
-def sample(
-    pretrained: str,
-    concept: str = "",
-    compose: str = "",
-    count: int = 50,
-    seed: int = 0,
-    sampler: Literal["", "ddpm", "ddim", "dpm_solver"] = "",
-    steps: int = 0,
-    temperature: float = -1.0,
-    goal: str = "",
-    initial: str = "",
-    out: str = "states.safetensors",
-    figure: str = "",
-    execute: bool = False,
-    replan: int = 0,
-    animation: str = "",
-) -> None:
+@dataclass(frozen=True)
+class SampleOptions:
     """Generate behaviour from a learned concept, composed with training concepts.
 
-    Args:
+    Attributes:
         pretrained: folder of the pretrained model, or the name of one that ships.
         concept: file of a learned concept; empty for training concepts alone.
         compose: what is composed with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9". Training
@@ -102,61 +92,101 @@ def sample(
         replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 likewise.
         animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
     """
+
+    pretrained: str
+    concept: str = ""
+    compose: str = ""
+    count: int = 50
+    seed: int = 0
+    sampler: Literal["", "ddpm", "ddim", "dpm_solver"] = ""
+    steps: int = 0
+    temperature: float = -1.0
+    goal: str = ""
+    initial: str = ""
+    out: str = "states.safetensors"
+    figure: str = ""
+    execute: bool = False
+    replan: int = 0
+    animation: str = ""
+
+    def __post_init__(self) -> None:
+        from ftl_lightning.errors import UserError
+
+        for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
+            if path and Path(path).suffix not in endings:
+                raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
+        for name, least in (("count", 1), ("seed", 0), ("steps", 0), ("replan", 0)):
+            if (value := getattr(self, name)) < least:
+                raise UserError(f"{name}: expected {least} or more, found {value}")
+
+
+def sample(options: SampleOptions) -> None:
+    """Generate behaviour as the options say; write, judge, draw and execute it."""
     from dataclasses import replace
 
-    from ftl_lightning.demonstrations.container import Demonstrations
-    from ftl_lightning.errors import UserError
     from ftl_lightning.evaluation.animation import captioned, gif
     from ftl_lightning.few_shot import FewShot
     from ftl_lightning.tensor_file import atomic
 
-    for name, path, endings in (("animation", animation, (".gif",)), ("figure", figure, (".png", ".svg", ".pdf"))):
-        if path and Path(path).suffix not in endings:
-            raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
-    if seed < 0 or count < 1 or steps < 0 or replan < 0:
-        raise UserError(f"seed, steps, replan, count: expected 0 or more, and 1 sample, found {seed}, {steps}, {replan}, {count}")
-    model = FewShot.from_pretrained(pretrained)
-    domain = model.domain
-    if goal and not domain.concepts.reads(goal):
-        raise UserError(f"goal: expected a task of {domain.name}, found {goal!r}")
-    if execute and domain.closed_loop is None:
-        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
-    if animation and not execute and domain.show.film is None:
-        raise UserError(f"animation: expected --execute true, since plans of {domain.name} are not filmed, found {animation!r}")
-    starts = None
-    if initial:
-        starts = Demonstrations.load(initial).fitted(domain.observed).initial_states
-    elif domain.observed:
-        if not goal:
-            raise UserError(
-                f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
-            )
-        starts = domain.source(None).starts(goal, count, seed)
-    chosen = {"sampler": sampler or None, "steps": steps or None, "temperature": None if temperature < 0 else temperature}
-    changes = {name: value for name, value in chosen.items() if value is not None}
-    composition = model.compose(" + ".join(part for part in (compose, concept) if part))
-    plans = model.sample(composition, count, starts, seed=seed, **changes)
-    plans = replace(plans, concepts=(goal,) * len(plans), provenance={**plans.provenance, "concept": concept, "compose": compose})
-    plans.save(out)
-    print(f"{out}: {len(plans)} samples")
-    if goal and domain.metrics:
-        for name, value in model.evaluate(plans, goal).items():
-            print(f"{name} on '{goal}': {value:.2f}")
-    if figure:
-        with atomic(figure) as temporary:
+    model = FewShot.from_pretrained(options.pretrained)
+    _check_sample(options, model.domain)
+    goal, film = options.goal, model.domain.show.film
+    starts = _sample_starts(options, model.domain)
+    composition = model.compose(" + ".join(part for part in (options.compose, options.concept) if part))
+    plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))
+    told = {**plans.provenance, "concept": options.concept, "compose": options.compose}
+    plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)
+    plans.save(options.out)
+    print(f"{options.out}: {len(plans)} samples")
+    for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
+        print(f"{name} on '{goal}': {value:.2f}")
+    if options.figure:
+        with atomic(options.figure) as temporary:
             model.render(plans, goal).savefig(temporary, dpi=110)
-        print(figure)
-    if execute and starts is not None:
-        done = model.execute(composition, starts, goal, replan=replan or None, seed=seed, **changes)
+        print(options.figure)
+    if options.execute and starts is not None:
+        done = model.execute(composition, starts, goal, replan=options.replan or None, seed=options.seed, **_sampling(options))
         for name, value in done.outcomes.items():
             print(f"closed loop, {name}: {value:.2f} of {len(starts)} episodes")
-        if animation:
-            done.save(animation)
-            print(animation)
-    elif animation and domain.show.film:
-        with atomic(animation) as temporary:
-            temporary.write_bytes(gif(captioned(domain.show.film(plans.states[0]), goal or Path(concept).stem)))
-        print(animation)
+        if options.animation:
+            done.save(options.animation)
+    elif options.animation and film:
+        with atomic(options.animation) as temporary:
+            temporary.write_bytes(gif(captioned(film(plans.states[0]), goal or Path(options.concept).stem)))
+    if options.animation:
+        print(options.animation)
+
+
+def _sampling(options: SampleOptions) -> dict[str, Any]:
+    """What differs from the configured way of sampling."""
+    changes: dict[str, Any] = {"sampler": options.sampler} if options.sampler else {}
+    changes |= {"steps": options.steps} if options.steps else {}
+    return changes | ({"temperature": options.temperature} if options.temperature >= 0 else {})
+
+
+def _check_sample(options: SampleOptions, domain: "Domain") -> None:
+    """Refuse what a domain cannot do, before anything is generated."""
+    from ftl_lightning.errors import UserError
+
+    if options.goal and not domain.concepts.reads(options.goal):
+        raise UserError(f"goal: expected a task of {domain.name}, found {options.goal!r}")
+    if options.execute and domain.closed_loop is None:
+        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
+    if options.animation and not options.execute and domain.show.film is None:
+        raise UserError(f"animation: expected --execute true (plans of {domain.name} are not filmed), found {options.animation!r}")
+    if domain.observed and not (options.goal or options.initial):
+        raise UserError(
+            f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
+        )
+
+
+def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
+    """Initial states of a file's demonstrations or of the goal; ``None`` where behaviour has none."""
+    from ftl_lightning.demonstrations.container import Demonstrations
+
+    if options.initial:
+        return Demonstrations.load(options.initial).fitted(domain.observed).initial_states
+    return domain.source(None).starts(options.goal, options.count, options.seed) if domain.observed else None
 
 
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
@@ -176,7 +206,9 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     if nearest < 1:
         raise UserError(f"nearest: expected 1 or more, found {nearest}")
     learned = Concept.load(concept)
-    model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), shipped("pretrained"))))
+    model = load_model(
+        pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), shipped("pretrained")))
+    )
     model.check(learned, concept)
     names = model.config.training_concepts
     print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")

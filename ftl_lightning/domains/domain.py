@@ -40,7 +40,7 @@ class Plans:
         start_exponent: exponent u of the windows' starts in a demonstration, ``start = length * share^u``, for windows as long as a
             plan: 1 is uniform; 3 where a plan reaches over the whole behaviour, so that the first window matters most. Shorter
             windows start anywhere: all times are alike to them.
-        resolution: columns of states and observed vectors that vary by less, in their units, hold nothing but a simulator's rounding.
+        resolution: columns of states and observed vectors that vary by less, in their units, hold a simulator's rounding alone.
     """
 
     horizon: int

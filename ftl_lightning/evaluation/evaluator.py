@@ -18,6 +18,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import InitialStates, join, moved
 from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
@@ -31,7 +32,6 @@ from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.summary import OWN, show, summary_table
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.data import InversionData
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from ftl_lightning import __version__
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import atomic
+from ftl_lightning.version import __version__
 
 METHOD, REFERENCE = "method", "reference"
 """Roles: what learns or is told a concept, and what stands beside it (chance, trivial policies, oracles)."""

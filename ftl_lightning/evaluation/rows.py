@@ -5,12 +5,12 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from ftl_lightning import __version__
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.generates import Generates
 from ftl_lightning.evaluation.judged import Judged, paired, share
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row
 from ftl_lightning.tensor_file import content_hash, file_hash
+from ftl_lightning.version import __version__
 
 
 def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:

@@ -10,11 +10,11 @@ from torch import Tensor
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.data import InversionData
 from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
 
 

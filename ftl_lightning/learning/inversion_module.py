@@ -17,7 +17,7 @@ from ftl_lightning.learning.inversion import Inversion, InversionSettings, check
 
 
 class InversionModule(Adaptation):
-    """Learns K embeddings and their weights for every concept of an :class:`~ftl_lightning.learning.data.InversionData`.
+    """Learns K embeddings and their weights for every concept of an :class:`~ftl_lightning.domains.data.InversionData`.
 
     Its only parameters are those of an :class:`~ftl_lightning.learning.inversion.Inversion`. The pretrained model is frozen and
     not part of a checkpoint.

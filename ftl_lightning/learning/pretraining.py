@@ -22,13 +22,13 @@ from ftl_lightning.diffusion import PAPER_SIZE
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.prediction import loss_weights
 from ftl_lightning.diffusion.schedule import denoising_loss
+from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors
-from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
@@ -259,8 +259,8 @@ def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
         same = (embeddings[:number] == embeddings[number]).all(dim=1).nonzero()
         if len(same):
             raise UserError(
-                f"concepts: {concepts[int(same[0])]!r} and {text!r} have the same embedding; expected texts that data.encoder tells "
-                "apart: change one"
+                f"concepts: {concepts[int(same[0])]!r} and {text!r} have the same embedding; expected texts that "
+                "data.encoder tells apart: change one"
             )
 
 

@@ -1,6 +1,6 @@
 """Pretraining data of driving."""
 
-from ftl_lightning.learning.data import PretrainingData
+from ftl_lightning.domains.data import PretrainingData
 
 
 class DrivingData(PretrainingData):

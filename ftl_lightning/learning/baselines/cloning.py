@@ -11,12 +11,12 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
-from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.learning.pretraining import Pretraining
 
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
-from ftl_lightning.learning.data import PretrainingData
 
 
 @dataclass(frozen=True, kw_only=True)

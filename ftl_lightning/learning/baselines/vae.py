@@ -11,10 +11,10 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import Observed, moved
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
-from ftl_lightning.learning.data import Batch, PretrainingData
 from ftl_lightning.learning.pretraining import Pretraining
 
 
