@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ftl_lightning.diffusion.initial_state import EntityEncoder
 
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet

@@ -3,7 +3,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from ftl_lightning.demonstrations.datamodule import InversionData
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
@@ -126,7 +125,7 @@ def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: P
     (file,) = (log / "concepts").iterdir()
     assert Concept.load(file).origin.weights == "learned"
     rows = read_rows(log / "results.csv")
-    assert rows.loc[rows["setting"] == "own demonstrations", "task"].tolist() == [task] * 3  # ours and two reference lines
+    assert rows[["setting", "task", "role"]].to_numpy().tolist() == [["own demonstrations", task, "method"]]  # judged alone
     options = [f"--pretrained={tiny}", f"--concept={file}", "--compose=circle above square:1.2", "--count=4", "--steps=3"]
     assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors", "--figure=states.png"]) == 0
     assert "accuracy on" in capsys.readouterr().out
