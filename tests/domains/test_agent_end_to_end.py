@@ -10,6 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.agent.scenes import OBSERVED
 from tests.conftest import CONF
 
 FIT = ["--config", str(CONF / "agent.yaml")]
@@ -53,7 +54,8 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     tag = "closed loop/new initial state/go to red bowl"
     assert events.Images(tag)[0].encoded_image_string.startswith(b"GIF89a")
     assert "new initial state/go to red bowl" in events.Tags()["images"]
-    assert any(one.startswith("test/closed loop success/") for one in events.Tags()["scalars"])
+    tested = EventAccumulator("logs/agent/invert/hparams").Reload()
+    assert "closed loop success/new initial state" in tested.Tags()["scalars"]
 
 
 def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,8 +63,9 @@ def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pyt
     assert main([*common, "--goal=go to bowl", "--count=3", "--figure=plans.png"]) == 0
     drawn = Demonstrations.load("states.safetensors")
     assert drawn.states.shape == (3, 128, 13)
-    assert drawn.initial_states is not None
-    assert drawn.initial_states.shape == (3, 52)
+    assert drawn.observed[OBSERVED].shape == (3, 52)
+    assert drawn.scenes is not None
+    assert torch.equal(drawn.scenes, drawn.observed[OBSERVED])
     assert Path("plans.png").is_file()
     assert main([*common, "--initial=states.safetensors", "--out=again.safetensors"]) == 0
     again = Demonstrations.load("again.safetensors")
@@ -94,22 +97,21 @@ def test_a_checkpoint_of_another_horizon_is_refused(model: Path, capsys: pytest.
     assert "key 'horizon': expected 64, found 128" in capsys.readouterr().err
 
 
-def test_demonstrations_without_initial_states_are_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demonstrations_without_observed_features_are_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import numpy as np
 
     np.savez("plain.npz", states=np.zeros((2, 150, 13), dtype=np.float32))
     assert main(["invert", *INVERT, f"--model.pretrained={model}", "--data.demonstrations=plain.npz", *QUIET]) == 2
-    assert "key 'initial_states': expected 52 numbers each (the pretrained model's), found none" in capsys.readouterr().err
+    assert "key 'observed/world': expected shape (52,) each, found none" in capsys.readouterr().err
 
 
-def test_demonstrations_whose_first_initial_states_alone_are_known(model: Path) -> None:
+def test_demonstrations_whose_first_observations_alone_are_known(model: Path) -> None:
     assert main(["generate", "agent", "--task=go to red bowl", "--count=3", "--out=whole.safetensors"]) == 0
     whole = Demonstrations.load("whole.safetensors")
-    assert whole.initial_states is not None
-    first = whole.initial_states[:, 0]
-    replace(whole, initial_states=first).save("first.safetensors")
-    assert torch.equal(whole.first_initial_states, first)  # type: ignore[arg-type]
-    assert torch.equal(Demonstrations.load("first.safetensors").first_initial_states, first)  # type: ignore[arg-type]
+    first = whole.observed[OBSERVED][:, 0]
+    replace(whole, observed={OBSERVED: first}, per_step=()).save("first.safetensors")
+    assert torch.equal(whole.initial_states.observed[OBSERVED], first)
+    assert torch.equal(Demonstrations.load("first.safetensors").initial_states.observed[OBSERVED], first)
     options = ["--data.steps=2", "--model.samples=2", "--evaluation.suites=[paper]", "--evaluation.closed_loop=false"]
     own = ["--data.demonstrations=first.safetensors"]
     assert main(["invert", *INVERT, f"--model.pretrained={model}", *own, *options, *QUICK, *QUIET]) == 0

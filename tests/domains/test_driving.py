@@ -8,7 +8,7 @@ import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
 from ftl_lightning.domains.driving import expert, generation
-from ftl_lightning.domains.driving.environment import INITIAL, OBSERVED, DrivingEnvironment, initial_state, origin
+from ftl_lightning.domains.driving.environment import OBSERVED, SCENARIO, SCENE, TRAFFIC, DrivingEnvironment, origin, scene
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.simulation import advance, restore, save
@@ -140,12 +140,18 @@ def test_planning_leaves_the_simulation_as_it_was() -> None:
 # Closed loop
 
 
-def follow(actions: list[np.ndarray], task: str = "roundabout", seed: int = 0) -> tuple[np.ndarray, dict[str, float]]:
+def scene_of(name: str, seed: int) -> np.ndarray:
+    """The scene ``(37,)`` that a scenario and a seed lead to."""
+    return scene(observe(start(name, seed)), name, seed)
+
+
+def follow(actions: list[np.ndarray], seed: int = 0) -> tuple[np.ndarray, dict[str, float]]:
+    """Traffic ``(time, 35)`` in the roundabout and how it ended."""
     env = DrivingEnvironment()
-    seen, info = [env.reset(seed=seed, options={"task": task})[0]], {}
+    seen, info = [env.reset(options={"scene": scene_of("roundabout", seed)})[0][TRAFFIC]], {}
     for action in actions:
         observation, _, ended, late, info = env.step(action)
-        seen.append(observation)
+        seen.append(observation[TRAFFIC])
         if ended or late:
             break
     env.close()
@@ -153,12 +159,10 @@ def follow(actions: list[np.ndarray], task: str = "roundabout", seed: int = 0) -
 
 
 def test_the_planner_does_what_the_expert_did() -> None:
-    env = DrivingEnvironment()
-    name, seed = origin(env.reset(seed=5)[0])
-    seen, succeeded = expert.drive(name, seed)
+    seen, succeeded = expert.drive("roundabout", 5)
     assert succeeded
     driven, info = follow(list(seen[1:, 0]), seed=5)
-    np.testing.assert_allclose(driven[:, :OBSERVED], seen.reshape(len(seen), -1), atol=1e-4)
+    np.testing.assert_allclose(driven, seen.reshape(len(seen), -1), atol=1e-4)
     assert info["arrived"]
     assert info["passed"]
     assert not info["crashed"]
@@ -180,26 +184,38 @@ def test_an_episode_repeats_and_starts_where_its_numbers_say() -> None:
     first, again = follow([np.array([3.0])] * 4, seed=9)[0], follow([np.array([3.0])] * 4, seed=9)[0]
     assert np.array_equal(first, again)
     env, other = DrivingEnvironment(), DrivingEnvironment()
-    seen, _ = env.reset(options={"initial_state": first[0]})
-    assert np.array_equal(seen, first[0])
-    other.reset(options={"initial_state": first[0]})
+    given = scene_of("roundabout", 9)
+    seen, _ = env.reset(options={"scene": given})
+    assert np.array_equal(seen[TRAFFIC], first[0])
+    assert np.array_equal(given[:OBSERVED], first[0])
+    assert seen[SCENARIO].tolist() == [PAPER.index("roundabout")]
+    other.reset(options={"scene": given})
     assert env.np_random.random() == other.np_random.random()  # draws among equal decisions
     with pytest.raises(UserError, match="expected the start of 'roundabout'"):
-        env.reset(options={"initial_state": first[2]})
+        env.reset(options={"scene": np.concatenate((first[2], given[OBSERVED:]))})
+
+
+def test_without_a_scene_the_seed_and_the_task_decide_where_an_episode_starts() -> None:
+    env = DrivingEnvironment()
+    first, again, other = (env.reset(seed=seed, options={"task": "merge"})[0] for seed in (3, 3, 4))
+    assert first[SCENARIO].tolist() == [PAPER.index("merge")]
+    assert np.array_equal(first[TRAFFIC], again[TRAFFIC])
+    assert not np.array_equal(first[TRAFFIC], other[TRAFFIC])
+    assert env.observation_space.contains(first)
 
 
 @pytest.mark.parametrize(
     ("wrong", "expected"),
     [
         (np.zeros(35), "expected 37 finite numbers"),
-        (np.full(INITIAL, np.nan), "expected 37 finite numbers"),
+        (np.full(SCENE, np.nan), "expected 37 finite numbers"),
         (np.concatenate((np.zeros(OBSERVED), [99, 0])), "a scenario from 0 to"),
         (np.concatenate((np.zeros(OBSERVED), [0, 0.5])), "and a seed, found 0 and 0.5"),
     ],
 )
-def test_initial_states_that_are_none(wrong: np.ndarray, expected: str) -> None:
+def test_scenes_that_are_none(wrong: np.ndarray, expected: str) -> None:
     with pytest.raises(UserError, match=expected):
-        DrivingEnvironment().reset(options={"initial_state": wrong})
+        DrivingEnvironment().reset(options={"scene": wrong})
 
 
 def test_actions_that_are_none() -> None:
@@ -211,8 +227,9 @@ def test_actions_that_are_none() -> None:
 
 
 def test_what_no_model_sees_stands_last() -> None:
-    row = initial_state(np.ones((5, 7), dtype=np.float32), "merge", 12345)
-    assert row.shape == (INITIAL,)
+    row = scene(np.ones((5, 7), dtype=np.float32), "merge", 12345)
+    assert row.shape == (SCENE,)
+    assert (row[:OBSERVED] == 1).all()
     assert origin(row) == ("merge", 12345)
 
 
@@ -223,14 +240,14 @@ def test_nobody_starts_where_a_scenario_ends() -> None:
 
 @pytest.mark.parametrize("name", TRAINING_CONCEPTS)
 def test_who_drives_as_a_recorded_episode_succeeds_as_it_did(name: str) -> None:
-    recorded = training_set(1, 0).select(name)
-    assert recorded.initial_states is not None
+    recorded = training_set("train", 1).select(name)
     env = DrivingEnvironment()
-    env.reset(options={"initial_state": recorded.initial_states[0, 0].numpy()})
+    env.reset(options={"scene": recorded.initial_states.require_scenes()[0].numpy()})
     length = int(recorded.lengths[0])
     for time in range(1, length):
         seen, _, terminated, truncated, info = env.step(recorded.states[0, time].numpy())
-        np.testing.assert_allclose(seen, recorded.initial_states[0, time], atol=1e-3)
+        for feature, values in recorded.observed.items():
+            np.testing.assert_allclose(seen[feature], values[0, time], atol=1e-3)
     assert terminated or truncated
     assert info["arrived"]
     assert info["passed"]
@@ -249,10 +266,10 @@ def test_demonstrations_do_not_depend_on_workers_and_go_on_where_they_stopped(
     told: list[int] = []
     alone = generation.demonstrations("merge", 2, 0, 1, lambda: told.append(1))
     assert len(told) == 2
-    assert alone.initial_states is not None
-    assert torch.equal(alone.states, alone.initial_states[..., :7])
+    assert torch.equal(alone.states, alone.observed[TRAFFIC][..., :7])
+    scenes = alone.initial_states.require_scenes()
     assert alone.provenance["rejected"] == alone.provenance["driven"] - 2
-    for row, (length, start) in enumerate(zip(alone.lengths.tolist(), alone.initial_states[:, 0].numpy(), strict=True)):
+    for row, (length, start) in enumerate(zip(alone.lengths.tolist(), scenes.numpy(), strict=True)):
         beyond = torch.arange(1, alone.states.shape[1] - length + 1)  # seconds
         assert len(beyond) >= 8
         torch.testing.assert_close(

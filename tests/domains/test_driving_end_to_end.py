@@ -8,16 +8,17 @@ import pytest
 import torch
 
 from ftl_lightning.cli import main
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.diffusion.samplers import SAMPLERS
+from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.environment import STATE, origin
+from ftl_lightning.domains.driving.environment import SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.evaluation.closed_loop import planner
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.seeding import VALIDATION_SEED, generator
+from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
 
 FIT = ["--config", str(CONF / "driving.yaml")]
@@ -43,19 +44,24 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_shipped_demonstrations() -> None:
-    train, held_out = training_set(100, 0), training_set(10, VALIDATION_SEED)
+    train, held_out = training_set("train", 100), training_set("validation", 10)
     assert len(train) == 400
     assert len(held_out) == 40
-    assert train.initial_states is not None
-    assert held_out.initial_states is not None
-    starts = {origin(row) for part in (train, held_out) for row in part.initial_states[:, 0].numpy()}
+    starts = {origin(row) for part in (train, held_out) for row in part.initial_states.require_scenes().numpy()}
     assert len(starts) == 440
-    assert {name for name, _ in starts} == set(DOMAIN.training_concepts)
-    assert torch.equal(training_set(3, 7).states, training_set(3, 0).states)
+    assert {name for name, _ in starts} == set(DOMAIN.concepts.training)
+    source = DOMAIN.source(None)
+    assert torch.equal(source.split("train", 3, 7).states, source.split("train", 3, 0).states)
+    for part in (train, held_out):
+        assert part.per_step == (TRAFFIC, SCENARIO)
+        assert torch.equal(part.observed[TRAFFIC][..., :7], part.states)
+        scenario = part.initial_states.require_scenes()[:, None, -2]
+        assert torch.equal(part.observed[SCENARIO][..., 0], scenario.expand(part.states.shape[:2]))
     # Each is where the seed in its card puts it.
-    again = DOMAIN.initial_states("exit", 40, 0)  # type: ignore[misc]
-    first = train.select("exit").initial_states[0, 0]  # type: ignore[index]
-    assert any(torch.allclose(first, row, atol=1e-3) for row in again)
+    again = source.starts("exit", 40, 0)
+    assert again is not None
+    first = train.select("exit").initial_states.require_scenes()[0]
+    assert any(torch.allclose(first, row, atol=1e-3) for row in again.require_scenes())
 
 
 def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
@@ -102,14 +108,14 @@ def test_the_shipped_model_knows_the_training_scenarios() -> None:
     assert DOMAIN.closed_loop is not None
     assert planner(shipped, DOMAIN.closed_loop) is VIEWS["steps"].act
     for name in ("highway", "merge"):
-        held = training_set(10, VALIDATION_SEED).select(name)
+        held = training_set("validation", 10).select(name)
         rows = [(row, time) for row, length in enumerate(held.lengths.tolist()) for time in range(length - 1)]
-        assert held.initial_states is not None
-        now = torch.stack([held.initial_states[row, time] for row, time in rows])
+        at, when = torch.tensor(rows).T
+        now = {name: values[at, when] for name, values in held.observed.items()}
         following = torch.stack([held.states[row, time + 1] for row, time in rows])
-        concept, draw = [shipped.concept(name)[None]], [generator("cpu", 0)]
-        plans = shipped.sample(concept, [torch.tensor([1.2])], len(rows), SAMPLERS["dpm_solver"], 5, 0.0, draw, now)[0]
-        kept = now[:, :STATE].clone()
+        concept, draw = [Composition(shipped.concept(name)[None], torch.tensor([1.2]))], [generator("cpu", 0)]
+        plans = shipped.sample(concept, len(rows), Sampling("dpm_solver", 5, 0.0), draw, now)[0]
+        kept = now[TRAFFIC][:, :STATE].clone()
         kept[:, 1:3] += kept[:, 3:5]  # decisions are a second apart
         assert (plans[:, 1] - following).norm(dim=1).mean() < 0.9 * (kept - following).norm(dim=1).mean()
 
@@ -118,8 +124,9 @@ def test_generate_writes_what_invert_reads(model: Path, capsys: pytest.CaptureFi
     assert main(["generate", "driving", "--task=merge", "--count=2", "--out=demos.safetensors"]) == 0
     found = Demonstrations.load("demos.safetensors")
     assert found.states.shape[2] == 7
-    assert found.initial_states is not None
-    assert found.initial_states.shape[2] == 37
+    assert {name: values.shape[2:] for name, values in found.observed.items()} == {TRAFFIC: (35,), SCENARIO: (1,)}
+    assert found.scenes is not None
+    assert found.scenes.shape == (2, 37)
     capsys.readouterr()
     for arguments, expected in (
         (["generate", "driving", "--task=motorway"], "driving task: expected one of highway"),
@@ -140,7 +147,9 @@ def test_a_file_whose_states_do_not_fit(model: Path, capsys: pytest.CaptureFixtu
         state_names=tuple("abcdefgh"),
         state_units=("",) * 8,
         concepts=("roundabout",),
-        initial_states=torch.zeros(1, 9, 37),
+        observed={TRAFFIC: torch.zeros(1, 9, 35), SCENARIO: torch.zeros(1, 9, 1)},
+        per_step=(TRAFFIC, SCENARIO),
+        scenes=torch.zeros(1, 37),
     )
     wide.save("wide.safetensors")
     assert main(["invert", *INVERT, *QUIET, f"--model.pretrained={model}", "--data.demonstrations=wide.safetensors"]) == 2

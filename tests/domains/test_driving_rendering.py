@@ -2,8 +2,10 @@ import torch
 from matplotlib.figure import Figure
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.driving.rendering import frames, render
+from ftl_lightning.domains.driving.environment import TRAFFIC
+from ftl_lightning.domains.driving.rendering import film, render
 from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.rollout import Rollout
 
 
 def panels(figure: Figure) -> int:
@@ -12,7 +14,7 @@ def panels(figure: Figure) -> int:
 
 def test_a_figure_shows_at_most_eight_plans_and_says_what_the_colours_mean() -> None:
     shipped = Demonstrations.load(SHIPPED / "exit.safetensors").rows(range(10))
-    starts = shipped.first_initial_states
+    starts = shipped.initial_states
     figure = render(shipped.states[:, :8], None, "exit", starts)
     assert panels(figure) == 8
     assert figure.get_suptitle() == "exit (8 of 10 shown)"
@@ -20,18 +22,18 @@ def test_a_figure_shows_at_most_eight_plans_and_says_what_the_colours_mean() -> 
     for axes in figure.axes[:8]:
         (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
         assert max(abs(right - left), abs(top - bottom)) < 2 * min(abs(right - left), abs(top - bottom))  # no stamps, no strips
-    few = render(shipped.states[:3, :8], [True, False, True], "exit", starts[:3])
+    few = render(shipped.states[:3, :8], [True, False, True], "exit", starts.take(slice(0, 3)))
     assert panels(few) == 3
     assert few.get_suptitle() == "exit"
 
 
 def test_an_episodes_pictures_have_one_size_and_end_when_nothing_moves() -> None:
     shipped = Demonstrations.load(SHIPPED / "exit.safetensors").rows([0])
-    start, states = shipped.first_initial_states[0], shipped.states[0]
-    observations = start.repeat(6, 1)
-    observations[:4, :7] = states[:4]  # the vehicle moves three times
-    observations[4:, :7] = states[3]
-    plans = torch.stack([states[:8]] * 5)
-    pictures = frames(observations, plans)
+    states = shipped.states[0]
+    observed = {name: values[:, :1].repeat(1, 6, 1) for name, values in shipped.observed.items()}
+    observed[TRAFFIC][0, :4, :7] = states[:4]  # the vehicle moves three times
+    observed[TRAFFIC][0, 4:, :7] = states[3]
+    episode = Rollout(shipped.initial_states, observed, torch.zeros(1, dtype=torch.bool), [{}])
+    pictures = film(episode, torch.stack([states[:8]] * 5))
     assert len(pictures) == 4
     assert len({picture.shape for picture in pictures}) == 1

@@ -1,15 +1,18 @@
 """How a model sees traffic."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.environment import SCENARIO, TRAFFIC, initial_states
 from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.views import VIEWS
-from ftl_lightning.errors import UserError
 
 
 def vehicle(x: float, y: float, speed: float, heading: float) -> list[float]:
@@ -21,10 +24,44 @@ NEW, KNOWN = 4, 0
 """Numbers of a scenario that is not one of pretraining, and of one that is."""
 
 
-def scene(turn: float = 0.0, x: float = 0.0, y: float = 0.0, number: int = NEW) -> Tensor:
-    """A vehicle at 8 m/s and another 10 m ahead of it at 4 m/s, the whole turned and moved."""
+def scene(turn: float = 0.0, x: float = 0.0, y: float = 0.0, number: int = NEW) -> dict[str, Tensor]:
+    """What is observed of a vehicle at 8 m/s and another 10 m ahead of it at 4 m/s, the whole turned and moved."""
     ahead = vehicle(x + 10 * math.cos(turn), y + 10 * math.sin(turn), 4, turn)
-    return torch.tensor([vehicle(x, y, 8, turn) + ahead + [0.0] * 21 + [number, 99]])
+    traffic = torch.tensor([vehicle(x, y, 8, turn) + ahead + [0.0] * 21])
+    return {TRAFFIC: traffic, SCENARIO: torch.tensor([[float(number)]])}
+
+
+def seen_in(view: View, observed: Observed) -> Tensor:
+    """The vectors that a model with this view reads."""
+    return view.observe(observed)[TRAFFIC]
+
+
+def same(one: Observed, other: Observed) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+ANY = torch.Generator()
+"""A generator that is asked for nothing: :func:`drawn` stands in for what draws."""
+
+
+def drawn(*values: float) -> Callable[..., Tensor]:
+    """A source of noise ``(1, 2)`` that draws these values."""
+
+    def randn(shape: tuple[int, int], **_: object) -> Tensor:
+        assert shape == (1, len(values))
+        return torch.tensor([values])
+
+    return randn
+
+
+def test_without_a_generator_every_road_is_unknown_and_nothing_else_changes() -> None:
+    view, start, states = VIEWS["steps"], scene(2.0, 80, -20, KNOWN), straight_on(2.0, 80, -20)
+    assert view.perturb is not None
+    other, hidden = view.perturb(states, start, None)
+    torch.testing.assert_close(other, states)
+    assert seen_in(view, start)[0, 0] != 0
+    assert seen_in(view, hidden)[0, :4].tolist() == [0, 0, 0, 0]
+    torch.testing.assert_close(seen_in(view, hidden)[0, 4:5], seen_in(view, start)[0, 4:5])
 
 
 def straight_on(turn: float = 0.0, x: float = 0.0, y: float = 0.0) -> Tensor:
@@ -41,7 +78,7 @@ def test_decoding_undoes_encoding(name: str) -> None:
 
 def test_from_the_vehicle_all_new_straight_roads_are_alike() -> None:
     view = VIEWS["steps"]
-    seen, seen_turned = view.observe(scene()), view.observe(scene(2.0, 300, 40))
+    seen, seen_turned = seen_in(view, scene()), seen_in(view, scene(2.0, 300, 40))
     torch.testing.assert_close(seen_turned, seen, atol=1e-4, rtol=1e-4)
     assert seen[0, :7].tolist() == [0, 0, 0, 0, 8, 0, 0]
     assert seen[0, 7:14].tolist() == pytest.approx([1, 10 * 20 / 30, 0, 4 - 8, 0, 1, 0], abs=1e-5)  # 10 m away, 4 m/s slower
@@ -51,33 +88,40 @@ def test_from_the_vehicle_all_new_straight_roads_are_alike() -> None:
 
 def test_on_a_known_road_a_vehicle_knows_its_place() -> None:
     view = VIEWS["steps"]
-    seen = view.observe(scene(math.pi / 2, 80, -20, KNOWN))
+    seen = seen_in(view, scene(math.pi / 2, 80, -20, KNOWN))
     assert seen[0, :7].tolist() == pytest.approx([80, -20, 80 * 20 / 100, -10, 8, 0, 1], abs=1e-5)
-    assert torch.equal(seen[0, 7:], view.observe(scene(math.pi / 2, 80, -20))[0, 7:])
+    assert torch.equal(seen[0, 7:], seen_in(view, scene(math.pi / 2, 80, -20))[0, 7:])
 
 
-def test_half_of_the_time_the_place_on_a_known_road_is_hidden_and_the_present_perturbed() -> None:
+def test_half_of_the_time_the_place_on_a_known_road_is_hidden_and_the_present_perturbed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     view, start, states = VIEWS["steps"], scene(number=KNOWN), straight_on()
     assert view.perturb is not None
-    kept, seen = view.perturb(states, start, torch.tensor([[0.5, 1.0]]))
+    monkeypatch.setattr(torch, "randn", drawn(0.5, 1.0))
+    kept, seen = view.perturb(states, start, ANY)
     assert torch.equal(kept, states)
-    assert torch.equal(seen, start)
-    other, seen = view.perturb(states, start, torch.tensor([[0.5, -1.0]]))
+    assert same(seen, start)
+    monkeypatch.setattr(torch, "randn", drawn(0.5, -1.0))
+    other, seen = view.perturb(states, start, ANY)
     assert other[0, 0].tolist() == pytest.approx(vehicle(0, 0, 8 + 0.5 * 4, 0))
-    assert view.observe(seen)[0, :7].tolist() == pytest.approx([0, 0, 0, 0, 10, 0, 0])
+    assert seen_in(view, seen)[0, :7].tolist() == pytest.approx([0, 0, 0, 0, 10, 0, 0])
     torch.testing.assert_close(view.decode(view.encode(other, seen), seen), other)
 
 
-def test_a_perturbed_present_has_another_speed_and_the_way_back_from_it() -> None:
+def test_a_perturbed_present_has_another_speed_and_the_way_back_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
     view, start, states = VIEWS["steps"], scene(), straight_on()
     assert view.perturb is not None
-    other, seen = view.perturb(states, start, torch.tensor([[0.5, 1.0]]))
-    assert seen[0, 1:7].tolist() == pytest.approx(vehicle(0, 0, 8 + 0.5 * 4, 0)[1:])
-    assert torch.equal(seen[0, 7:], start[0, 7:])
-    assert torch.equal(other[0, 0, 1:], seen[0, 1:7])
+    monkeypatch.setattr(torch, "randn", drawn(0.5, 1.0))
+    other, seen = view.perturb(states, start, ANY)
+    assert seen[TRAFFIC][0, 1:7].tolist() == pytest.approx(vehicle(0, 0, 8 + 0.5 * 4, 0)[1:])
+    assert torch.equal(seen[TRAFFIC][0, 7:], start[TRAFFIC][0, 7:])
+    assert torch.equal(seen[SCENARIO], start[SCENARIO])
+    assert torch.equal(other[0, 0, 1:], seen[TRAFFIC][0, 1:7])
     assert torch.equal(other[0, 1:], states[0, 1:])
     assert view.encode(other, seen)[0, 1, 3] == -2  # brakes by what it was too fast
-    stopped, _ = view.perturb(states, start, torch.tensor([[-9.0, 1.0]]))
+    monkeypatch.setattr(torch, "randn", drawn(-9.0, 1.0))
+    stopped, _ = view.perturb(states, start, ANY)
     assert stopped[0, 0, 3:5].tolist() == [0, 0]
 
 
@@ -95,14 +139,16 @@ def test_in_steps_a_heading_is_of_length_one_whatever_the_model_said() -> None:
 
 
 def test_no_model_sees_which_new_road_it_is_or_the_seed() -> None:
-    start = scene()
-    other = start.clone()
-    other[:, -2:] = torch.tensor([5, 0])
+    start, other = scene(), scene(number=5)
     for view in VIEWS.values():
-        assert view.observe(start).shape == (1, 35)
-        assert torch.equal(view.observe(start), view.observe(other))
-        with pytest.raises(UserError, match="expected 37 numbers each, found 35"):
-            view.observe(start[:, :35])
+        assert {name: feature.shape for name, feature in view.features.items()} == {TRAFFIC: (35,)}
+        assert seen_in(view, start).shape == (1, 35)
+        assert torch.equal(seen_in(view, start), seen_in(view, other))
+    # The seed is part of a scene, of which nothing but what is observed reaches a model.
+    assert sum(feature.size for feature in DOMAIN.observed.values()) == 36
+    for number in (0, 99):
+        drawn_from = initial_states(torch.cat((start[TRAFFIC], torch.tensor([[NEW, number]])), dim=1))
+        assert same(drawn_from.observed, start)
 
 
 def test_a_drive_is_the_same_on_any_road() -> None:
@@ -124,5 +170,7 @@ def test_a_plan_is_followed_by_its_drives() -> None:
 
 
 def test_entities_are_the_other_vehicles() -> None:
-    assert [columns[0] for columns in DOMAIN.entities] == [7, 14, 21, 28]
-    assert {len(columns) for columns in DOMAIN.entities} == {7}
+    entities = DOMAIN.observed[TRAFFIC].entities
+    assert [columns[0] for columns in entities] == [7, 14, 21, 28]
+    assert {len(columns) for columns in entities} == {7}
+    assert DOMAIN.observed[SCENARIO].entities == ()

@@ -6,7 +6,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.domains.domain import domain_names, load_domain
 from ftl_lightning.domains.object_rearrangement.relations import (
     PER_SHAPE,
     SHAPES,
@@ -18,10 +17,16 @@ from ftl_lightning.domains.object_rearrangement.relations import (
     overlap,
     parse,
 )
+from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.errors import UserError
 
 DOMAIN = load_domain("object_rearrangement")
-TASKS = [task.goal for suite in ("training", "paper", "validation") for task in DOMAIN.suites[suite].tasks]
+SOURCE = DOMAIN.source(None)
+TASKS = [task.goal for suite in ("training", "paper", "validation") for task in DOMAIN.concepts.suites[suite].tasks]
+
+
+def succeeded(task: str, states: torch.Tensor) -> torch.Tensor:
+    return DOMAIN.metrics["accuracy"].measure(task, states, None)
 
 
 def scene(**shapes: tuple[float, float, float]) -> torch.Tensor:
@@ -34,32 +39,32 @@ def scene(**shapes: tuple[float, float, float]) -> torch.Tensor:
 
 
 def test_the_papers_numbers_of_concepts_and_tasks() -> None:
-    assert len(DOMAIN.training_concepts) == 12
-    count = {name: [task.setting for task in suite.tasks] for name, suite in DOMAIN.suites.items()}
-    assert {setting: count["paper"].count(setting) for setting in DOMAIN.suites["paper"].settings} == {
+    assert len(DOMAIN.concepts.training) == 12
+    count = {name: [task.setting for task in suite.tasks] for name, suite in DOMAIN.concepts.suites.items()}
+    assert {setting: count["paper"].count(setting) for setting in DOMAIN.concepts.suites["paper"].settings} == {
         "training composition": 5,
         "new concept": 5,
         "new + training": 5,
     }
     assert count["validation"].count("training composition") >= 6
-    learned = DOMAIN.suites["validation"].learned
-    assert not set(learned) & set(DOMAIN.suites["paper"].learned)
-    assert len(DOMAIN.suites["paper"].learned) == 10
+    learned = DOMAIN.concepts.suites["validation"].learned
+    assert not set(learned) & set(DOMAIN.concepts.suites["paper"].learned)
+    assert len(DOMAIN.concepts.suites["paper"].learned) == 10
 
 
 def test_the_training_set_is_the_papers_size_and_quick() -> None:
     start = time.perf_counter()
-    training = DOMAIN.training_set(920, 0)
+    training = SOURCE.split("train", 920, 0)
     assert time.perf_counter() - start < 10
     assert training.states.shape == (11_040, 1, 21)
-    assert torch.equal(training.states, DOMAIN.training_set(920, 0).states)
-    assert not torch.equal(training.states, DOMAIN.training_set(920, 1).states)
+    assert torch.equal(training.states, SOURCE.split("train", 920, 0).states)
+    assert not torch.equal(training.states, SOURCE.split("train", 920, 1).states)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_generated_scenes_show_the_task_and_nothing_else(task: str) -> None:
-    states = DOMAIN.generate(task, 20, 3).states
-    assert DOMAIN.succeeded(task, states).all()
+    states = SOURCE.draw(task, 20, 3).states
+    assert succeeded(task, states).all()
     flat = states[:, 0]
     assert not overlap(flat).any()
     x, y, radius = columns(flat)
@@ -77,9 +82,9 @@ def test_generated_scenes_show_the_task_and_nothing_else(task: str) -> None:
 
 def test_a_task_is_independent_of_others_and_of_the_count() -> None:
     task = "circle right of square"
-    training = DOMAIN.training_set(8, 5).select(task).states
-    assert torch.equal(DOMAIN.generate(task, 8, 5).states, training)
-    assert torch.equal(DOMAIN.generate(task, 4, 5).states, training[:4])
+    training = SOURCE.split("train", 8, 5).select(task).states
+    assert torch.equal(SOURCE.draw(task, 8, 5).states, training)
+    assert torch.equal(SOURCE.draw(task, 4, 5).states, training[:4])
 
 
 @pytest.mark.parametrize(
@@ -147,16 +152,16 @@ def test_an_unreadable_task_is_a_clear_error(task: str) -> None:
 
 def test_contradicting_relations_are_a_clear_error() -> None:
     with pytest.raises(UserError, match="0 of 3 scenes found"):
-        DOMAIN.generate("circle right of square and square right of circle", 3, 0)
+        SOURCE.draw("circle right of square and square right of circle", 3, 0)
 
 
-def test_domains_are_the_folders() -> None:
+def test_a_domain_is_found_by_its_name() -> None:
     assert "object_rearrangement" in domain_names()
-    with pytest.raises(UserError, match=r"domain: expected one of .*object_rearrangement.*, found 'chess'"):
+    with pytest.raises(UserError, match=r"expected one of .*object_rearrangement, or package.module:DOMAIN, found 'chess'"):
         load_domain("chess")
 
 
 def test_the_oracle_is_right_and_chance_is_not() -> None:
     for task in TASKS[::7]:
-        assert DOMAIN.succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, None, 0)).all()
-        assert DOMAIN.succeeded(task, DOMAIN.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5
+        assert succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, None, 0)).all()
+        assert succeeded(task, DOMAIN.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5

@@ -1,5 +1,6 @@
 """Closed loop: lock-step, replanning, plans that are not finite, independence of the batch."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -8,10 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import ddpm
+from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop
-from ftl_lightning.evaluation.closed_loop import Following, fixed_plans, roll_out, sampled_plans
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, reset, roll_out, sampled_plans
 from ftl_lightning.evaluation.tensorboard import gif
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
@@ -22,79 +27,118 @@ class Line(gymnasium.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         assert options is not None
-        self.x = np.array(options["initial_state"], dtype=np.float32)
-        return self.x.copy(), {}
+        self.x = np.array(options["scene"], dtype=np.float32)
+        return self.seen(), {}
+
+    def seen(self) -> dict[str, Any]:
+        picture = np.full((3, 2, 2), abs(int(self.x[0])) % 256, dtype=np.uint8)
+        return {"place": self.x.copy(), "picture": picture}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self.x[0] == 100:
             raise RuntimeError("the simulator broke")
         self.x = self.x + action
-        return self.x.copy(), 0.0, bool(self.x[0] > 3), False, {"x": float(self.x[0])}
+        return self.seen(), 0.0, bool(self.x[0] > 3), False, {"x": float(self.x[0])}
 
 
 LOOP = ClosedLoop(
     environment=Line,
-    act=lambda plans, step, observations: plans[:, step + 1] - observations,
+    act=lambda plans, step, observed: plans[:, step + 1] - observed["place"],
     steps=8,
-    judge=lambda goal, observations, infos: {"success": observations[:, -1, 0] > 3},
-    frames=lambda observations, plans: [],
+    judge=lambda goal, rollout: {"success": rollout.observed["place"][:, -1, 0] > 3},
+    film=lambda rollout, plans: [],
 )
 
 
-def ahead(observations: Tensor, rows: list[int]) -> Tensor:
+def begin(*places: float) -> InitialStates:
+    """Episodes that start from these places."""
+    return reset(LOOP, torch.tensor(places)[:, None])
+
+
+def ahead(observed: Observed, rows: list[int]) -> Tensor:
     """One unit a step from wherever one stands."""
-    return observations[:, None] + torch.arange(9)[None, :, None]
+    return observed["place"][:, None] + torch.arange(9)[None, :, None]
 
 
 @pytest.mark.parametrize("replan", [1, 3, 8])
 def test_plans_are_followed_until_the_environment_ends_an_episode(replan: int) -> None:
     calls = []
 
-    def plan(observations: Tensor, rows: list[int]) -> Tensor:
+    def plan(observed: Observed, rows: list[int]) -> Tensor:
         calls.append(list(rows))
-        return ahead(observations, rows)
+        return ahead(observed, rows)
 
-    policy = Following(plan, LOOP.act, replan)
-    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), policy)
-    assert found.observations[0, :, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 4, 4]  # padded with its last
-    assert found.observations[1, :, 0].tolist() == list(range(-9, 0))
+    policy = PlanFollower(plan, LOOP.act, replan)
+    found = roll_out(LOOP, begin(0.0, -9.0), policy)
+    assert found.observed["place"][0, :, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 4, 4]  # padded with its last
+    assert found.observed["place"][1, :, 0].tolist() == list(range(-9, 0))
     assert not found.failed.any()
     assert calls == [[0, 1] if start < 4 else [1] for start in range(0, 8, replan)]
     assert [int(plan[0, 0]) for plan in policy.followed[0]] == [step - step % replan for step in range(4)]
 
 
 def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
-    def plan(observations: Tensor, rows: list[int]) -> Tensor:
-        plans = ahead(observations, rows)
-        if observations[0, 0] == 2:
+    def plan(observed: Observed, rows: list[int]) -> Tensor:
+        plans = ahead(observed, rows)
+        if observed["place"][0, 0] == 2:
             plans[0, -1] = float("nan")
         return plans
 
-    found = roll_out(LOOP, torch.tensor([[0.0], [-9.0]]), Following(plan, LOOP.act, 1))
+    found = roll_out(LOOP, begin(0.0, -9.0), PlanFollower(plan, LOOP.act, 1))
     assert found.failed.tolist() == [True, False]
-    assert found.observations[0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
-    assert found.observations[1, -1, 0] == -1
+    assert found.observed["place"][0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
+    assert found.observed["place"][1, -1, 0] == -1
     assert "episode 0, step 2: the plan is not finite" in caplog.text
 
 
 def test_all_episodes_may_fail() -> None:
-    nowhere = Following(lambda observations, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
-    found = roll_out(LOOP, torch.zeros(2, 1), nowhere)
+    nowhere = PlanFollower(lambda observed, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
+    found = roll_out(LOOP, begin(0.0, 0.0), nowhere)
     assert found.failed.all()
-    assert (found.observations == 0).all()
+    assert (found.observed["place"] == 0).all()
 
 
 def test_an_episode_whose_simulator_raises_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
-    found = roll_out(LOOP, torch.tensor([[100.0], [-9.0]]), Following(ahead, LOOP.act, 1))
+    found = roll_out(LOOP, begin(100.0, -9.0), PlanFollower(ahead, LOOP.act, 1))
     assert found.failed.tolist() == [True, False]
     assert "episode 0, step 0: RuntimeError('the simulator broke')" in caplog.text
     assert [info.get("x") for info in found.infos] == [None, -1]
     assert [len(part.infos) for part in found.split([1, 1])] == [1, 1]
 
 
+def test_a_rollout_keeps_the_features_that_are_asked_for_and_parts_keep_their_own() -> None:
+    starts = begin(0.0, -9.0)
+    every = roll_out(LOOP, starts, PlanFollower(ahead, LOOP.act, 1))
+    assert every.observed["picture"].shape == (2, 9, 3, 2, 2)
+    assert every.observed["picture"].dtype == torch.uint8
+    assert every.observed["picture"][1, :, 0, 0, 0].tolist() == [9, 8, 7, 6, 5, 4, 3, 2, 1]
+    seen: list[set[str]] = []
+
+    def watched(plans: Tensor, step: int, observed: Observed) -> Tensor:
+        seen.append(set(observed))
+        return LOOP.act(plans, step, observed)
+
+    some = roll_out(replace(LOOP, keeps=("place",)), starts, PlanFollower(ahead, watched, 1))
+    assert set(some.observed) == {"place"}
+    assert torch.equal(some.observed["place"], every.observed["place"])
+    assert all(one == {"place", "picture"} for one in seen)  # a policy sees them all
+    first, second = every.split([1, 1])
+    assert first.starts.require_scenes().tolist() == [[0]]
+    assert second.starts.require_scenes().tolist() == [[-9]]
+    assert torch.equal(second.observed["picture"], every.observed["picture"][1:])
+
+
+def test_what_is_observed_at_a_start_comes_from_the_environment_unless_it_is_given() -> None:
+    found = begin(4.0, -2.0)
+    assert found.observed["place"].tolist() == [[4], [-2]]
+    assert found.observed["picture"][:, 0, 0, 0].tolist() == [4, 2]
+    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\)"):
+        roll_out(LOOP, InitialStates(found.observed), PlanFollower(ahead, LOOP.act, 1))
+
+
 def test_fixed_plans_are_chosen_by_episode() -> None:
     plans = torch.arange(3.0)[:, None, None]
-    assert fixed_plans(plans)(torch.zeros(2, 1), [2, 0]).flatten().tolist() == [2, 0]
+    assert fixed_plans(plans)({"place": torch.zeros(2, 1)}, [2, 0]).flatten().tolist() == [2, 0]
 
 
 def model() -> GenerativeModel:
@@ -103,7 +147,7 @@ def model() -> GenerativeModel:
         domain="agent",
         horizon=16,
         state_dim=1,
-        initial_state_dim=1,
+        observed={"place": Feature((1,))},
         concept_dim=6,
         training_concepts=("a", "b"),
         encoder="none",
@@ -112,26 +156,22 @@ def model() -> GenerativeModel:
         diffusion_steps=10,
     )
     limits = torch.tensor([-10.0]), torch.tensor([10.0])
-    return GenerativeModel(config, Normalization(*limits), torch.randn(3, 6), Normalization(*limits)).eval()
+    return GenerativeModel(config, load_domain("agent"), Normalization(*limits), torch.randn(3, 6), Normalization(*limits)).eval()
 
 
 def test_episodes_do_not_depend_on_their_neighbours() -> None:
     net = model()
-    starts = torch.linspace(-2, 2, 5)[:, None]
-    concepts = [torch.randn(k, 6, generator=generator("cpu", k)) for k in (1, 2, 1, 2, 1)]
-    weights = [torch.ones(len(one)) for one in concepts]
+    starts = begin(-2, -1, 0, 1, 2)
+    concepts = [Composition(torch.randn(k, 6, generator=generator("cpu", k)), torch.ones(k)) for k in (1, 2, 1, 2, 1)]
 
     def run(rows: list[int]) -> Tensor:
         plan = sampled_plans(
             net,
             [concepts[row] for row in rows],
-            [weights[row] for row in rows],
-            ddpm,
-            5,
-            0.5,
+            Sampling("ddpm", 5, 0.5),
             [generator("cpu", 0, row) for row in rows],
         )
-        return roll_out(LOOP, starts[rows], Following(plan, LOOP.act, 2)).observations
+        return roll_out(LOOP, starts.take(rows), PlanFollower(plan, LOOP.act, 2)).observed["place"]
 
     together = run([0, 1, 2, 3, 4])
     for rows in ([0], [3, 1], [4, 2, 0]):

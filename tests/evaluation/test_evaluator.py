@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,11 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.domains.domain import EvaluationTask, load_domain
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.domain import Domain, Metric
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import Judged, standard_error
@@ -26,10 +31,17 @@ class Trained:
     def __init__(self, model: GenerativeModel, seed: int = 0) -> None:
         self.model, self.hparams = model, {"seed": seed}
 
-    def composition(self, task: EvaluationTask) -> tuple[torch.Tensor, torch.Tensor] | None:
+    @property
+    def domain(self) -> Domain:
+        return self.model.domain
+
+    def demonstrated(self, concept: str) -> Demonstrations | None:
+        return None
+
+    def composition(self, task: EvaluationTask) -> Composition | None:
         if task.learned:
             return None
-        return torch.stack([self.model.concept(text) for text in task.texts]), torch.ones(len(task.texts))
+        return Composition(torch.stack([self.model.concept(text) for text in task.texts]), torch.ones(len(task.texts)))
 
     def concept_embeddings(self) -> dict[str, torch.Tensor]:
         return self.model.named_embeddings()
@@ -37,10 +49,50 @@ class Trained:
 
 def test_accuracy_is_the_share_of_right_samples() -> None:
     domain = load_domain("object_rearrangement")
-    task = domain.suites["training"].tasks[0]
-    good = domain.generate(task.goal, 3, 0).states
-    bad = domain.generate("square right of circle", 1, 0).states
+    task = domain.concepts.suites["training"].tasks[0]
+    source = domain.source(None)
+    good = source.draw(task.goal, 3, 0).states
+    bad = source.draw("square right of circle", 1, 0).states
     assert Judged.of(task, torch.cat((good, bad)), None, domain).values == {"accuracy": pytest.approx(0.75)}
+
+
+def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_may_be_better() -> None:
+    base = load_domain("object_rearrangement")
+    goals: list[str] = []
+
+    def distance(goal: str, states: torch.Tensor, starts: object) -> torch.Tensor:
+        goals.append(goal)
+        return states[:, 0, 0]
+
+    domain = replace(
+        base,
+        metrics={
+            "spread": Metric(lambda goal, states, starts: states.std(dim=0).mean(), identity="judge 1"),
+            "distance": Metric(distance, less_is_better=True),
+            "accuracy": base.metrics["accuracy"],
+        },
+        headline="distance",
+    )
+    task = base.concepts.suites["training"].tasks[0]
+    states = base.source(None).draw(task.goal, 4, 0).states
+    one = Judged.of(task, states, None, domain)
+    assert one.measured["spread"].shape == ()
+    assert one.measured["distance"].shape == (4,)
+    assert list(one.values) == ["spread", "distance", "accuracy"]
+    assert one.values["spread"] == pytest.approx(states.std(dim=0).mean().item())
+    assert one.values["distance"] == pytest.approx(states[:, 0, 0].mean().item())
+    assert one.values["accuracy"] == 1
+    assert goals == [task.goal]
+    assert one.right is not None
+    assert one.right.tolist() == [True] * 4  # a number of the whole set, or of a sample, does not say what is right
+    assert domain.main_metric == "spread"
+    assert [domain.less_is_better(name) for name in domain.metrics] == [False, True, False]
+    assert not domain.less_is_better("closed loop distance")  # there is no closed loop
+    assert Judged.of(task, states, None, replace(domain, metrics={"distance": Metric(distance, True)})).right is None
+    driving = load_domain("driving")
+    assert driving.less_is_better("closed loop crash")
+    assert not driving.less_is_better("closed loop success")
+    assert driving.main_metric == "closed loop success"
 
 
 def test_standard_error_over_tasks() -> None:
@@ -113,15 +165,14 @@ def test_a_foreign_results_file_is_refused(tmp_path: Path) -> None:
 def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable[..., Path]) -> None:
     log = invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[training, paper]")
     events = EventAccumulator(str(log), size_guidance={"images": 0, "scalars": 0}).Reload()
-    tags = events.Tags()
+    tested = EventAccumulator(str(log / "hparams")).Reload()
     assert len(events.Scalars("train/loss")) == 5
     for setting in ("training concept", "training composition", "new concept", "new + training"):
-        assert 0 <= events.Scalars(f"test/accuracy/{setting}")[0].value <= 1
-        assert f"test/standard error/{setting}" in tags["scalars"]
-    assert "test/accuracy/new concept/square diagonal to triangle" in tags["scalars"]
+        assert 0 <= tested.Scalars(f"accuracy/{setting}")[0].value <= 1
+    assert not [tag for tag in events.Tags()["scalars"] if tag.startswith("test/accuracy")]  # a test is no curve
     image = events.Images("new concept/square diagonal to triangle")[0]
     assert image.encoded_image_string.startswith(b"\x89PNG")
-    assert EventAccumulator(str(log / "hparams")).Reload().summary_metadata["_hparams_/session_start_info"]
+    assert tested.summary_metadata["_hparams_/session_start_info"]
     labels = next(log.rglob("metadata.tsv")).read_text().splitlines()
     assert "square diagonal to triangle [component 2]" in labels
     assert "(empty)" in labels
@@ -130,8 +181,8 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable
 
 def test_figures_frame_right_green_and_wrong_red(tmp_path: Path) -> None:
     domain = load_domain("object_rearrangement")
-    states = domain.generate("circle right of square", 2, 0).states
-    domain.render(states, [True, False], "two scenes").savefig(tmp_path / "f.png", dpi=100)
+    states = domain.source(None).draw("circle right of square", 2, 0).states
+    domain.show.picture(states, [True, False], "two scenes", None).savefig(tmp_path / "f.png", dpi=100)
     pixels = np.asarray(Image.open(tmp_path / "f.png").convert("RGB")).reshape(-1, 3).astype(int)
     for colour in ((46, 158, 70), (208, 58, 58)):
         assert (np.abs(pixels - colour).sum(axis=1) < 12).sum() > 200

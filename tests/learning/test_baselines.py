@@ -8,10 +8,12 @@ import torch
 from torch import nn
 
 from ftl_lightning.cli import main
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import SAMPLERS
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning.baselines.cloning import CloningConfig, CloningModel, ParallelMLP
@@ -24,7 +26,8 @@ from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
 
-AGENT = {"domain": "agent", "state_dim": 13, "initial_state_dim": 52, "state_columns": tuple(range(13)), "encoder": "e"}
+AGENT = {"domain": "agent", "state_dim": 13, "observed": {OBSERVED: FEATURE}, "encoder": "e"}
+DOMAIN = load_domain("agent")
 TEXTS = ("go to red object", "go to bowl")
 
 
@@ -35,22 +38,23 @@ def limits(columns: int) -> Normalization:
 def cloning(**changes: object) -> CloningModel:
     config = {**AGENT, "horizon": 6, "concept_dim": 5, "training_concepts": TEXTS, "view": "steps", "hidden_dim": 8} | changes
     torch.manual_seed(0)
-    return CloningModel(CloningConfig(**config), limits(13), torch.randn(3, 5), limits(52)).eval()  # type: ignore[arg-type]
+    return CloningModel(CloningConfig(**config), DOMAIN, limits(13), torch.randn(3, 5), limits(52)).eval()  # type: ignore[arg-type]
 
 
 def transformer() -> InContextModel:
     sizes = {"tokens": 3, "width": 16, "layers": 1, "heads": 2, "concept_dim": 3 * 65, "horizon": 6}
     torch.manual_seed(0)
     config = InContextConfig(**AGENT, **sizes, training_concepts=TEXTS, view="steps")  # type: ignore[arg-type]
-    return InContextModel(config, limits(13), torch.randn(3, 3 * 65), limits(52)).eval()
+    return InContextModel(config, DOMAIN, limits(13), torch.randn(3, 3 * 65), limits(52)).eval()
 
 
 def sampled(
-    model: ConceptModel, concepts: list[torch.Tensor], initial: torch.Tensor, count: int, temperature: float = 0.0
+    model: ConceptModel, concepts: list[torch.Tensor], initial: torch.Tensor | None, count: int, temperature: float = 0.0
 ) -> torch.Tensor:
-    weights = [torch.ones(len(own)) for own in concepts]
+    compositions = [Composition(own, torch.ones(len(own))) for own in concepts]
     draws = [generator("cpu", number) for number in range(len(concepts))]
-    return model.sample(concepts, weights, count, SAMPLERS["ddpm"], 1, temperature, draws, initial)
+    seen = None if initial is None else {OBSERVED: initial}
+    return model.sample(compositions, count, Sampling("ddpm", 1, temperature), draws, seen)
 
 
 def test_networks_side_by_side_are_the_networks_alone() -> None:
@@ -77,7 +81,7 @@ def test_plans_are_unrolled_state_by_state_and_straight_between(stride: int, cal
         return torch.stack((torch.zeros(2, 13), torch.full((2, 13), 0.1 * stride)), dim=1)
 
     initial = torch.randn(2, 52)
-    plans = unroll(model, predict, initial)
+    plans = unroll(model, predict, {OBSERVED: initial})
     expected = initial[:, None, :13] + 0.1 * torch.arange(10)[None, :, None]
     assert torch.allclose(plans, expected, atol=1e-5)
     assert len(seen) == called
@@ -85,16 +89,16 @@ def test_plans_are_unrolled_state_by_state_and_straight_between(stride: int, cal
 
 
 def test_a_plan_that_no_state_can_be_unrolled_from_is_refused() -> None:
-    with pytest.raises(UserError, match=r"model.plan_horizon: expected 2 states, and stride 1 \(initial states of domain agent"):
-        StepConfig(**(AGENT | {"state_columns": ()}), horizon=3, concept_dim=2, training_concepts=TEXTS)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"model.plan_horizon: expected 2 states, and stride 1 \(what domain agent observes"):
+        StepConfig(
+            **(AGENT | {"observed": {OBSERVED: replace(FEATURE, state=())}}), horizon=3, concept_dim=2, training_concepts=TEXTS
+        )  # type: ignore[arg-type]
 
 
 def test_the_view_in_steps_goes_there_and_back() -> None:
-    domain = load_domain("agent")
-    drives = domain.generate("go to bowl", 2, 0)
+    drives = DOMAIN.source(None).draw("go to bowl", 2, 0)
     states, initial = drives.windows(torch.tensor([0, 1]), torch.tensor([0, 7]), 16)
-    assert initial is not None
-    view = domain.views["steps"]
+    view = DOMAIN.views["steps"]
     steps = view.encode(states, initial)
     assert torch.allclose(steps[:, 0], torch.zeros(2, 13), atol=1e-6)
     assert torch.allclose(steps[:, 3], states[:, 3] - states[:, 2])
@@ -114,11 +118,11 @@ def test_the_vae_composes_by_adding_and_its_noise_is_the_temperatures() -> None:
     config = {"domain": "object_rearrangement", "state_dim": 21, "encoder": "e", "horizon": 1, "concept_dim": 4, "hidden_dim": 8}
     torch.manual_seed(0)
     config = VAEConfig(**config, training_concepts=("a", "b"))  # type: ignore[arg-type]
-    model = VAEModel(config, limits(21), torch.randn(3, 4)).eval()
-    both = sampled(model, [torch.stack((model.concept("a"), model.concept("b")))], None, 3)  # type: ignore[arg-type]
-    alone = model.plans((model.concept("a") + model.concept("b"))[None], None)
-    assert torch.allclose(both[0], model.decode(alone, None).expand(3, -1, -1), atol=1e-6)
-    assert sampled(model, [model.concept("a")[None]], None, 3, temperature=0.5).std(dim=1).max() > 1e-3  # type: ignore[arg-type]
+    model = VAEModel(config, load_domain("object_rearrangement"), limits(21), torch.randn(3, 4)).eval()
+    both = sampled(model, [torch.stack((model.concept("a"), model.concept("b")))], None, 3)
+    alone = model.plans((model.concept("a") + model.concept("b"))[None], {})
+    assert torch.allclose(both[0], model.decode(alone, {}).expand(3, -1, -1), atol=1e-6)
+    assert sampled(model, [model.concept("a")[None]], None, 3, temperature=0.5).std(dim=1).max() > 1e-3
 
 
 def test_in_context_reads_only_the_demonstrations_that_are_given() -> None:
@@ -141,11 +145,10 @@ def test_bins_are_even_and_hold_what_goes_beyond() -> None:
 def test_prompts_hold_what_was_seen_and_what_followed() -> None:
     model = transformer()
     model.config = replace(model.config, stride=2)
-    drive = load_domain("agent").generate("go to bowl", 1, 0)
+    drive = DOMAIN.source(None).draw("go to bowl", 1, 0)
     prompt = model.prompts(drive).unflatten(-1, (3, 65))[0]
-    assert drive.initial_states is not None
     for token, time in enumerate((0, 2, 4)):
-        assert torch.allclose(prompt[token, :52], drive.initial_states[0, time], atol=1e-5)
+        assert torch.allclose(prompt[token, :52], drive.observed[OBSERVED][0, time], atol=1e-5)
         assert torch.allclose(prompt[token, 52:], drive.states[0, time + 2] - drive.states[0, time], atol=1e-5)
 
 
@@ -174,10 +177,10 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
     concept = model.concept(model.config.training_concepts[0])
     assert concept.isfinite().all()
     assert concept.any()  # a VAE's and a transformer's are made after the fit, not left at zero
-    goal = load_domain(domain).suites["validation"].learned[0]
+    goal = load_domain(domain).concepts.suites["validation"].learned[0]
     demonstrations = [] if domain == "driving" else ["--data.suite=validation", "--data.demonstrations_per_concept=2"]
     if domain == "driving":  # its expert takes long; any drives will do
-        drives = load_domain(domain).training_set(2, 0).select("merge")
+        drives = load_domain(domain).source(None).split("train", 2, 0).select("merge")
         replace(drives, concepts=(goal,) * len(drives)).save("drives.safetensors")
         demonstrations = ["--data.demonstrations=drives.safetensors"]
     adapt = [*demonstrations, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
@@ -215,24 +218,24 @@ def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         f"--model.pretrained={ROOT / 'pretrained' / 'baseline' / 'in_context' / 'driving'}",
         "--data.demonstrations=drives.safetensors",
     ]
-    drives = load_domain("driving").training_set(2, 0).select("merge")
+    drives = load_domain("driving").source(None).split("train", 2, 0).select("merge")
     drives.save("drives.safetensors")
     assert main(["fit", "--config", adapt, *made, *QUIET]) == 2
     assert "expected invert (model.class_path: InContextAdaptation learns nothing), found fit" in capsys.readouterr().err
-    replace(drives, initial_states=drives.first_initial_states).save("drives.safetensors")
+    replace(drives, observed=drives.initial_states.observed, per_step=()).save("drives.safetensors")
     assert main(["invert", "--config", adapt, *made, *QUIET]) == 2
-    assert "key 'initial_states': expected one for each time" in capsys.readouterr().err
+    assert "key 'per_step': expected every feature to be observed at each time" in capsys.readouterr().err
 
 
 def test_short_windows_start_anywhere_and_long_ones_early() -> None:
-    domain = load_domain("agent")
-    assert [domain.start_power(window) for window in (2, 9, domain.horizon)] == [1.0, 1.0, 3.0]
+    plans = DOMAIN.plans
+    assert [plans.exponent(window) for window in (2, 9, plans.horizon)] == [1.0, 1.0, 3.0]
 
 
 def test_prompts_can_hide_the_road() -> None:
     model = load_model(ROOT / "pretrained" / "baseline" / "in_context" / "driving")
     assert isinstance(model, InContextModel)
-    drives = load_domain("driving").training_set(1, 0)
+    drives = load_domain("driving").source(None).split("train", 1, 0)
     shown, hidden = (model.prompts(drives, hide=hide).unflatten(-1, (model.config.tokens, -1)) for hide in (False, True))
     place = [0, 1, 2, 3]  # of what the view observes: place, and place with what is far squashed
     assert (hidden[..., place] == hidden[0, 0, place]).all()  # nowhere
@@ -274,11 +277,11 @@ def test_a_table_knows_no_new_sentences(tiny: Path) -> None:
 
 
 def test_tasks_are_told_in_the_papers_words() -> None:
-    sentence = load_domain("object_rearrangement").sentence
+    sentence = load_domain("object_rearrangement").concepts.sentence
     assert sentence("circle diagonal to triangle") == "circle right and above diagonally to triangle"
     assert (
         sentence("circle, triangle and square in a circle of radius 1.67")
         == "circle triangle and square in a circle of radius 1.67"
     )
     assert sentence("square diagonal to triangle and circle above square").endswith("to triangle and circle above square")
-    assert load_domain("agent").sentence("go to red bowl") == "go to red bowl"
+    assert DOMAIN.concepts.sentence("go to red bowl") == "go to red bowl"

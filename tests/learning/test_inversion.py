@@ -3,12 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from ftl_lightning.demonstrations.datamodule import InversionData
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule
+from ftl_lightning.learning.data import InversionData
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
@@ -35,12 +35,12 @@ def test_the_only_parameters_are_embeddings_and_weights_and_each_gets_a_gradient
     for omega, names in (("learned", {"embeddings", "weights"}), (1.2, {"embeddings"})):
         module = learn(tiny, omega=omega, components=3)
         trainable = {name: parameter for name, parameter in module.named_parameters() if parameter.requires_grad}
-        assert set(trainable) == names
+        assert set(trainable) == {f"inversion.{name}" for name in names}
         for parameter in trainable.values():
             assert parameter.grad is not None
             assert (parameter.grad.abs().flatten(2 if parameter.dim() == 3 else 1).amax(dim=-1) > 0).all()
         assert module.model.hash == before  # not one bit of the pretrained model has changed
-        assert (module.weights == 1.2).all() or omega == "learned"
+        assert (module.inversion.weights == 1.2).all() or omega == "learned"
 
 
 def test_learning_lowers_the_loss(tiny: Path) -> None:
@@ -54,7 +54,7 @@ def test_timesteps_are_even_or_mostly_noisy(tiny: Path, power: float, expected: 
     module = learn(tiny, timestep_power=power)
     seen: list[torch.Tensor] = []
     module.model.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[1]))
-    module._losses(2000, torch.Generator().manual_seed(0))
+    module.inversion.losses(2000, torch.Generator().manual_seed(0))
     t = torch.cat(seen)
     steps = len(module.model.alpha_bar)
     assert t.min() >= 0
@@ -80,11 +80,15 @@ def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
     everything.demonstrations.select(name).save(file)
     data = [InversionData("object_rearrangement", demonstrations=str(file), steps=6) for _ in range(2)]
     one, four = learn(tiny, data[0], initial_spread=1.0), learn(tiny, data[1], initial_spread=1.0, restarts=4)
-    assert torch.allclose(four.embeddings[:1], one.embeddings, atol=2e-4)  # the first restart is what there is without restarts
+    assert torch.allclose(
+        four.inversion.embeddings[:1], one.inversion.embeddings, atol=2e-4
+    )  # the first restart is what there is without restarts
     kept = four.learned()[name]
     with torch.no_grad():
-        losses = four._losses(5_000, torch.Generator().manual_seed(0)).mean(dim=1)  # on other noise than the choice was made on
-    best = four.embeddings.detach()[losses.argmin()]
+        losses = four.inversion.losses(5_000, torch.Generator().manual_seed(0)).mean(
+            dim=1
+        )  # on other noise than the choice was made on
+    best = four.inversion.embeddings.detach()[losses.argmin()]
     assert losses.max() - losses.min() > 0.01  # else there is nothing to choose
     assert torch.equal(kept.embeddings, best)
     assert kept.origin.loss <= one.learned()[name].origin.loss + 1e-4
@@ -94,7 +98,7 @@ def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
 def test_the_span_form_stays_in_the_span(tiny: Path, off_span: float, inside: bool) -> None:
     module = learn(tiny, off_span=off_span)
     training = module.model.training_embeddings
-    found = module.parametrised.detach().flatten(0, 1)
+    found = module.inversion.parametrised.detach().flatten(0, 1)
     solution = torch.linalg.lstsq(training.T.double(), found.T.double()).solution
     outside = (training.T.double() @ solution - found.T).norm() / found.norm()
     assert (outside < 1e-3) == inside
@@ -121,7 +125,7 @@ def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: P
     (file,) = (log / "concepts").iterdir()
     assert Concept.load(file).origin.weights == "learned"
     rows = read_rows(log / "results.csv")
-    assert rows.loc[rows["setting"] == "own demonstrations", "task"].tolist() == [task] * 3  # ours and two reference lines
+    assert rows[["setting", "task", "role"]].to_numpy().tolist() == [["own demonstrations", task, "method"]]  # judged alone
     options = [f"--pretrained={tiny}", f"--concept={file}", "--compose=circle above square:1.2", "--count=4", "--steps=3"]
     assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors", "--figure=states.png"]) == 0
     assert "accuracy on" in capsys.readouterr().out
