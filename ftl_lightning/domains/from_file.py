@@ -26,9 +26,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Show, Split
-from ftl_lightning.domains.line_plots import film, picture
-from ftl_lightning.domains.tasks import training_suite
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import generator
 
@@ -102,12 +100,9 @@ def own_domain(
         plans=Plans(horizon, examples.state_names, examples.state_units),
         concepts=Concepts(
             training=tuple(training),
-            suites={"training": training_suite(tuple(training))},
-            descriptions=tuple(training),
             reads=lambda text: text in texts,
         ),
         source=lambda root: every,
-        show=Show(picture=picture(examples.state_names), film=film if examples.states.shape[2] in (2, 3) else None),
         observed=examples.features,
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
         headline=next(iter(metrics), ""),
