@@ -1,4 +1,4 @@
-"""Pen strokes in the plane: six kinds for pretraining, two new ones to learn from five strokes each."""
+"""Pen strokes in the plane: six kinds for pretraining, and two new ones to learn from five strokes each."""
 
 from math import pi
 
@@ -11,46 +11,39 @@ from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.seeding import generator, task_key
 
-NAME, PLANS = "strokes", Plans(horizon=32, columns=("x", "y"), units=("cm", "cm"))
-S = torch.linspace(0, 1, PLANS.horizon)  # the way along a stroke
-TURN = 2 * pi * S
-CURVES = {
-    "line": (2 * S - 1, 0.3 * (2 * S - 1)),
-    "arc": (-torch.cos(TURN / 2), torch.sin(TURN / 2)),
-    "circle": (torch.cos(TURN), torch.sin(TURN)),
-    "wave": (2 * S - 1, 0.5 * torch.sin(2 * TURN)),
-    "zigzag": (2 * S - 1, (8 * S % 2 - 1).abs() - 0.5),
-    "spiral": (S * torch.cos(2 * TURN), S * torch.sin(2 * TURN)),
-    "figure eight": (0.6 * torch.sin(2 * TURN), torch.cos(TURN)),
-    "hook": (torch.where(S < 0.5, 0.6, 0.6 * torch.cos(TURN - pi)), torch.where(S < 0.5, 1 - 2 * S, -0.6 * torch.sin(TURN - pi))),
+PLANS = Plans(horizon=32, columns=("x", "y"), units=("cm", "cm"))
+S = torch.linspace(0, 1, PLANS.horizon)  # the way along a stroke; points are complex numbers x + iy
+KNOWN = {
+    "line": (1 + 0.3j) * (2 * S - 1),
+    "arc": -torch.exp(-1j * pi * S),
+    "circle": torch.exp(2j * pi * S),
+    "wave": 2 * S - 1 + 0.5j * torch.sin(4 * pi * S),
+    "zigzag": 2 * S - 1 + 1j * (8 * S % 2 - 1).abs() - 0.5j,
+    "spiral": S * torch.exp(4j * pi * S),
 }
-NEW = ("figure eight", "hook")
-TRAINING = tuple(kind for kind in CURVES if kind not in NEW)
+NEW = {
+    "figure eight": 0.6 * torch.sin(4 * pi * S) + 1j * torch.cos(2 * pi * S),
+    "hook": torch.where(S < 0.5, 0.6 + 1j - 2j * S, -0.6 * torch.exp(2j * pi * S).conj()),
+}
+CURVES = KNOWN | NEW
 
 
 def draw(kind: str, count: int, seed: int) -> Tensor:
-    """Strokes ``(count, 32, 2)`` of a kind that differ in size, slant and place."""
-    rng = generator("cpu", seed, task_key(kind))
-    size, angle, place = (torch.rand(count, 1, 1, columns, generator=rng)[:, 0] for columns in (1, 1, 2))
-    x, y = torch.stack(CURVES[kind]).expand(count, 2, -1).unbind(dim=1)
-    angle = 0.5 * angle[..., 0] - 0.25
-    turned = torch.stack((x * angle.cos() - y * angle.sin(), x * angle.sin() + y * angle.cos()), dim=-1)
-    return (1 + size) * turned + 2 * place - 1
+    """Strokes ``(count, 32, 2)`` of one kind that differ in size, slant and place."""
+    size, slant, x, y = torch.rand(4, count, 1, generator=generator("cpu", seed, task_key(kind)))
+    points = (1 + size) * torch.exp(0.5j * (slant - 0.5)) * CURVES[kind] + 2 * torch.complex(x, y) - (1 + 1j)
+    return torch.view_as_real(points)
 
 
 def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether each stroke is near the goal's curve, and nearer to it than to any other, whatever its size and place."""
-    curves = torch.stack([torch.stack(curve, dim=-1) for curve in CURVES.values()])
-    found, known = (one - one.mean(dim=1, keepdim=True) for one in (states, curves))
-    found, known = (one / one.square().mean(dim=(1, 2), keepdim=True).sqrt() for one in (found, known))
-    apart = (found[:, None] - known).square().mean(dim=(2, 3)).sqrt()
+    """Whether strokes ``(sample, 32, 2)`` are like the goal's curve, and more so than like any other, whatever size and place."""
+    curves = torch.stack(tuple(CURVES.values()))
+    centred = [points - points.mean(dim=1, keepdim=True) for points in (torch.view_as_complex(states.contiguous()), curves)]
+    found, known = (points / points.abs().square().mean(dim=1, keepdim=True).sqrt() for points in centred)
+    apart = (found[:, None] - known).abs().square().mean(dim=2).sqrt()  # (sample, curve)
     return (apart.argmin(dim=1) == list(CURVES).index(goal)) & (apart.amin(dim=1) < 0.4)
 
 
-DOMAIN = Domain(
-    name=NAME,
-    plans=PLANS,
-    concepts=Concepts(TRAINING, few_shot_suites(TRAINING, NEW)),
-    source=lambda root: Generated(NAME, PLANS, TRAINING, draw),
-    metrics={"accuracy": Metric(recognised)},
-)
+CONCEPTS = Concepts(tuple(KNOWN), few_shot_suites(tuple(KNOWN), tuple(NEW)))
+SOURCE = Generated("strokes", PLANS, CONCEPTS.training, draw)
+DOMAIN = Domain("strokes", PLANS, CONCEPTS, lambda root: SOURCE, metrics={"accuracy": Metric(recognised)})
