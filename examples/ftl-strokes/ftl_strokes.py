@@ -1,4 +1,4 @@
-"""Pen strokes in the plane: six kinds for pretraining, and two new ones to learn from five strokes each."""
+"""Pen strokes in the plane: four shapes drawn four ways, of which two are new and learned from five strokes each."""
 
 from math import pi
 
@@ -13,19 +13,16 @@ from ftl_lightning.seeding import generator, task_key
 
 PLANS = Plans(horizon=32, columns=("x", "y"), units=("cm", "cm"))
 S = torch.linspace(0, 1, PLANS.horizon)  # the way along a stroke; points are complex numbers x + iy
-KNOWN = {
-    "line": (1 + 0.3j) * (2 * S - 1),
+SHAPES = {
+    "line": 2 * S - 1 + 0j,
     "arc": -torch.exp(-1j * pi * S),
-    "circle": torch.exp(2j * pi * S),
     "wave": 2 * S - 1 + 0.5j * torch.sin(4 * pi * S),
     "zigzag": 2 * S - 1 + 1j * (8 * S % 2 - 1).abs() - 0.5j,
-    "spiral": S * torch.exp(4j * pi * S),
 }
-NEW = {
-    "figure eight": 0.6 * torch.sin(4 * pi * S) + 1j * torch.cos(2 * pi * S),
-    "hook": torch.where(S < 0.5, 0.6 + 1j - 2j * S, -0.6 * torch.exp(2j * pi * S).conj()),
-}
-CURVES = KNOWN | NEW
+WAYS = {"rightwards": 1, "upwards": 1j, "leftwards": -1, "downwards": -1j}
+CURVES = {f"{shape} {way}": turn * curve for shape, curve in SHAPES.items() for way, turn in WAYS.items()}
+NEW = ("wave upwards", "zigzag leftwards")
+KNOWN = tuple(kind for kind in CURVES if kind not in NEW)
 
 
 def draw(kind: str, count: int, seed: int) -> Tensor:
@@ -44,6 +41,6 @@ def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
     return (apart.argmin(dim=1) == list(CURVES).index(goal)) & (apart.amin(dim=1) < 0.4)
 
 
-CONCEPTS = Concepts(tuple(KNOWN), few_shot_suites(tuple(KNOWN), tuple(NEW)))
-SOURCE = Generated("strokes", PLANS, CONCEPTS.training, draw)
+CONCEPTS = Concepts(KNOWN, few_shot_suites(KNOWN, NEW))
+SOURCE = Generated("strokes", PLANS, KNOWN, draw)
 DOMAIN = Domain("strokes", PLANS, CONCEPTS, lambda root: SOURCE, metrics={"accuracy": Metric(recognised)})

@@ -28,6 +28,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.errors import UserError
+from ftl_lightning.inputs import MINARI
 from ftl_lightning.seeding import generator
 
 OWN = "own"
@@ -146,9 +147,11 @@ def read_own(path: str) -> Demonstrations:
         UserError: naming it, if it is missing or damaged.
     """
     file = Path(path)
-    if file.suffix in (".npz", ".safetensors") or file.exists() or importlib.util.find_spec("minari") is None:
+    if file.suffix in (".npz", ".safetensors") or file.exists() or not MINARI.fullmatch(path):
         return Demonstrations.load(file).named(file.stem)
-    from ftl_lightning.demonstrations.minari import read_minari  # an extra
+    if importlib.util.find_spec("minari") is None:
+        raise UserError(f"{path}: expected a file, found the name of a Minari data set, which needs the extra 'minari'")
+    from ftl_lightning.demonstrations.minari import read_minari
 
     return read_minari(path)
 

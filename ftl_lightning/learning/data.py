@@ -235,8 +235,8 @@ class InversionData(pl.LightningDataModule):
     Args:
         domain: name of the domain, or ``package.module:DOMAIN``; ``'own'`` for a user's own data.
         suite: the concepts of this suite of the domain are learned, from demonstrations drawn from the seed.
-        demonstrations: a file of your own instead (safetensors or npz). Its concept texts name the concepts to learn;
-            demonstrations without a text belong to one concept named after the file.
+        demonstrations: a file of your own instead (safetensors or npz), or the name of an installed Minari data set. Its concept
+            texts name the concepts to learn; demonstrations without a text belong to one concept named after the file.
         demonstrations_per_concept: how many are drawn; the paper's number is 5.
         seed: decides the demonstrations that are drawn.
         steps: gradient steps, which is the length of the one epoch.
@@ -272,7 +272,7 @@ class InversionData(pl.LightningDataModule):
         elif demonstrations is None:
             self.demonstrations = self._drawn(load_domain(domain), suite, demonstrations_per_concept, root)
         else:
-            self.demonstrations = read_demonstrations(Path(demonstrations), load_domain(domain))
+            self.demonstrations = read_demonstrations(demonstrations, load_domain(domain))
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int, root: str | None) -> Demonstrations:
@@ -293,19 +293,19 @@ class InversionData(pl.LightningDataModule):
     val_dataloader = test_dataloader
 
 
-def read_demonstrations(path: Path, domain: Domain) -> Demonstrations:
-    """A file of a domain's demonstrations; those without a text are named after the file.
+def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
+    """A file or Minari data set of a domain's demonstrations; those without a text are named after it.
 
     Raises:
-        UserError: naming the file, if it does not fit the domain.
+        UserError: naming it, if it does not fit the domain.
     """
-    found = Demonstrations.load(path)
+    found = read_own(path)
     columns = len(domain.plans.columns)
     if found.domain not in ("", domain.name):
         raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {found.domain!r}")
     if found.states.shape[2] != columns:
         raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(found.states.shape)}")
     try:
-        return found.fitted(domain.observed).named(path.stem)
+        return found.fitted(domain.observed)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
