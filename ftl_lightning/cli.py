@@ -86,14 +86,8 @@ def _dispatch(arguments: list[str]) -> None:
 
         commands = importlib.import_module("ftl_lightning.commands")
         function, kind = getattr(commands, verb), getattr(commands, f"{verb.capitalize()}Options", None)
-        program = f"python -m ftl_lightning {verb}"
-        read: dict[str, Any] = {
-            "args": expanded(arguments[1:]),
-            "as_positional": verb in POSITIONAL,
-            "prog": program,
-            "exit_on_error": False,
-        }
-        found = auto_cli(kind or function, **read)
+        options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
+        found = auto_cli(kind or function, args=expanded(arguments[1:]), exit_on_error=False, **options)
         if kind:  # options in a class of their own
             function(found)
     elif verb in TRAINER_VERBS:

@@ -1,5 +1,6 @@
 """The verbs that need no trainer: plain typed functions. Their imports are inside, so that each starts at once."""
 
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -28,7 +29,7 @@ def generate(
         count: demonstrations of the task, or of each training concept.
         seed: the same seed gives the same bytes.
         workers: processes, in domains whose expert takes long; a run that was stopped goes on where it was.
-        out: file to write.
+        out: file to write, or "minari:NAME" for a Minari data set (the extra "minari"), such as "minari:strokes/test-v0".
         root: folder of your copy of the data, for domains whose demonstrations do not ship.
     """
     from ftl_lightning.domains.registry import load_domain
@@ -40,11 +41,19 @@ def generate(
         raise UserError(f"seed: expected 0 or more, found {seed}")
     if workers < 1:
         raise UserError(f"workers: expected 1 or more, found {workers}")
+    name = out.removeprefix("minari:")
+    if name != out and importlib.util.find_spec("minari") is None:
+        raise UserError(f"out: expected a file, found the Minari data set {name!r}, which needs the extra 'minari'")
     found = load_domain(domain)
     source = found.source(Path(root) if root else None)
     demonstrations = source.draw(task, count, seed, workers) if task else source.split("train", count, seed)
-    demonstrations.save(out)
-    print(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
+    if name != out:
+        from ftl_lightning.demonstrations.minari import write_minari
+
+        write_minari(demonstrations, name)
+    else:
+        demonstrations.save(out)
+    print(f"{name}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
 
 
 def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: str = "") -> None:

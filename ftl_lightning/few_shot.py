@@ -14,7 +14,7 @@ from torch import Tensor
 from ftl_lightning.concepts.composition import Composition, parse_composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import Explanation, explain
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.container import Demonstrations, padded
 from ftl_lightning.demonstrations.features import Feature, InitialStates
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop, Domain
@@ -510,10 +510,7 @@ def _padded(values: Any) -> tuple[Tensor, Tensor]:
     if not isinstance(values, Tensor | np.ndarray):
         each = [_tensor(one) for one in values]
         if each and each[0].dim() and len({len(one) for one in each}) > 1:
-            lengths = torch.tensor([len(one) for one in each])
-            longest = int(lengths.max())
-            last = [one[-1:].expand(longest - len(one), *one.shape[1:]) for one in each]
-            return torch.stack([torch.cat(pair) for pair in zip(each, last, strict=True)]), lengths
+            return padded(each)
         values = torch.stack(each)
     found = _tensor(values)
     return found, torch.full((len(found),), found.shape[1] if found.dim() > 1 else 1)

@@ -1,5 +1,7 @@
 """Randomness as a function of a key: nothing depends on what was drawn before, so a resumed run repeats the unbroken one."""
 
+import zlib
+
 import numpy as np
 import torch
 
@@ -20,3 +22,8 @@ def generator(device: torch.device | str, *key: int) -> torch.Generator:
     """
     seed = int(np.random.SeedSequence(key).generate_state(1)[0])
     return torch.Generator(device=device).manual_seed(seed)
+
+
+def task_key(task: str) -> int:
+    """A task as part of a key: the same number on every machine, and hardly ever another task's."""
+    return zlib.crc32(task.encode())

@@ -277,6 +277,20 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
     )
 
 
+def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Behaviours of different lengths as one tensor.
+
+    Args:
+        behaviours: ``(time, ...)`` each, of at least one time.
+
+    Returns:
+        ``(demo, longest time, ...)``, each padded with its last time, and the lengths ``(demo,)`` int64.
+    """
+    lengths = torch.tensor([len(one) for one in behaviours])
+    longest = int(lengths.max())
+    return torch.cat([_padded(one[None], longest) for one in behaviours]), lengths
+
+
 def _padded(values: Tensor, time: int) -> Tensor:
     """``(demo, time, ...)`` with its last time repeated."""
     last = values[:, -1:].expand(-1, time - values.shape[1], *(-1,) * (values.dim() - 2))

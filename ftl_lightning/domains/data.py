@@ -17,7 +17,7 @@ from ftl_lightning.concepts.encoder import Encoder, load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
-from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
 
@@ -55,7 +55,8 @@ class PretrainingData(pl.LightningDataModule):
     """Batches of (behaviour, concept) pairs of a domain. A subclass may name the domain.
 
     Args:
-        domain: name of the domain, see :func:`ftl_lightning.domains.registry.load_domain`; empty for the class's own.
+        domain: name of the domain, or ``package.module:DOMAIN``, see :func:`ftl_lightning.domains.registry.load_domain`; empty
+            for the class's own.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
         samples_per_concept: demonstrations of each training concept.
         validation_per_concept: others of each, for the validation loss.
@@ -94,7 +95,7 @@ class PretrainingData(pl.LightningDataModule):
         self.save_hyperparameters()
         if self.own_domain and domain not in ("", self.own_domain):
             raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
-        self.domain = self._domain(self.own_domain or domain)
+        self.domain_name, self.domain = self._domain(self.own_domain or domain)
         self._number = {text: number for number, text in enumerate(self.domain.concepts.training)}
         self.metrics: Mapping[str, float] = {}
         self.horizon = self.domain.plans.horizon if horizon is None else horizon
@@ -119,8 +120,9 @@ class PretrainingData(pl.LightningDataModule):
         self.steps_per_epoch = steps_per_epoch
         self.encoder: Encoder = load_encoder(encoder, self.domain.concepts.table, revision)
 
-    def _domain(self, name: str) -> Domain:
-        return load_domain(name)
+    def _domain(self, name: str) -> tuple[str, Domain]:
+        """The domain and the name by which a model knows it."""
+        return recorded_name(name), load_domain(name)
 
     def setup(self, stage: str) -> None:
         source = self.domain.source(self.root)
@@ -218,8 +220,8 @@ class OwnData(PretrainingData):
         self.save_hyperparameters()
         self.metrics = self._metrics
 
-    def _domain(self, name: str) -> Domain:
-        return domain_from_file(self._file, self._asked, self._metrics, self._share)
+    def _domain(self, name: str) -> tuple[str, Domain]:
+        return OWN, domain_from_file(self._file, self._asked, self._metrics, self._share)
 
     @property
     def examples(self) -> Demonstrations:
@@ -231,10 +233,10 @@ class InversionData(pl.LightningDataModule):
     """A few demonstrations of each new concept, learned together.
 
     Args:
-        domain: name of the domain; ``'own'`` for a user's own data.
+        domain: name of the domain, or ``package.module:DOMAIN``; ``'own'`` for a user's own data.
         suite: the concepts of this suite of the domain are learned, from demonstrations drawn from the seed.
-        demonstrations: a file of your own instead (safetensors or npz). Its concept texts name the concepts to learn;
-            demonstrations without a text belong to one concept named after the file.
+        demonstrations: a file of your own instead (safetensors or npz), or the name of an installed Minari data set. Its concept
+            texts name the concepts to learn; demonstrations without a text belong to one concept named after the file.
         demonstrations_per_concept: how many are drawn; the paper's number is 5.
         seed: decides the demonstrations that are drawn.
         steps: gradient steps, which is the length of the one epoch.
@@ -262,7 +264,7 @@ class InversionData(pl.LightningDataModule):
         self.seed = seed
         self.steps = steps
         self.own = demonstrations is not None
-        self.domain_name = domain
+        self.domain_name = domain if domain == OWN else recorded_name(domain)
         if demonstrations is None and domain == OWN:
             raise UserError("data.demonstrations: expected a file of the new concepts' demonstrations, found none")
         if domain == OWN:
@@ -270,7 +272,7 @@ class InversionData(pl.LightningDataModule):
         elif demonstrations is None:
             self.demonstrations = self._drawn(load_domain(domain), suite, demonstrations_per_concept, root)
         else:
-            self.demonstrations = read_demonstrations(Path(demonstrations), load_domain(domain))
+            self.demonstrations = read_demonstrations(demonstrations, load_domain(domain))
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int, root: str | None) -> Demonstrations:
@@ -291,19 +293,19 @@ class InversionData(pl.LightningDataModule):
     val_dataloader = test_dataloader
 
 
-def read_demonstrations(path: Path, domain: Domain) -> Demonstrations:
-    """A file of a domain's demonstrations; those without a text are named after the file.
+def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
+    """A file or Minari data set of a domain's demonstrations; those without a text are named after it.
 
     Raises:
-        UserError: naming the file, if it does not fit the domain.
+        UserError: naming it, if it does not fit the domain.
     """
-    found = Demonstrations.load(path)
+    found = read_own(path)
     columns = len(domain.plans.columns)
     if found.domain not in ("", domain.name):
         raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {found.domain!r}")
     if found.states.shape[2] != columns:
         raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(found.states.shape)}")
     try:
-        return found.fitted(domain.observed).named(path.stem)
+        return found.fitted(domain.observed)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None

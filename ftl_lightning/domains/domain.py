@@ -1,4 +1,7 @@
-"""What a domain is: one object in a few groups. Adding a domain adds such an object, here or in a package of one's own."""
+"""What a domain is: one object in a few groups. Adding a domain adds such an object, here or in a package of one's own.
+
+Name, plans, concepts and source have to be said; everything else has a default.
+"""
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
@@ -14,9 +17,10 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
+from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tasks import Suite
+from ftl_lightning.domains.tasks import Suite, training_suite
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,6 +58,11 @@ class Plans:
         return self.start_exponent if window >= self.horizon else 1.0
 
 
+def _described(text: str) -> bool:
+    """Stands for the default of :attr:`Concepts.reads`, which depends on the descriptions."""
+    raise NotImplementedError
+
+
 @dataclass(frozen=True)
 class Concepts:
     """The behaviour's concepts, in words.
@@ -61,19 +70,29 @@ class Concepts:
     Attributes:
         training: descriptions of the behaviours of pretraining.
         suites: what is evaluated, by name: ``'training'`` (training concepts), ``'paper'`` (final evaluation only),
-            ``'validation'`` (for tuning), or any other.
-        descriptions: every text that the table of embeddings holds besides the empty one.
-        reads: whether a text is a goal that behaviour can be judged by.
+            ``'validation'`` (for tuning), or any other. Without any, the training concepts alone.
+        descriptions: every text that the table of embeddings holds besides the empty one; without any, the training concepts and
+            the suites' goals.
+        reads: whether a text is a goal that behaviour can be judged by; by default, whether it is one of the descriptions.
         sentence: how a goal is told to a language model.
         table: file of the embeddings of all descriptions, made by ``encode``; ``None`` where none ships.
     """
 
     training: tuple[str, ...]
-    suites: Mapping[str, Suite]
-    descriptions: tuple[str, ...]
-    reads: Callable[[str], bool]
+    suites: Mapping[str, Suite] = field(default_factory=dict)
+    descriptions: tuple[str, ...] = ()
+    reads: Callable[[str], bool] = _described
     sentence: Callable[[str], str] = str
     table: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not self.suites:
+            object.__setattr__(self, "suites", {"training": training_suite(self.training)})
+        if not self.descriptions:
+            texts = dict.fromkeys((*self.training, *(goal for suite in self.suites.values() for goal in suite.goals)))
+            object.__setattr__(self, "descriptions", tuple(texts))
+        if self.reads is _described:
+            object.__setattr__(self, "reads", frozenset(self.descriptions).__contains__)
 
 
 def deferred(reference: str) -> Callable[..., Any]:
@@ -130,6 +149,18 @@ class Show:
 
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
+
+
+def line_drawings(plans: Plans) -> Show:
+    """Pictures of behaviour of which nothing but its columns is known, see :mod:`ftl_lightning.domains.line_plots`.
+
+    Paths in two or three dimensions are also filmed.
+    """
+    return Show(line_plots.picture(plans.columns), line_plots.film if len(plans.columns) in (2, 3) else None)
+
+
+_LINES = Show(line_plots.picture(()))
+"""Stands for the default of :attr:`Domain.show`, which depends on the plans."""
 
 
 Policy = Callable[[Observed, list[int], int], Tensor]
@@ -194,11 +225,11 @@ class Domain:
     """A domain.
 
     Attributes:
-        name: as in ``load_domain``.
+        name: the one under which its package offers it, see :func:`ftl_lightning.domains.registry.load_domain`.
         plans: the behaviour that is generated.
         concepts: what it is told by.
         source: makes the source of demonstrations, given the folder of a user's data or ``None``.
-        show: pictures of it.
+        show: pictures of it; by default :func:`line_drawings`.
         observed: features that a plan is conditioned on, by name; empty where behaviour has no initial state.
         metrics: of plans, by name; the first is what ablations are about. None where only what comes of plans is judged.
         headline: what methods are compared by, task for task: a metric's name, or ``'closed loop '`` and an outcome's.
@@ -213,7 +244,7 @@ class Domain:
     plans: Plans
     concepts: Concepts
     source: Callable[[Path | None], Source]
-    show: Show
+    show: Show = _LINES
     observed: Mapping[str, Feature] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
     headline: str = ACCURACY
@@ -221,6 +252,10 @@ class Domain:
     views: Mapping[str, View] = field(default_factory=dict)
     closed_loop: ClosedLoop | None = None
     paper: Paper | None = None
+
+    def __post_init__(self) -> None:
+        if self.show is _LINES:
+            object.__setattr__(self, "show", line_drawings(self.plans))
 
     @property
     def main_metric(self) -> str:

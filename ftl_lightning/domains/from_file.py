@@ -26,10 +26,9 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Show, Split
-from ftl_lightning.domains.line_plots import film, picture
-from ftl_lightning.domains.tasks import training_suite
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.errors import UserError
+from ftl_lightning.inputs import MINARI
 from ftl_lightning.seeding import generator
 
 OWN = "own"
@@ -102,12 +101,9 @@ def own_domain(
         plans=Plans(horizon, examples.state_names, examples.state_units),
         concepts=Concepts(
             training=tuple(training),
-            suites={"training": training_suite(tuple(training))},
-            descriptions=tuple(training),
             reads=lambda text: text in texts,
         ),
         source=lambda root: every,
-        show=Show(picture=picture(examples.state_names), film=film if examples.states.shape[2] in (2, 3) else None),
         observed=examples.features,
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
         headline=next(iter(metrics), ""),
@@ -151,9 +147,11 @@ def read_own(path: str) -> Demonstrations:
         UserError: naming it, if it is missing or damaged.
     """
     file = Path(path)
-    if file.suffix in (".npz", ".safetensors") or file.exists() or importlib.util.find_spec("minari") is None:
+    if file.suffix in (".npz", ".safetensors") or file.exists() or not MINARI.fullmatch(path):
         return Demonstrations.load(file).named(file.stem)
-    from ftl_lightning.demonstrations.minari import read_minari  # an extra
+    if importlib.util.find_spec("minari") is None:
+        raise UserError(f"{path}: expected a file, found the name of a Minari data set, which needs the extra 'minari'")
+    from ftl_lightning.demonstrations.minari import read_minari
 
     return read_minari(path)
 

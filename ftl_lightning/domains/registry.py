@@ -34,3 +34,19 @@ def load_domain(name: str) -> Domain:
     if not isinstance(found, Domain):
         raise UserError(f"domain {name!r}: expected a Domain, found {type(found).__name__}")
     return found
+
+
+def recorded_name(name: str) -> str:
+    """The name by which files know a domain: the one under which a package offers it or, where none does, the one given.
+
+    So a model finds the domain again, and where a package offers the domain both ways of naming it mean the same.
+
+    Args:
+        name: as of :func:`load_domain`.
+
+    Raises:
+        UserError: as of :func:`load_domain`.
+    """
+    domain = load_domain(name)
+    offered = (other for other in domain_names() if other == name or (other == domain.name and load_domain(other) is domain))
+    return next(offered, name)

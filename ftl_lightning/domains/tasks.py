@@ -56,3 +56,11 @@ class Suite:
 def training_suite(concepts: tuple[str, ...]) -> Suite:
     """Each training concept, generated and judged by itself."""
     return Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in concepts))
+
+
+def few_shot_suites(training: tuple[str, ...], new: tuple[str, ...]) -> dict[str, Suite]:
+    """The suites ``'training'`` and ``'new'``: training concepts, and others that are learned from a few demonstrations each.
+
+    The goal of each is its own text.
+    """
+    return {"training": training_suite(training), "new": Suite(tuple(EvaluationTask("new concept", text, text) for text in new))}

@@ -11,7 +11,8 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
-from ftl_lightning.domains.from_file import own_domain
+from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.domains.registry import recorded_name
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -64,10 +65,9 @@ class Adaptation(pl.LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, InversionData):
             raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
-        if data.domain_name != self.model.config.domain:
-            raise UserError(
-                f"data.domain: expected {self.model.config.domain!r} (the pretrained model's), found {data.domain_name!r}"
-            )
+        mine = self.model.config.domain
+        if data.domain_name != (mine if mine == OWN else recorded_name(mine)):
+            raise UserError(f"data.domain: expected {mine!r} (the pretrained model's), found {data.domain_name!r}")
         self.concepts = data.concepts
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
             raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")

@@ -126,7 +126,7 @@ class Pretraining(pl.LightningModule, ABC):
             states, seen = windows.states[:, :: self.stride], view.observe(windows.observed)
             states = view.encode(states, windows.observed)
         shared = {
-            "domain": data.domain.name,
+            "domain": data.domain_name,
             "horizon": data.horizon,
             "state_dim": len(data.domain.plans.columns),
             "observed": dict(features),

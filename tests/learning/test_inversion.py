@@ -6,9 +6,9 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.domains.data import InversionData
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule
-from ftl_lightning.learning.data import InversionData
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer

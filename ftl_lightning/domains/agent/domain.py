@@ -150,7 +150,6 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
-        descriptions=tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for suite in SUITES.values() for goal in suite.goals)))),
         reads=reads,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),

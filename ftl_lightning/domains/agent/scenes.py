@@ -5,7 +5,6 @@ Axes: x right, y up, z forward; metres. The agent starts at :data:`AGENT_START`;
 
 import itertools
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import task_key
 
 COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
 """The paper's colours, 0 to 255."""
@@ -133,7 +133,7 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
     """
     goal = parse(task)
     # Two streams, so that fewer scenes of the same seed are the first of more.
-    order, place = (np.random.default_rng([seed, zlib.crc32(task.encode()), stream]) for stream in range(2))
+    order, place = (np.random.default_rng([seed, task_key(task), stream]) for stream in range(2))
     looks: list[tuple[Look, Look]] = []
     while len(looks) < count:
         both_sides = [pair[::side] for pair in pairs(goal) for side in (1, -1)]

@@ -14,7 +14,7 @@ from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, 
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.published import PUBLISHED
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, make, observe, scenario
+from ftl_lightning.domains.driving.scenarios import make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.views import VIEWS
@@ -74,8 +74,6 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
-        descriptions=tuple(SCENARIOS),
-        reads=lambda task: task in SCENARIOS,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
     source=lambda root: Expert(),

@@ -1,7 +1,5 @@
 """Scenes drawn by vectorised rejection sampling: propose many, keep those that show the task and nothing else."""
 
-import zlib
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,6 +16,7 @@ from ftl_lightning.domains.object_rearrangement.relations import (
     parse,
 )
 from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import task_key
 
 SIZE = (0.3, 1.0)
 """Range of a shape's radius (paper)."""
@@ -45,7 +44,7 @@ def generate(task: str, count: int, seed: int) -> Tensor:
     relations = parse(task)
     related = {named for relation in relations for named in _related(relation)}
     unrelated = [relation for relation in TRAINING_RELATIONS if relation not in related]
-    rng = np.random.default_rng([seed, zlib.crc32(task.encode())])
+    rng = np.random.default_rng([seed, task_key(task)])
     kept: list[Tensor] = []
     for _ in range(PATIENCE):
         scenes = _propose(relations, rng)
