@@ -51,9 +51,7 @@ def read_minari(name: str, part: str = "") -> Demonstrations:
         beside = [_text(one) for one in found.storage.get_episode_metadata(found.episode_indices)]
         metadata = found.storage.metadata
     except FileNotFoundError as error:
-        raise UserError(
-            f"{name}: expected a file or an installed Minari data set, found neither (minari list local)"
-        ) from error
+        raise UserError(f"{name}: expected a file or an installed Minari data set, found neither (minari list local)") from error
     except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({error})") from error
     if not episodes:

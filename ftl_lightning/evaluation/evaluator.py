@@ -1,7 +1,7 @@
 """Evaluation as a callback: generates every task of a suite in one batch, judges it, and tells TensorBoard and the results file.
 
 It works the same while fitting, in ``validate``, in ``test`` and after ``invert``; all it asks of a module is its generative
-model and :class:`Generates`.
+model and :class:`Evaluable`.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
-from ftl_lightning.evaluation.generates import Generates
+from ftl_lightning.evaluation.evaluable import Evaluable
 from ftl_lightning.evaluation.judged import Judged, executed, share
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.results import Row, append_rows
@@ -124,7 +124,7 @@ class Evaluator(pl.Callback):
         own = [name for name in learned if name not in asked and (domain.concepts.reads(name) or not domain.metrics)]
         return tasks + [EvaluationTask(OWN, name, learned=name) for name in own]
 
-    def _start(self, task: EvaluationTask, module: Generates, domain: Domain) -> InitialStates | None:
+    def _start(self, task: EvaluationTask, module: Evaluable, domain: Domain) -> InitialStates | None:
         """Where a task's behaviour starts, or ``None`` where the domain has no initial states."""
         if not domain.observed:
             return None
@@ -136,7 +136,7 @@ class Evaluator(pl.Callback):
         return domain.source(self.root).starts(task.goal, self.samples, EVALUATION_SEED + self.seed)
 
     @torch.no_grad()
-    def evaluate(self, module: Generates, execute: bool = False) -> list[Judged]:
+    def evaluate(self, module: Evaluable, execute: bool = False) -> list[Judged]:
         """Generate and judge every task, those with equally many samples in one batch of the network.
 
         Args:
@@ -178,7 +178,7 @@ class Evaluator(pl.Callback):
 
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Tell mistakes before hours of training, not after."""
-        if not isinstance(pl_module, Generates):
+        if not isinstance(pl_module, Evaluable):
             raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(pl_module).__name__}")
         data = trainer.datamodule  # type: ignore[attr-defined]
         self.asked, self.root = self._asked(data), getattr(data, "root", None)
@@ -192,7 +192,7 @@ class Evaluator(pl.Callback):
     def _run(self, trainer: pl.Trainer, module: pl.LightningModule, stage: str) -> None:
         if trainer.sanity_checking:
             return
-        assert isinstance(module, Generates)
+        assert isinstance(module, Evaluable)
         self.judged = self.evaluate(module, execute=self.closed_loop and stage == "test")
         domain, data = module.domain, trainer.datamodule  # type: ignore[attr-defined]
         by_task = {(one.task.setting, one.task.name): one.values for one in self.judged}
@@ -236,7 +236,7 @@ class Evaluator(pl.Callback):
                     outcome_text(one.task.goal, one.outcomes),
                 )
 
-    def config_hash(self, module: Generates, data: pl.LightningDataModule) -> str:
+    def config_hash(self, module: Evaluable, data: pl.LightningDataModule) -> str:
         """What the results file knows this evaluation by."""
         return config_hash(configuration(module, data, self.settings(data)))
 

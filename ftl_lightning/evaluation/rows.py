@@ -6,7 +6,7 @@ from typing import Any
 import lightning.pytorch as pl
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.generates import Generates
+from ftl_lightning.evaluation.evaluable import Evaluable
 from ftl_lightning.evaluation.judged import Judged, paired, share
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row
 from ftl_lightning.tensor_file import content_hash, file_hash
@@ -18,7 +18,7 @@ def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
 
 
-def configuration(module: Generates, data: pl.LightningDataModule, settings: Mapping[str, Any]) -> dict[str, Any]:
+def configuration(module: Evaluable, data: pl.LightningDataModule, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Everything that was configured, by its place in a configuration file.
 
     Args:
@@ -42,7 +42,7 @@ def config_hash(configured: Mapping[str, Any]) -> str:
 
 
 def rows(
-    module: Generates,
+    module: Evaluable,
     domain: Domain,
     judged: Sequence[Judged],
     references: Mapping[str, Sequence[Judged]],

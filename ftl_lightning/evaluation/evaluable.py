@@ -12,7 +12,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 
 @runtime_checkable
-class Generates(Protocol):
+class Evaluable(Protocol):
     """The model, names of the method, of its variant and of learned concepts, and embeddings."""
 
     model: ConceptModel
