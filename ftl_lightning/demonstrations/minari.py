@@ -52,7 +52,7 @@ def read_minari(name: str, part: str = "") -> Demonstrations:
         metadata = found.storage.metadata
     except FileNotFoundError as error:
         raise UserError(
-            f"{name}: expected a file or an installed Minari data set, found neither (minari list local)"
+            f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({error})") from error
@@ -132,9 +132,8 @@ def _part(name: str, space: gymnasium.Space[Any], part: str) -> str:
         expected = "observations that are vectors (a Box of numbers)"
     else:
         vectors = [key for key, own in space.spaces.items() if _is_vector(own)]
-        expected = (
-            f"observations with one vector or {PART!r}, or read_minari(name, part) with one of {', '.join(vectors) or 'none'}"
-        )
+        told = ", ".join(vectors) or "none"
+        expected = f"observations with one vector or {PART!r}, or read_minari(name, part) with one of {told}"
     if not part and (PART in vectors or len(vectors) == 1):
         return PART if PART in vectors else vectors[0]
     if not part or part not in vectors:
