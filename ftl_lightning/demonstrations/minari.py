@@ -54,7 +54,7 @@ def read_minari(name: str, part: str = "") -> Demonstrations:
         raise UserError(
             f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
+    except (ImportError, OSError, ValueError, KeyError, TypeError, AssertionError) as error:
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({error})") from error
     if not episodes:
         raise UserError(f"{name}: expected at least one episode, found none")
@@ -105,7 +105,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
                 "state_units": list(demonstrations.state_units),
             }
             written.storage.update_metadata({_HEADER: header})
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+    except (ImportError, OSError, ValueError, AttributeError, TypeError) as error:
         raise UserError(f"{name}: cannot be written as a Minari data set such as strokes/test-v0 ({error})") from error
 
 
