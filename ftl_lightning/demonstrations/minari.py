@@ -51,8 +51,10 @@ def read_minari(name: str, part: str = "") -> Demonstrations:
         beside = [_text(one) for one in found.storage.get_episode_metadata(found.episode_indices)]
         metadata = found.storage.metadata
     except FileNotFoundError as error:
-        raise UserError(f"{name}: expected a file or an installed Minari data set, found neither (minari list local)") from error
-    except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
+        raise UserError(
+            f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
+        ) from error
+    except (ImportError, OSError, ValueError, KeyError, TypeError, AssertionError) as error:
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({error})") from error
     if not episodes:
         raise UserError(f"{name}: expected at least one episode, found none")
@@ -103,7 +105,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
                 "state_units": list(demonstrations.state_units),
             }
             written.storage.update_metadata({_HEADER: header})
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+    except (ImportError, OSError, ValueError, AttributeError, TypeError) as error:
         raise UserError(f"{name}: cannot be written as a Minari data set such as strokes/test-v0 ({error})") from error
 
 
@@ -130,9 +132,8 @@ def _part(name: str, space: gymnasium.Space[Any], part: str) -> str:
         expected = "observations that are vectors (a Box of numbers)"
     else:
         vectors = [key for key, own in space.spaces.items() if _is_vector(own)]
-        expected = (
-            f"observations with one vector or {PART!r}, or read_minari(name, part) with one of {', '.join(vectors) or 'none'}"
-        )
+        told = ", ".join(vectors) or "none"
+        expected = f"observations with one vector or {PART!r}, or read_minari(name, part) with one of {told}"
     if not part and (PART in vectors or len(vectors) == 1):
         return PART if PART in vectors else vectors[0]
     if not part or part not in vectors:

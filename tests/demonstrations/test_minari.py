@@ -99,7 +99,7 @@ def test_of_several_parts_the_observation_or_the_only_vector_is_read() -> None:
     make("goal-v0", [episode(both, 2)], gymnasium.spaces.Dict(parts))
     assert (read_minari("goal-v0").states == 0.25).all()
     assert (read_minari("goal-v0", "goal").states == 0.75).all()
-    with pytest.raises(UserError, match=r"goal-v0: expected .* one of observation, goal, found 'speed'"):
+    with pytest.raises(UserError, match=r"goal-v0: expected .* one of goal, observation, found 'speed'"):
         read_minari("goal-v0", "speed")
     pose = {"pose": vectors(2), "camera": list(np.zeros((3, 4, 4, 3), np.uint8))}
     make("camera-v0", [episode(pose, 2)], gymnasium.spaces.Dict({"pose": VECTOR, "camera": IMAGE}))

@@ -70,8 +70,9 @@ def test_an_installed_domain_is_used_by_its_name(installed: Path) -> None:
     assert sorted(path.stem for path in Path("logs/strokes/invert/concepts").iterdir()) == ["wave_upwards", "zigzag_leftwards"]
     rows = Path("logs/strokes/invert/results.csv").read_text()
     assert "new concept,wave upwards" in rows
-    told = run("sample", "--pretrained", str(folder), "--concept=logs/strokes/invert/concepts/wave_upwards.safetensors",
-               "--goal=wave upwards", "--count=3", "--steps=3", "--sampler=dpm_solver", "--figure=s.png", "--animation=s.gif")  # fmt: skip
+    learned = "--concept=logs/strokes/invert/concepts/wave_upwards.safetensors"
+    options = ["--goal=wave upwards", "--count=3", "--steps=3", "--sampler=dpm_solver", "--figure=s.png", "--animation=s.gif"]
+    told = run("sample", f"--pretrained={folder}", learned, *options)
     assert "accuracy on 'wave upwards'" in told
     samples = Demonstrations.load("states.safetensors")
     assert samples.domain == "strokes"
