@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 from ftl_lightning.concepts.hashing import HashingEncoder
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.domains.data import InversionData, OwnData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule, PretrainingModule
-from ftl_lightning.learning.data import InversionData, OwnData
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.trainer import Trainer
 
-SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go down": (0.0, -1.0)}
+SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go between": (0.5, 0.5)}
 TIME = 12
 
 
@@ -65,7 +65,7 @@ def test_a_file_is_a_domain(file: str) -> None:
     assert domain_from_file(file, 5, {}, 0.1).plans.horizon == 5
     assert [task.goal for task in domain.concepts.suites["training"].tasks] == ["go right", "go up"]
     assert domain.concepts.reads("go up")
-    assert not domain.concepts.reads("go down")
+    assert not domain.concepts.reads("go between")
     assert domain.main_metric == domain.headline == "end_point_within"
     assert [domain.less_is_better(name) for name in domain.metrics] == [False, True]
     assert domain.show.film is not None
@@ -86,7 +86,7 @@ def test_the_last_demonstrations_of_each_concept_are_held_out(file: str) -> None
 def test_demonstrations_of_a_task_are_the_first_of_its_concept(file: str) -> None:
     source = domain_from_file(file, None, {}, 0.1).source(None)
     assert torch.equal(source.draw("go up", 2, 0).states, Demonstrations.load(file).states[6:8])
-    for task, count, found in (("go up", 7, 6), ("go down", 1, 0)):
+    for task, count, found in (("go up", 7, 6), ("go between", 1, 0)):
         with pytest.raises(UserError, match=f"task: expected {count} demonstrations of {task!r} in the file, found {found}"):
             source.draw(task, count, 0)
     assert source.starts("go up", 3, 0) is None
@@ -158,7 +158,7 @@ def test_pace_does_not_matter_when_time_is_warped() -> None:
     slow_then_fast = torch.tensor([0.0, 0, 0, 0, 0.25, 0.5, 0.75, 1, 1])[None, :, None]
     whole = torch.tensor([9])
     assert warped_distances(even, whole, even, whole).item() == 0
-    assert warped_distances(slow_then_fast, whole, even, whole).item() < 0.05
+    assert warped_distances(slow_then_fast, whole, even, whole).item() < 0.06
     assert warped_distances(1 - even, whole, even, whole).item() > 0.3
 
 
@@ -184,11 +184,10 @@ def test_columns_are_scaled_alike_where_neighbours_are_looked_for() -> None:
     plans = torch.from_numpy(np.stack((wide[10], wide[11] + step))).float()
     measure = METRICS["nearest_demonstration"](known, TIME, 3).measure
     assert measure("low", plans, None).tolist() == [True, False]
-    constant = examples(low=np.zeros((2, TIME, 2)), high=np.stack([np.zeros((TIME, 2)) + [0, 1]] * 2))  # a column that never varies
-    assert (
-        METRICS["nearest_demonstration"](constant, TIME, 1).measure("high", constant.states, None).tolist()
-        == [False] * 2 + [True] * 2
-    )
+    high = np.zeros((2, TIME, 2)) + np.array([0.0, 1.0])
+    constant = examples(low=np.zeros((2, TIME, 2)), high=high)  # the first column never varies
+    measure = METRICS["nearest_demonstration"](constant, TIME, 1).measure
+    assert measure("high", constant.states, None).tolist() == [False] * 2 + [True] * 2
 
 
 def test_a_plan_is_right_that_ends_where_a_demonstration_of_its_goal_does() -> None:
@@ -226,8 +225,8 @@ def test_the_distance_a_step_to_the_nearest_demonstration_of_the_goal() -> None:
 @pytest.mark.parametrize("name", METRICS)
 def test_a_goal_that_was_never_shown_cannot_be_judged(name: str) -> None:
     known = examples(go_right=walks("go right", 2), go_up=walks("go up", 2, 1))
-    with pytest.raises(UserError, match="goal: expected a concept with demonstrations to compare with, found 'go down'"):
-        METRICS[name](known, TIME, 1).measure("go down", known.states, None)
+    with pytest.raises(UserError, match="goal: expected a concept with demonstrations to compare with, found 'go between'"):
+        METRICS[name](known, TIME, 1).measure("go between", known.states, None)
 
 
 # Learning
@@ -246,13 +245,13 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a small model of a file, and beside it the file."""
     folder = tmp_path_factory.mktemp("own")
     data = OwnData(
-        write(folder / "walks.npz"), metrics=JUDGED, validation_share=0.34, batch_size=16, steps_per_epoch=100, encoder="hashing"
+        write(folder / "walks.npz"), metrics=JUDGED, validation_share=0.34, batch_size=16, steps_per_epoch=750, encoder="hashing"
     )
     module = PretrainingModule(
         denoiser_args={"hidden_dim": 64, "depth": 2, "condition_dim": 32}, diffusion_steps=20, output=str(folder / "model")
     )
     judge = Evaluator(samples=4, sampler="ddim", steps=10, results=str(folder / "r.csv"))
-    trainer(max_steps=300, callbacks=[judge]).fit(module, datamodule=data)
+    trainer(max_steps=1500, callbacks=[judge]).fit(module, datamodule=data)
     return folder / "model"
 
 
@@ -281,21 +280,23 @@ def test_a_model_of_ones_own_data_keeps_what_it_is_judged_by(fitted: Path) -> No
 
 
 def test_a_new_concept_is_learned_generated_and_judged_beside_the_known_ones(fitted: Path) -> None:
-    np.savez("down.npz", states=walks("go down", 4, 5), concepts="go down")
-    data = InversionData("own", demonstrations="down.npz", steps=150)
+    np.savez("between.npz", states=walks("go between", 4, 5), concepts="go between")
+    data = InversionData("own", demonstrations="between.npz", steps=150)
     module = InversionModule(str(fitted), samples=16, components=1, output="concepts")
     judge = Evaluator(samples=8, sampler="ddim", steps=10, temperature=0.1, results="r.csv")
     trainer(max_epochs=1, callbacks=[judge]).invert(module, data)
-    assert [path.name for path in Path("concepts").iterdir()] == ["go_down.safetensors"]
+    assert [path.name for path in Path("concepts").iterdir()] == ["go_between.safetensors"]
     (one,) = judge.judged
-    assert one.task.goal == "go down"
+    assert one.task.goal == "go between"
     assert one.measured["dtw_to_demonstrations"].shape == (8,)
-    # The walk it was shown leads down; what the model knows leads right and up.
-    assert one.states[:, -1, 1].mean() < -2
+    # The walks it was shown lead along the diagonal; what the model knows leads right and up.
+    x, y = one.states[:, -1].mean(dim=0).tolist()
+    assert 3 < x < 8
+    assert 2 < y < 6.5
     assert one.values["nearest_demonstration"] > 0.5
     rows = read_rows("r.csv")
     assert set(rows["metric"]) == set(JUDGED)
-    assert set(rows["task"]) == {"go down"}
+    assert set(rows["task"]) == {"go between"}
     assert set(rows["demonstrations"]) == {4}
     with pytest.raises(UserError, match=r"data\.demonstrations: expected a file of the new concepts' demonstrations, found none"):
         InversionData("own")
