@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
-from ftl_lightning.concepts.composition import composed_epsilon
+from ftl_lightning.concepts.composition import Composition, composed_epsilon
 from ftl_lightning.diffusion import TemporalUNet
 from ftl_lightning.diffusion.denoiser import Sizes
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.tensor_file import write_text
 
 BASE = {"horizon": 128, "K": 2, "width": 32, "concepts": 5}
@@ -29,21 +29,26 @@ REPEATS = 3
 def milliseconds(horizon: int, components: int, width: int, concepts: int) -> tuple[float, float]:
     """Of one step of inversion, and of one denoising step of as many plans without gradient; the fastest of some."""
     domain = load_domain("agent")
-    states, initial_dim, n = len(domain.state_names), 52, 384
-    net = TemporalUNet(Sizes(horizon, states, n, initial_dim, domain.entities, domain.looks), width, initial_encoder="entities")
+    states, n = len(domain.plans.columns), 384
+    sizes = Sizes(horizon, states, n, domain.observed)
+    net = TemporalUNet(sizes, width, initial_encoder="entities")
     net.requires_grad_(False).eval()
     batch = concepts * SAMPLES
-    x, s0 = torch.randn(batch, horizon, states), torch.randn(batch, initial_dim)
+    x, s0 = torch.randn(batch, horizon, states), torch.randn(batch, sizes.vector_dim)
     t = torch.randint(100, (batch,))
     embeddings = torch.randn(concepts, components, n, requires_grad=True)
     weights = torch.ones(concepts, components)
 
+    composition = Composition(embeddings, weights)
+
     def learn() -> None:
-        composed_epsilon(net, x, t, embeddings, weights, torch.zeros(n), s0).square().mean().backward()
+        composed_epsilon(net, x, t, composition, torch.zeros(n), net.observe(s0)).square().mean().backward()
+
+    context = net.observe(s0)  # once a plan, not at every step
 
     @torch.no_grad()
     def generate() -> None:
-        composed_epsilon(net, x, t, embeddings, weights, torch.zeros(n), s0)
+        composed_epsilon(net, x, t, composition, torch.zeros(n), context)
 
     found = []
     for work in (learn, generate):

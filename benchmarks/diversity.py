@@ -14,10 +14,11 @@ from tempfile import TemporaryDirectory
 from torch import Tensor
 
 from ftl_lightning.cli import main
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import load_concepts
-from ftl_lightning.diffusion.samplers import SAMPLERS
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import write_text
@@ -51,9 +52,9 @@ def measured(config: str, pretrained: str, temperature: float) -> float:
         learned(config, folder)
         concepts = load_concepts(sorted(Path(folder).glob("*.safetensors")))
     draws = [generator("cpu", 0, number) for number in range(len(concepts))]
-    embeddings, weights = [one.embeddings for one in concepts], [one.weights for one in concepts]
-    steps = model.max_steps or 1
-    scenes = model.sample(embeddings, weights, COUNT, SAMPLERS["ddpm"], steps, temperature, draws)[:, :, 0]
+    compositions = [Composition(one.embeddings, one.weights) for one in concepts]
+    sampling = Sampling("ddpm", model.max_steps or 1, temperature)
+    scenes = model.sample(compositions, COUNT, sampling, draws)[:, :, 0]
     return sum(map(spread, scenes)) / len(scenes)
 
 
@@ -62,7 +63,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", help="JSON file to write")
     options = parser.parse_args()
     domain = load_domain(DOMAIN)
-    drawn = [spread(domain.generate(task, COUNT, 0).states[:, 0]) for task in domain.suites["paper"].learned]
+    drawn = [spread(domain.source(None).draw(task, COUNT, 0).states[:, 0]) for task in domain.concepts.suites["paper"].learned]
     found = {"the tasks themselves": sum(drawn) / len(drawn)} | {name: measured(*run) for name, run in RUNS.items()}
     found = {name: round(value, 3) for name, value in found.items()}
     print(json.dumps(found, indent=2))

@@ -17,13 +17,15 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from ftl_lightning.demonstrations.datamodule import InversionData
 from torch import Tensor
 
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.diffusion.samplers import ddpm
+from ftl_lightning.diffusion.samplers import Sampling, ddpm
 from ftl_lightning.diffusion.schedule import denoising_loss
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.domains.data import InversionData
+from ftl_lightning.domains.domain import ACCURACY
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
@@ -33,6 +35,7 @@ from ftl_lightning.trainer import Trainer
 PUBLISHED_STEPS = 50_000
 OMEGA = 1.2
 TEMPERATURE = 0.1
+SAMPLING = Sampling("ddpm", 100, TEMPERATURE)
 
 Result = TypeVar("Result")
 
@@ -74,7 +77,8 @@ def published_inversion(model: GenerativeModel, demonstrations: Tensor, steps: i
 def our_inversion(pretrained: str, concepts: list[str], steps: int) -> list[Concept]:
     """What ``invert`` does with the shipped configuration, for some concepts of the validation suite."""
     data = InversionData("object_rearrangement", suite="validation", steps=steps)
-    data.concepts = tuple(concepts)
+    kept = [row for row, text in enumerate(data.demonstrations.concepts) if text in concepts]
+    data.demonstrations, data.concepts = data.demonstrations.rows(kept), tuple(concepts)
     module = InversionModule(pretrained, omega=OMEGA)
     trainer = Trainer(
         max_epochs=1,
@@ -91,10 +95,8 @@ def our_inversion(pretrained: str, concepts: list[str], steps: int) -> list[Conc
 
 def accuracy(model: GenerativeModel, task: str, concepts: Tensor, weights: Tensor) -> float:
     """Share of 50 samples that show the task."""
-    states = model.sample([concepts], [weights], 50, ddpm, 100, TEMPERATURE, [generator("cpu", 0)])[0]
-    succeeded = load_domain(model.config.domain).succeeded
-    assert succeeded is not None
-    return float(succeeded(task, states, None).float().mean())
+    states = model.sample([Composition(concepts, weights)], 50, SAMPLING, [generator("cpu", 0)])[0]
+    return float(model.domain.metrics[ACCURACY].measure(task, states, None).float().mean())
 
 
 def main() -> None:
@@ -110,7 +112,7 @@ def main() -> None:
     model = GenerativeModel.load(options.pretrained)
     domain = load_domain(model.config.domain)
     task = options.task
-    others = [name for name in domain.suites["validation"].learned if name != task]
+    others = [name for name in domain.concepts.suites["validation"].learned if name != task]
     demonstrations = InversionData(domain.name, suite="validation").demonstrations.select(task).states
     slice_steps = PUBLISHED_STEPS if options.full else options.slice
 
@@ -131,8 +133,8 @@ def main() -> None:
 
     single = timed(one_at_a_time)[1] / singles * 500
     draws = [generator("cpu", task) for task in range(10)]
-    _, batch = timed(lambda: model.sample([concepts] * 10, [weights] * 10, 50, ddpm, 100, TEMPERATURE, draws))
-    _, generation = timed(lambda: domain.training_set(920, 0))
+    _, batch = timed(lambda: model.sample([Composition(concepts, weights)] * 10, 50, SAMPLING, draws))
+    _, generation = timed(lambda: domain.source(None).split("train", 920, 0))
 
     found: dict[str, dict[str, object]] = {
         "machine": {

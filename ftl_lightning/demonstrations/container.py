@@ -258,9 +258,13 @@ class Demonstrations:
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
-    """Demonstrations of the same domain one after another, padded to the longest; the first one's provenance is kept."""
+    """Demonstrations of the same domain one after another, padded to the longest; the first one's provenance is kept.
+
+    A feature is observed at every time, and there are scenes, where that is so of all parts.
+    """
     first = parts[0]
     longest = max(part.states.shape[1] for part in parts)
+    per_step = tuple(name for name in first.per_step if all(name in part.per_step for part in parts))
     scenes = [part.scenes for part in parts if part.scenes is not None]
     return replace(
         first,
@@ -269,11 +273,15 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
         concepts=tuple(text for part in parts for text in part.concepts),
         observed={
             name: torch.cat(
-                [_padded(part.observed[name], longest) if name in first.per_step else part.observed[name] for part in parts]
+                [
+                    _padded(part.observed[name], longest) if name in per_step else part.initial_states.observed[name]
+                    for part in parts
+                ]
             )
             for name in first.observed
         },
-        scenes=torch.cat(scenes) if scenes else None,
+        per_step=per_step,
+        scenes=torch.cat(scenes) if len(scenes) == len(parts) else None,
     )
 
 

@@ -29,7 +29,7 @@ def load_domain(name: str) -> Domain:
         raise UserError(f"domain: expected one of {', '.join(domain_names())}, or package.module:DOMAIN, found {name!r}")
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:  # the last two for no or a relative module
         raise UserError(f"domain {name!r}: cannot be imported ({error}); install its package or mend the name") from error
     if not isinstance(found, Domain):
         raise UserError(f"domain {name!r}: expected a Domain, found {type(found).__name__}")

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.concepts.composition import Composition, Context, Denoiser, composed_epsilon, parse_composition
+from ftl_lightning.concepts.composition import Composition, Context, Denoiser, batched, composed_epsilon, parse_composition
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion import MLPDenoiser
 from ftl_lightning.diffusion.denoiser import Sizes
@@ -109,3 +109,55 @@ def test_compositions_in_words() -> None:
     for wrong in ("a:heavy", "a:nan", "a:inf", ":1", "a + "):
         with pytest.raises(UserError, match="expected 'concept:weight"):
             parse_composition(wrong)
+
+
+def drawn(count: int, seed: int) -> Composition:
+    draw = torch.Generator().manual_seed(seed)
+    return Composition(torch.randn(count, 4, generator=draw), torch.randn(count, generator=draw))
+
+
+def score(composition: Composition, of: dict[str, torch.Tensor]) -> torch.Tensor:
+    """What a composition ``(K, 4)`` adds to the noise of the empty concept, of every sample."""
+    together = batched([composition])
+    everywhere = of | {"concepts": together.embeddings, "weights": together.weights}
+    return composed(everywhere) - plain(of, EMPTY.expand(len(of["x"]), -1))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds, counts=st.tuples(st.integers(0, 3), st.integers(0, 3)), factor=st.floats(-3, 3))
+def test_a_sum_adds_what_its_parts_do_and_a_multiple_multiplies_it(seed: int, counts: tuple[int, int], factor: float) -> None:
+    of, one, other = inputs(1, seed), drawn(counts[0], seed), drawn(counts[1], seed + 1)
+    assert close(score(one + other, of), score(one, of) + score(other, of))
+    assert close(score(one + other, of), score(other + one, of))
+    assert close(score(factor * one, of), factor * score(one, of))
+    both = factor * (one + other)
+    apart = factor * one + other * factor
+    assert torch.equal(both.embeddings, apart.embeddings)
+    assert torch.equal(both.weights, apart.weights)
+
+
+def test_sums_and_multiples_leave_their_parts_as_they_were() -> None:
+    one, other = drawn(2, 0), drawn(1, 1)
+    before = one.weights.clone()
+    both = 2 * one + other
+    assert both.embeddings.shape == (3, 4)
+    assert torch.equal(both.weights, torch.cat((2 * before, other.weights)))
+    assert torch.equal(one.weights, before)
+    assert torch.equal((one + other).embeddings, torch.cat((one.embeddings, other.embeddings)))
+    runs = Composition(torch.zeros(5, 2, 4), torch.ones(5, 2))  # leading dimensions are kept
+    assert (runs + runs).embeddings.shape == (5, 4, 4)
+    assert (3 * runs).weights.shape == (5, 2)
+    assert both.to(torch.device("cpu")).weights.device.type == "cpu"
+
+
+def test_compositions_of_different_lengths_in_one_batch_are_those_alone() -> None:
+    parts = [drawn(count, count) for count in (1, 3, 0, 2)]
+    together = batched(parts)
+    assert together.embeddings.shape == (4, 3, 4)
+    of = inputs(1, 5, batch=8)
+    whole = composed(of | {"concepts": together.embeddings, "weights": together.weights})
+    for number, part in enumerate(parts):
+        rows = slice(2 * number, 2 * number + 2)
+        own = {name: of[name][rows] for name in ("x", "t", "place")}
+        alone = composed(own | {"concepts": part.embeddings[None], "weights": part.weights[None]})
+        assert close(whole[rows], alone)

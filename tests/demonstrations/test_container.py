@@ -250,6 +250,17 @@ def test_selecting_and_joining_keep_what_is_observed_and_scenes() -> None:
     assert one.scenes.tolist() == [[10, 10]]
 
 
+def test_what_only_some_know_at_every_time_is_joined_at_the_first() -> None:
+    values = torch.arange(6.0).reshape(1, 2, 3)
+    always = demonstrations(torch.zeros(1, 2, 1), observed={"a": values}, per_step=("a",), scenes=torch.zeros(1, 2))
+    once = demonstrations(torch.zeros(1, 4, 1), observed={"a": values[:, 1]})
+    for parts in ([always, once], [once, always]):
+        joined = concatenate(parts)
+        assert joined.per_step == ()
+        assert sorted(joined.observed["a"].tolist()) == [[0, 1, 2], [3, 4, 5]]
+        assert joined.scenes is None
+
+
 def test_what_is_observed_may_be_the_scene_itself(tmp_path: Path) -> None:
     same = torch.arange(6.0).reshape(2, 3)
     demonstrations(torch.zeros(2, 1, 1), observed={"world": same}, scenes=same).save(tmp_path / "d.safetensors")

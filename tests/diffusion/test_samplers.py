@@ -10,8 +10,9 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from torch import Tensor
 
-from ftl_lightning.diffusion.samplers import SAMPLERS, ddim, ddpm, dpm_solver, timesteps
+from ftl_lightning.diffusion.samplers import SAMPLERS, Sampling, ddim, ddpm, dpm_solver, timesteps
 from ftl_lightning.diffusion.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
+from ftl_lightning.errors import UserError
 
 ALPHA_BAR = cosine_alpha_bar(100)
 SHAPE = (400, 1, 2)
@@ -118,3 +119,24 @@ def test_the_loss_of_the_true_noise_is_zero() -> None:
     noise = torch.randn(4, 1, 3)
     t = torch.tensor([0, 10, 50, 99])
     assert torch.equal(denoising_loss(lambda x, t: noise, torch.zeros(4, 1, 3), noise, t, ALPHA_BAR), torch.zeros(4))
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_a_sampling_runs_its_sampler_with_its_steps_and_temperature(name: str) -> None:
+    found = Sampling(name, 12, 0.3).run(exact, noise(), ALPHA_BAR)
+    assert torch.equal(found, SAMPLERS[name](exact, noise(), ALPHA_BAR, 12, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sampler": "euler"}, "sampler: expected one of ddpm, ddim, dpm_solver, found 'euler'"),
+        ({"steps": 0}, "steps: expected 1 or more, found 0"),
+        ({"temperature": -0.1}, "temperature: expected 0 or more, found -0.1"),
+        ({"temperature": float("nan")}, "temperature: expected 0 or more, found nan"),
+        ({"temperature": float("inf")}, "temperature: expected 0 or more, found inf"),
+    ],
+)
+def test_a_sampling_that_is_none_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        Sampling(**options)

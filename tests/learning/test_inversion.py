@@ -1,5 +1,7 @@
+import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -7,9 +9,12 @@ import torch
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.data import InversionData
+from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
 
@@ -47,6 +52,49 @@ def test_learning_lowers_the_loss(tiny: Path) -> None:
     data = [InversionData("object_rearrangement", suite="validation", steps=steps) for steps in (1, 60)]
     short, long = (learn(tiny, one, learning_rate=0.03).learned() for one in data)
     assert all(long[name].origin.loss < short[name].origin.loss for name in long)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"omega": "learned", "components": 3}, {"off_span": 0.1, "restarts": 2, "loss": "v", "timestep_power": 3.0}],
+    ids=str,
+)
+def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, options: dict[str, Any]) -> None:
+    data = InversionData("object_rearrangement", suite="validation", steps=7)
+    module = learn(tiny, data, seed=3, **options)
+    told: list[float] = []
+    settings = InversionSettings(samples=8, seed=3, **options)
+    found = invert(load_model(tiny), data.demonstrations, settings, 7, told.append)
+    expected = module.learned()
+    assert list(found) == list(expected) == list(data.concepts)
+    for name, concept in expected.items():
+        assert torch.equal(found[name].embeddings, concept.embeddings)
+        assert torch.equal(found[name].weights, concept.weights)
+        assert found[name].origin == concept.origin
+    assert len(told) == 7
+    assert all(math.isfinite(loss) for loss in told)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"components": 0}, r"model\.components: expected 1 or more, found 0"),
+        ({"restarts": 0}, r"model\.restarts: expected 1 or more, found 0"),
+        ({"samples": 0}, r"model\.samples: expected 1 or more, found 0"),
+        ({"off_span": 1.1}, r"model\.off_span: expected 0 \(span\) to 1 \(free\), found 1.1"),
+        ({"timestep_power": 0.5}, r"model\.timestep_power: expected 1 or more, found 0.5"),
+        ({"loss": "displacement"}, r"model\.loss: expected one of epsilon, v, clean, found 'displacement'"),
+    ],
+)
+def test_settings_that_are_none_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        InversionSettings(**options)
+
+
+def test_a_loss_that_is_not_finite_is_told(tiny: Path) -> None:
+    data = InversionData("object_rearrangement", suite="validation", steps=1)
+    with pytest.raises(UserError, match=r"inversion: the loss became nan at step \d; lower model\.learning_rate"):
+        invert(load_model(tiny), data.demonstrations, InversionSettings(samples=2, learning_rate=1e30), 9)
 
 
 @pytest.mark.parametrize(("power", "expected"), [(1.0, 12.5), (3.0, 50.0)])

@@ -1,0 +1,155 @@
+"""Condition encoders: what is observed is read once a plan, by whatever network, learning or sampling."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion.conditions import ENCODERS, EntityEncoder, condition_encoder
+from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, scenes
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.closed_loop import sampled_plans
+from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.seeding import generator
+
+STEPS = 6
+
+
+def model(denoiser: str, options: dict[str, Any], prediction: str = "epsilon", **observed: Feature) -> GenerativeModel:
+    config = DiffusionConfig(
+        domain="agent",
+        horizon=8,
+        state_dim=13,
+        observed={OBSERVED: FEATURE} | observed,
+        concept_dim=6,
+        training_concepts=("a", "b"),
+        encoder="none",
+        denoiser=denoiser,
+        denoiser_args=options,
+        diffusion_steps=10,
+        prediction=prediction,
+    )
+    torch.manual_seed(0)
+    limits = [Normalization(-torch.ones(count), torch.ones(count)) for count in (13, config.vector_dim)]
+    return GenerativeModel(config, load_domain("agent"), limits[0], torch.randn(3, 6), limits[1]).eval()
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[int]]:
+    """Batch sizes with which each half of any encoder is called."""
+    found: dict[str, list[int]] = {"observe": [], "attend": []}
+    for kind in (condition_encoder(name, Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8).__class__ for name in ENCODERS):
+        for half in ("observe", "attend"):
+            monkeypatch.setattr(kind, half, counted(getattr(kind, half), found[half]))
+    return found
+
+
+def counted(plain: Callable[..., Any], batches: list[int]) -> Callable[..., Any]:
+    """A method that notes the length of its last argument."""
+
+    def method(self: Any, *arguments: Any) -> Any:
+        batches.append(len(arguments[-1]))
+        return plain(self, *arguments)
+
+    return method
+
+
+NETWORKS = [
+    ("MLPDenoiser", {"hidden_dim": 16, "depth": 2, "condition_dim": 8}, "epsilon"),
+    ("TemporalUNet", {"width": 8, "multipliers": [1, 2]}, "epsilon"),
+    ("TemporalUNet", {"width": 8, "multipliers": [1, 2], "broadcast": True}, "displacement"),
+]
+
+
+@pytest.mark.parametrize(("denoiser", "options", "prediction"), NETWORKS, ids=str)
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_what_is_observed_is_read_once_a_plan(
+    denoiser: str, options: dict[str, Any], prediction: str, encoder: str, calls: dict[str, list[int]]
+) -> None:
+    net = model(denoiser, options | {"initial_encoder": encoder}, prediction)
+    compositions = [Composition(net.training_embeddings, torch.ones(2)), Composition(net.training_embeddings[:1], torch.ones(1))]
+    seen = {OBSERVED: scenes("go to bowl", 6, 0)}
+    draws = [generator("cpu", number) for number in range(2)]
+    plans = net.sample(compositions, 3, Sampling("ddpm", STEPS, 0.5), draws, seen)
+    assert plans.shape == (2, 3, 8, 13)
+    assert calls["observe"] == [6]
+    assert calls["attend"] == [3 * 6] * STEPS  # the empty concept and two components, at every step
+
+
+def test_learning_reads_it_once_a_step_for_all_branches(calls: dict[str, list[int]]) -> None:
+    net = model(*NETWORKS[0][:2])
+    concepts = torch.randn(2, 3, 6, requires_grad=True)
+    draws = net.draws(4, 1.0, generator("cpu", 0))
+    seen = {OBSERVED: scenes("go to bowl", 8, 0)}
+    losses = net.losses(torch.zeros(8, 8, 13), seen, Composition(concepts, torch.ones(2, 3)), draws, "epsilon")
+    assert losses.shape == (2, 4)
+    assert calls["observe"] == [8]
+    assert calls["attend"] == [8, 3 * 8]
+    losses.sum().backward()
+    assert concepts.grad is not None
+    assert (concepts.grad.abs().amax(dim=-1) > 0).all()
+
+
+def test_in_closed_loop_it_is_read_once_for_every_plan_that_is_made(calls: dict[str, list[int]]) -> None:
+    net = model(*NETWORKS[0][:2])
+    composition = Composition(net.training_embeddings, torch.ones(2))
+    draws = [generator("cpu", number) for number in range(2)]
+    make = sampled_plans(net, [composition] * 2, Sampling("ddim", STEPS, 0.5), draws)
+    for made in (1, 2):
+        make({OBSERVED: scenes("go to bowl", 2, made)}, [0, 1])
+        assert calls["observe"] == [2] * made
+
+
+def test_several_features_stand_one_after_another_and_keep_their_entities_and_state() -> None:
+    sizes = Sizes(
+        horizon=4,
+        state_dim=2,
+        concept_dim=6,
+        observed={
+            "first": Feature((3,)),
+            "photo": Feature((3, 8, 8), "image"),
+            "boxes": Feature((6,), entities=((0, 1, 2), (3, 4, 5)), attributes=(2,)),
+            "pose": Feature((2,), state=(1, 0)),
+        },
+    )
+    assert sizes.vector_dim == 11
+    assert sizes.entities == ((3, 4, 5), (6, 7, 8))
+    assert sizes.attributes == (2,)
+    assert sizes.state_columns == (10, 9)
+    encoder = EntityEncoder(sizes, 8)
+    vector, concept = torch.randn(5, 11), torch.randn(5, 6)
+    swapped = vector[:, [0, 1, 2, 6, 7, 8, 3, 4, 5, 9, 10]]
+    out, other = (encoder.attend(encoder.observe(one), concept) for one in (vector, swapped))
+    torch.testing.assert_close(out, other)
+    assert not torch.allclose(out, encoder.attend(encoder.observe(vector[:, [1, 0, *range(2, 11)]]), concept), atol=1e-4)
+
+
+def test_features_may_come_in_any_order_and_others_do_not_matter() -> None:
+    net = model(*NETWORKS[0][:2], speed=Feature((2,)))
+    world, speed = scenes("go to bowl", 3, 0), torch.rand(3, 2)
+    expected = torch.cat((world, speed), dim=1)
+    for seen in ({OBSERVED: world, "speed": speed}, {"other": torch.zeros(3), "speed": speed, OBSERVED: world}):
+        found = net.vector(seen)
+        assert found is not None
+        torch.testing.assert_close(found, expected)
+    with pytest.raises(UserError, match="key 'observed': expected the feature 'speed'"):
+        net.vector({OBSERVED: world})
+    with pytest.raises(UserError, match=r"key 'observed/speed': expected shape \(2,\) a sample, found \(3,\)"):
+        net.vector({OBSERVED: world, "speed": torch.zeros(3, 3)})
+
+
+def test_images_are_refused_as_long_as_there_is_no_encoder_for_them() -> None:
+    with pytest.raises(UserError, match="key 'observed/photo': expected vectors, found images"):
+        model(*NETWORKS[0][:2], photo=Feature((3, 8, 8), "image"))
+
+
+def test_a_name_that_is_no_encoder() -> None:
+    with pytest.raises(UserError, match="initial_encoder: expected one of flat, entities, set, found 'deep'"):
+        condition_encoder("deep", Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8)

@@ -1,0 +1,356 @@
+"""A file of demonstrations with texts is a domain."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ftl_lightning.concepts.hashing import HashingEncoder
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.domains.data import InversionData, OwnData
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.learning import InversionModule, PretrainingModule
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.trainer import Trainer
+
+SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go between": (0.5, 0.5)}
+TIME = 12
+
+
+def walks(text: str, count: int, seed: int = 0, time: int = TIME) -> np.ndarray:
+    """Straight walks ``(count, time, 2)`` with a little noise, of one unit a step."""
+    noise = 0.05 * np.random.default_rng(seed).standard_normal((count, time, 2))
+    return np.arange(time)[None, :, None] * np.array(SLOPES[text]) + noise
+
+
+def write(path: Path, texts: tuple[str, ...] = ("go right", "go up"), count: int = 6, **more: object) -> str:
+    """A file of walks, those of the second text shorter."""
+    states = np.concatenate([walks(text, count, seed) for seed, text in enumerate(texts)])
+    lengths = np.repeat([TIME - 4 * (number == 1) for number in range(len(texts))], count)
+    for row, length in enumerate(lengths):
+        states[row, length:] = states[row, length - 1]
+    np.savez(path, states=states, lengths=lengths, concepts=np.repeat(texts, count), **more)  # type: ignore[arg-type]
+    return str(path)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    return write(tmp_path / "walks.npz")
+
+
+def examples(**texts: np.ndarray) -> Demonstrations:
+    """Demonstrations of full length by their text, with ``_`` for a blank."""
+    states = torch.cat([torch.from_numpy(values).float() for values in texts.values()])
+    concepts = tuple(name.replace("_", " ") for name, values in texts.items() for _ in values)
+    return Demonstrations(states, torch.full((len(states),), states.shape[1]), "", ("x", "y"), ("m", "m"), concepts)
+
+
+# The domain
+
+
+def test_a_file_is_a_domain(file: str) -> None:
+    domain = domain_from_file(file, None, {"end_point_within": 1.0, "dtw_to_demonstrations": 1}, 0.1)
+    assert domain.concepts.training == ("go right", "go up")
+    assert domain.concepts.table is None
+    assert domain.plans.horizon == TIME  # the longest demonstration
+    assert domain_from_file(file, 5, {}, 0.1).plans.horizon == 5
+    assert [task.goal for task in domain.concepts.suites["training"].tasks] == ["go right", "go up"]
+    assert domain.concepts.reads("go up")
+    assert not domain.concepts.reads("go between")
+    assert domain.main_metric == domain.headline == "end_point_within"
+    assert [domain.less_is_better(name) for name in domain.metrics] == [False, True]
+    assert domain.show.film is not None
+    assert domain.observed == {}
+
+
+def test_the_last_demonstrations_of_each_concept_are_held_out(file: str) -> None:
+    everything = Demonstrations.load(file)
+    for share, held in ((0.01, 1), (0.1, 1), (0.34, 2), (0.5, 3)):
+        source = domain_from_file(file, None, {}, share).source(None)
+        train, validation = (source.split(name, 99, 0) for name in ("train", "validation"))  # type: ignore[arg-type]
+        assert validation.concepts == ("go right",) * held + ("go up",) * held
+        assert torch.equal(validation.states, everything.states[[*range(6 - held, 6), *range(12 - held, 12)]])
+        assert len(train) == 12 - 2 * held
+        assert torch.equal(source.split("train", 1, 7).states, train.states)  # count and seed are the file's matter
+
+
+def test_demonstrations_of_a_task_are_the_first_of_its_concept(file: str) -> None:
+    source = domain_from_file(file, None, {}, 0.1).source(None)
+    assert torch.equal(source.draw("go up", 2, 0).states, Demonstrations.load(file).states[6:8])
+    for task, count, found in (("go up", 7, 6), ("go between", 1, 0)):
+        with pytest.raises(UserError, match=f"task: expected {count} demonstrations of {task!r} in the file, found {found}"):
+            source.draw(task, count, 0)
+    assert source.starts("go up", 3, 0) is None
+
+
+def test_initial_states_are_those_of_held_out_demonstrations(tmp_path: Path) -> None:
+    places = np.arange(12.0)[:, None]
+    domain = domain_from_file(write(tmp_path / "w.npz", **{"observed/place": places}), None, {}, 0.34)
+    assert domain.observed == {"place": Feature((1,))}
+    starts = domain.source(None).starts("go up", 50, 3)
+    assert starts is not None
+    assert set(starts.observed["place"].flatten().tolist()) == {4.0, 5.0, 10.0, 11.0}
+    again, other = (domain.source(None).starts("go up", 50, seed) for seed in (3, 4))
+    assert again is not None
+    assert other is not None
+    assert torch.equal(again.observed["place"], starts.observed["place"])
+    assert not torch.equal(other.observed["place"], starts.observed["place"])
+
+
+def test_files_that_are_no_domain_are_told(tmp_path: Path, file: str) -> None:
+    one = write(tmp_path / "one.npz", ("go up",))
+    few = write(tmp_path / "few.npz", count=1)
+    for path, message in (
+        (one, r"one\.npz: key 'concepts': expected texts of two concepts or more to pretrain on, found 1"),
+        (few, r"few\.npz: concept 'go right': expected two demonstrations or more \(one is held out\), found 1"),
+        (str(tmp_path / "none.npz"), r"none\.npz: expected a demonstrations file, found nothing"),
+    ):
+        with pytest.raises(UserError, match=message):
+            domain_from_file(path, None, {}, 0.1)
+    with pytest.raises(UserError, match=r"data\.metrics: expected some of nearest_demonstration, .*, found accuracy"):
+        domain_from_file(file, None, {"accuracy": 1}, 0.1)
+
+
+def test_demonstrations_without_a_text_are_named_after_the_file(tmp_path: Path) -> None:
+    np.savez(tmp_path / "wave.npz", states=np.zeros((2, 3, 1)))
+    assert read_own(str(tmp_path / "wave.npz")).concepts == ("wave", "wave")
+
+
+# Metrics
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), columns=st.integers(1, 3))
+def test_warping_is_that_of_a_plain_double_loop(seed: int, columns: int) -> None:
+    draw = np.random.default_rng(seed)
+    states, others = draw.standard_normal((3, 6, columns)), draw.standard_normal((4, 8, columns))
+    lengths, other_lengths = draw.integers(1, 7, 3), draw.integers(1, 9, 4)
+
+    def plain(one: np.ndarray, other: np.ndarray) -> float:
+        total = np.full((len(one) + 1, len(other) + 1), np.inf)
+        total[0, 0] = 0
+        for i, here in enumerate(one):
+            for j, there in enumerate(other):
+                total[i + 1, j + 1] = np.linalg.norm(here - there) + min(total[i, j], total[i, j + 1], total[i + 1, j])
+        return float(total[-1, -1] / max(len(one), len(other)))
+
+    found = warped_distances(
+        torch.from_numpy(states), torch.from_numpy(lengths), torch.from_numpy(others), torch.from_numpy(other_lengths)
+    )
+    expected = [
+        [plain(one[:length], other[:end]) for other, end in zip(others, other_lengths, strict=True)]
+        for one, length in zip(states, lengths, strict=True)
+    ]
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_pace_does_not_matter_when_time_is_warped() -> None:
+    even = torch.linspace(0, 1, 9)[None, :, None]
+    slow_then_fast = torch.tensor([0.0, 0, 0, 0, 0.25, 0.5, 0.75, 1, 1])[None, :, None]
+    whole = torch.tensor([9])
+    assert warped_distances(even, whole, even, whole).item() == 0
+    assert warped_distances(slow_then_fast, whole, even, whole).item() < 0.06
+    assert warped_distances(1 - even, whole, even, whole).item() > 0.3
+
+
+def test_most_of_the_nearest_demonstrations_decide() -> None:
+    known = examples(go_right=walks("go right", 5), go_up=walks("go up", 5, 1))
+    plans = torch.from_numpy(np.concatenate([walks("go right", 2, 7), walks("go up", 2, 8)])).float()
+    for count in (1, 3, 5, 10, 50):
+        measure = METRICS["nearest_demonstration"](known, TIME, count).measure
+        # Of ten neighbours half are of each concept, which is not most of them.
+        expected = [count < 10] * 2 + [False] * 2
+        assert measure("go right", plans, None).tolist() == expected
+        assert measure("go up", plans, None).tolist() == expected[::-1]
+    with pytest.raises(UserError, match=r"data\.metrics\.nearest_demonstration: expected 1 or more neighbours, found 0"):
+        METRICS["nearest_demonstration"](known, TIME, 0)
+
+
+def test_columns_are_scaled_alike_where_neighbours_are_looked_for() -> None:
+    # The second column is what tells the concepts apart, and a thousandth as large as the noise in the first.
+    draw = np.random.default_rng(0)
+    wide = 1000 * draw.standard_normal((12, TIME, 1)) @ np.array([[1.0, 0.0]])
+    step = np.array([0.0, 1.0])
+    known = examples(low=wide[:5], high=wide[5:10] + step)
+    plans = torch.from_numpy(np.stack((wide[10], wide[11] + step))).float()
+    measure = METRICS["nearest_demonstration"](known, TIME, 3).measure
+    assert measure("low", plans, None).tolist() == [True, False]
+    high = np.zeros((2, TIME, 2)) + np.array([0.0, 1.0])
+    constant = examples(low=np.zeros((2, TIME, 2)), high=high)  # the first column never varies
+    measure = METRICS["nearest_demonstration"](constant, TIME, 1).measure
+    assert measure("high", constant.states, None).tolist() == [False] * 2 + [True] * 2
+
+
+def test_a_plan_is_right_that_ends_where_a_demonstration_of_its_goal_does() -> None:
+    known = examples(go_right=walks("go right", 3), go_up=walks("go up", 3, 1))
+    end = known.states[0, -1]
+    plans = torch.zeros(3, TIME, 2)
+    plans[:, -1] = end + torch.tensor([[0.0, 0.0], [1.9, 0.0], [2.5, 0.0]])
+    measure = METRICS["end_point_within"](known, TIME, 2.0).measure
+    assert measure("go right", plans, None).tolist() == [True, True, False]
+    assert not measure("go up", plans, None).any()
+    # A shorter plan is compared with where demonstrations are by then, a shorter demonstration with its own end.
+    short = METRICS["end_point_within"](known, 4, 0.5).measure
+    assert short("go right", known.states[:3, :4], None).all()
+    assert not short("go right", known.states[:3], None).any()
+
+
+def test_the_distance_a_step_to_the_nearest_demonstration_of_the_goal() -> None:
+    known = examples(go_right=walks("go right", 3), go_up=walks("go up", 3, 1))
+    plans = torch.stack((known.states[1], known.states[1] + torch.tensor([0.0, 0.5]), known.states[4]))
+    number = METRICS["dtw_to_demonstrations"](known, TIME, 1)
+    assert number.less_is_better
+    assert number.identity == known.hash
+    found = number.measure("go right", plans, None)
+    assert found.shape == (3,)
+    assert found[0] == pytest.approx(0, abs=1e-5)
+    assert found[1] == pytest.approx(0.5, abs=0.1)
+    assert found[2] > 2
+    assert number.measure("go up", plans, None)[2] == pytest.approx(0, abs=1e-5)
+    for radius, right in ((0.1, [True, False, False]), (1.0, [True, True, False])):
+        within = METRICS["dtw_within"](known, TIME, radius)
+        assert not within.less_is_better
+        assert within.measure("go right", plans, None).tolist() == right
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_a_goal_that_was_never_shown_cannot_be_judged(name: str) -> None:
+    known = examples(go_right=walks("go right", 2), go_up=walks("go up", 2, 1))
+    with pytest.raises(UserError, match="goal: expected a concept with demonstrations to compare with, found 'go between'"):
+        METRICS[name](known, TIME, 1).measure("go between", known.states, None)
+
+
+# Learning
+
+
+def trainer(**options: object) -> Trainer:
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
+    return Trainer(accelerator="cpu", default_root_dir="logs", **(quiet | options))  # type: ignore[arg-type]
+
+
+JUDGED = {"nearest_demonstration": 1.0, "dtw_to_demonstrations": 1.0}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small model of a file, and beside it the file."""
+    folder = tmp_path_factory.mktemp("own")
+    data = OwnData(
+        write(folder / "walks.npz"), metrics=JUDGED, validation_share=0.34, batch_size=16, steps_per_epoch=750, encoder="hashing"
+    )
+    module = PretrainingModule(
+        denoiser_args={"hidden_dim": 64, "depth": 2, "condition_dim": 32}, diffusion_steps=20, output=str(folder / "model")
+    )
+    judge = Evaluator(samples=4, sampler="ddim", steps=10, results=str(folder / "r.csv"))
+    trainer(max_steps=1500, callbacks=[judge]).fit(module, datamodule=data)
+    return folder / "model"
+
+
+def test_a_model_of_ones_own_data_keeps_what_it_is_judged_by(fitted: Path) -> None:
+    model = load_model(fitted)
+    assert isinstance(model, GenerativeModel)
+    assert model.config.domain == "own"
+    assert model.config.training_concepts == ("go right", "go up")
+    assert model.config.encoder == HashingEncoder().identity
+    assert model.config.metrics == JUDGED
+    held_out = domain_from_file(str(fitted.parent / "walks.npz"), None, {}, 0.34).source(None).split("validation", 0, 0)
+    assert model.examples is not None
+    assert model.examples.hash == held_out.hash
+    assert model.domain.plans.horizon == TIME
+    assert list(model.domain.metrics) == list(JUDGED)
+    model.save("copy")
+    again = load_model("copy")
+    assert again.hash == model.hash
+    assert again.examples is not None
+    assert again.examples.hash == held_out.hash
+    assert sorted(path.name for path in Path("copy").iterdir()) == [
+        "config.json",
+        "demonstrations.safetensors",
+        "model.safetensors",
+    ]
+
+
+def test_a_new_concept_is_learned_generated_and_judged_beside_the_known_ones(fitted: Path) -> None:
+    np.savez("between.npz", states=walks("go between", 4, 5), concepts="go between")
+    data = InversionData("own", demonstrations="between.npz", steps=150)
+    module = InversionModule(str(fitted), samples=16, components=1, output="concepts")
+    judge = Evaluator(samples=8, sampler="ddim", steps=10, temperature=0.1, results="r.csv")
+    trainer(max_epochs=1, callbacks=[judge]).invert(module, data)
+    assert [path.name for path in Path("concepts").iterdir()] == ["go_between.safetensors"]
+    (one,) = judge.judged
+    assert one.task.goal == "go between"
+    assert one.measured["dtw_to_demonstrations"].shape == (8,)
+    # The walks it was shown lead along the diagonal; what the model knows leads right and up.
+    x, y = one.states[:, -1].mean(dim=0).tolist()
+    assert 3 < x < 8
+    assert 2 < y < 6.5
+    assert one.values["nearest_demonstration"] > 0.5
+    rows = read_rows("r.csv")
+    assert set(rows["metric"]) == set(JUDGED)
+    assert set(rows["task"]) == {"go between"}
+    assert set(rows["demonstrations"]) == {4}
+    with pytest.raises(UserError, match=r"data\.demonstrations: expected a file of the new concepts' demonstrations, found none"):
+        InversionData("own")
+
+
+def test_the_training_concepts_are_learned(fitted: Path) -> None:
+    model = load_model(fitted)
+
+    class Known:
+        method, variant, concepts, hparams = "known", "", (), {"seed": 0}
+
+        def __init__(self) -> None:
+            self.model = model
+
+        @property
+        def domain(self) -> Domain:
+            return model.domain
+
+        def composition(self, task: object) -> object:
+            from ftl_lightning.concepts.composition import Composition
+
+            return Composition(model.concept(task.goal)[None], torch.ones(1))  # type: ignore[attr-defined]
+
+    judged = Evaluator(samples=8, sampler="ddim", steps=10).evaluate(Known())  # type: ignore[arg-type]
+    assert [one.task.goal for one in judged] == ["go right", "go up"]
+    assert all(one.values["nearest_demonstration"] > 0.8 for one in judged)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"validation_share": 0.0}, r"data\.validation_share: expected a share between 0 and 1, found 0.0"),
+        ({"validation_share": 1.0}, r"data\.validation_share: expected a share between 0 and 1, found 1.0"),
+        ({"encoder": "table"}, "encoder: expected 'minilm', 'hashing' or a language model, found 'table'"),
+        ({"metrics": {"fid": 1}}, r"data\.metrics: expected some of"),
+        ({"horizon": 0}, r"data\.horizon: expected 1 or more, found 0"),
+    ],
+)
+def test_mistakes_in_the_data_of_ones_own(file: str, options: dict[str, object], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        OwnData(file, **({"encoder": "hashing"} | options))  # type: ignore[arg-type]
+
+
+def test_new_demonstrations_of_other_columns_are_refused(fitted: Path) -> None:
+    np.savez("wide.npz", states=np.zeros((2, 5, 3)), concepts="wide")
+    module = InversionModule(str(fitted), output="concepts")
+    with pytest.raises(UserError, match=r"expected states of 2 columns \(the pretrained model's\), found 3"):
+        trainer(max_epochs=1).invert(module, InversionData("own", demonstrations="wide.npz", steps=2))
+
+
+def test_own_domain_without_metrics_has_no_headline() -> None:
+    known = examples(go_right=walks("go right", 2), go_up=walks("go up", 2, 1))
+    domain = own_domain(known, ("go right",), TIME, {})
+    assert domain.metrics == {}
+    assert domain.headline == ""
+    assert domain.concepts.reads("go up")  # it can be compared with, though it is no training concept
+    assert domain.concepts.training == ("go right",)
