@@ -88,7 +88,7 @@ class SampleOptions:
             concepts, or files of learned concepts, whose own weights are multiplied. A weight may be left out and is 1 then.
         count: samples.
         seed: of the samples.
-        sampler: see ftl_lightning.diffusion.samplers; empty for the one that the domain's configuration of invert names.
+        sampler: see ftl_lightning.diffusion.samplers; empty for the one that the settings name.
         steps: of the sampler; 0 likewise.
         temperature: the paper's alpha; lower is less diverse and more accurate; negative likewise.
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
@@ -99,6 +99,7 @@ class SampleOptions:
         execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
             episodes ended.
         replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 likewise.
+        settings: configuration file of invert that says how to sample and how often to plan anew; empty for that of the domain.
         animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
     """
 
@@ -117,6 +118,7 @@ class SampleOptions:
     execute: bool = False
     replan: int = 0
     animation: str = ""
+    settings: str = ""
 
     def __post_init__(self) -> None:
         from ftl_lightning.errors import UserError
@@ -137,7 +139,7 @@ def sample(options: SampleOptions) -> None:
     from ftl_lightning.few_shot import FewShot
     from ftl_lightning.tensor_file import atomic
 
-    model = FewShot.from_pretrained(options.pretrained)
+    model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     _check_sample(options, model.domain)
     goal, film = options.goal, model.domain.show.film
     starts = _sample_starts(options, model.domain)
