@@ -32,6 +32,8 @@ def configuration(module: Evaluable, data: pl.LightningDataModule, settings: Map
         **{f"data/{key}": value for key, value in _public(data.hparams) if key not in ("demonstrations", "root")},
         **{f"evaluation/{key}": value for key, value in settings.items()},
         "model/pretrained": module.model.hash,
+        # A trained judge decides values, too; rules have no identity.
+        **{f"metric/{name}": metric.identity for name, metric in module.model.domain.metrics.items() if metric.identity},
         **({"data/demonstrations": file_hash(own)} if own else {}),
     }
 
