@@ -7,7 +7,7 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept, Origin
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.reporting.comparison import comparison_table, lead, overview, short_overview

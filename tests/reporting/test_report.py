@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from ftl_lightning.cli import main
-from ftl_lightning.domains.domain import load_domain
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows
 from ftl_lightning.reporting.comparison import comparison_table
 from ftl_lightning.reporting.figures import accuracy_bars
