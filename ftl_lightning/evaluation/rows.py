@@ -1,6 +1,7 @@
 """What an evaluation adds to the results file, and the configuration that its numbers are known by."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
@@ -34,7 +35,8 @@ def configuration(module: Evaluable, data: pl.LightningDataModule, settings: Map
         "model/pretrained": module.model.hash,
         # A trained judge decides values, too; rules have no identity.
         **{f"metric/{name}": metric.identity for name, metric in module.model.domain.metrics.items() if metric.identity},
-        **({"data/demonstrations": file_hash(own)} if own else {}),
+        # A data set with a name and a version, which is no file, is known by these.
+        **({"data/demonstrations": file_hash(own) if Path(own).is_file() else own} if own else {}),
     }
 
 

@@ -47,6 +47,10 @@ def test_columns_can_share_another_scale() -> None:
 
 
 def test_what_varies_by_rounding_alone_is_constant() -> None:
-    found = Normalization.fit(torch.tensor([[0.1020, 1.0], [0.1021, 2.0]]))
+    states = torch.tensor([[0.1020, 1.0], [0.1021, 2.0]])
+    found = Normalization.fit(states, resolution=1e-3)
     assert found.encode(torch.tensor([0.1021, 1.5])).tolist() == [0, 0]
     assert found.decode(torch.zeros(2)).tolist() == pytest.approx([0.102, 1.5])
+    assert Normalization.fit(states).encode(states[1]).tolist() == pytest.approx([1, 1])  # unless a domain says so, it varies
+    large = torch.tensor([[1e6, 1e6], [1e6 + 0.25, 1e6 + 4]])  # of which float32 holds no more than a tenth
+    assert Normalization.fit(large).encode(large[1]).tolist() == [0, 1]

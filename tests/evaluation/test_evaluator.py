@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from lightning.pytorch import LightningDataModule
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -18,6 +19,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import Row, append_rows, labels, read_rows
+from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning.generative_model import GenerativeModel
 
 
@@ -154,6 +156,20 @@ def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path) -> Non
     assert new[kept].head(len(old)).equals(old[kept])  # text for text
     append_rows(path, [row(task="a, b", method="FTL-IGM", variant="steps, set, near span 0.1", value=0.75)])
     assert read_rows(path)["value"].tolist() == [1.0, 0.25, 0.1, 0.5, 0.75]  # the same measurement, replaced
+
+
+def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_by_name_and_version(tiny: Path) -> None:
+    module, data = Trained(GenerativeModel.load(tiny)), LightningDataModule()
+    found = []
+    for content, name in ((b"one", "a.npz"), (b"one", "b.npz"), (b"two", "a.npz")):
+        Path(name).write_bytes(content)
+        data.hparams["demonstrations"] = name
+        found.append(configuration(module, data, {})["data/demonstrations"])
+    assert found[0] == found[1] != found[2]
+    data.hparams["demonstrations"] = "strokes/test-v0"
+    assert configuration(module, data, {})["data/demonstrations"] == "strokes/test-v0"
+    data.hparams.update({"demonstrations": None, "root": "/somewhere"})
+    assert not [key for key in configuration(module, data, {}) if key.startswith("data/")]  # where data are is no setting
 
 
 def test_a_foreign_results_file_is_refused(tmp_path: Path) -> None:
