@@ -9,7 +9,13 @@ from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
-CARDS = (*ROOT.glob("pretrained/*/README.md"), *ROOT.glob("ftl_lightning/**/README.md"), ROOT / "results" / "README.md")
+CARDS = (
+    *ROOT.glob("pretrained/*/README.md"),
+    *ROOT.glob("examples/*/README.md"),
+    *ROOT.glob("ftl_lightning/domains/**/README.md"),
+    ROOT / "conf" / "README.md",
+    ROOT / "results" / "README.md",
+)
 PAGES = tuple(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts and not path.is_symlink())
 TEXTS = (README, *PAGES, *CARDS)
 
