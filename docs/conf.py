@@ -19,6 +19,7 @@ release = version = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
 nitpicky = False
+suppress_warnings = ["ref.python"]  # two classes may have attributes of the same name
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
