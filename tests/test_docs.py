@@ -19,6 +19,9 @@ CARDS = (
 PAGES = tuple(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts and not path.is_symlink())
 TEXTS = (README, *PAGES, *CARDS)
 
+FOLDERS = (ROOT, *ROOT.glob("examples/*"))
+"""In which commands are run."""
+
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 INCLUDED = re.compile(r"^`{3,}\{include\} (\S+)", re.MULTILINE)
 CODE = re.compile(r"^(`{3,})(?!\{include\}).*?^\1`*$", re.MULTILINE | re.DOTALL)
@@ -67,7 +70,8 @@ def test_every_command_names_a_verb_and_files_that_exist(path: Path) -> None:
     for verb, files in commands(path.read_text(encoding="utf-8")):
         assert verb in TRAINER_VERBS | COMMANDS, verb
         for name in files:
-            assert any(ROOT.glob(PLACEHOLDER.sub("*", name))), f"{verb} --config {name}"
+            found = (any(folder.glob(PLACEHOLDER.sub("*", name))) for folder in FOLDERS)
+            assert any(found), f"{verb} --config {name}"
 
 
 def test_every_page_is_in_the_contents() -> None:
