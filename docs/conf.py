@@ -1,5 +1,6 @@
 """How the documentation's pages are built: ``make docs``. Nothing is fetched from a network."""
 
+import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -18,12 +19,14 @@ release = version = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
 nitpicky = False
+suppress_warnings = ["ref.python"]  # two classes may have attributes of the same name
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # the notebooks hold their output
 
 autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_mock_imports = [name for name in ("minari",) if importlib.util.find_spec(name) is None]  # an extra
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False  # Lightning's and torch's own documentation is theirs
 autodoc_typehints = "description"
@@ -39,7 +42,7 @@ html_show_sourcelink = False
 
 # Links are written for readers of the repository. Pages below are links to files outside this folder, which Sphinx would not find.
 OUTSIDE = ((r"(?:\.\./)+notebooks/(\w+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
-DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:results|ftl_lightning)/[^)]*\.md)\)")
+DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:results|ftl_lightning|examples|conf)/[^)]*\.md)\)")
 
 
 def _links(app: Sphinx, page: str, source: list[str]) -> None:

@@ -9,9 +9,18 @@ from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
-CARDS = (*ROOT.glob("pretrained/*/README.md"), *ROOT.glob("ftl_lightning/**/README.md"), ROOT / "results" / "README.md")
+CARDS = (
+    *ROOT.glob("pretrained/*/README.md"),
+    *ROOT.glob("examples/*/README.md"),
+    *ROOT.glob("ftl_lightning/domains/**/README.md"),
+    ROOT / "conf" / "README.md",
+    ROOT / "results" / "README.md",
+)
 PAGES = tuple(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts and not path.is_symlink())
 TEXTS = (README, *PAGES, *CARDS)
+
+FOLDERS = (ROOT, *ROOT.glob("examples/*"))
+"""In which commands are run."""
 
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 INCLUDED = re.compile(r"^`{3,}\{include\} (\S+)", re.MULTILINE)
@@ -61,7 +70,8 @@ def test_every_command_names_a_verb_and_files_that_exist(path: Path) -> None:
     for verb, files in commands(path.read_text(encoding="utf-8")):
         assert verb in TRAINER_VERBS | COMMANDS, verb
         for name in files:
-            assert any(ROOT.glob(PLACEHOLDER.sub("*", name))), f"{verb} --config {name}"
+            found = (any(folder.glob(PLACEHOLDER.sub("*", name))) for folder in FOLDERS)
+            assert any(found), f"{verb} --config {name}"
 
 
 def test_every_page_is_in_the_contents() -> None:

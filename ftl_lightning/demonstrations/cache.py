@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.container import VERSION, Demonstrations
 from ftl_lightning.errors import UserError
 from ftl_lightning.progress import bar
 from ftl_lightning.tensor_file import content_hash
@@ -22,11 +22,11 @@ def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demon
     """Read demonstrations from the cache, or make them, with a progress bar, and keep them there.
 
     Args:
-        settings: everything that decides them; a file is named by its hash.
+        settings: everything that decides them; a file is named by their hash and that of the container's form.
         total: how many are made.
         make: makes them; calls its argument after each.
     """
-    path = cache_folder() / f"{settings['domain']}-{content_hash(settings)}.safetensors"
+    path = cache_folder() / f"{settings['domain']}-{content_hash({**settings, 'form': VERSION})}.safetensors"
     if path.is_file():
         try:
             return Demonstrations.load(path)

@@ -75,7 +75,10 @@ class Adaptation(pl.LightningModule, ABC):
         expected, found = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
         if found != expected:
             raise UserError(f"data.demonstrations: expected states of {expected} columns (the pretrained model's), found {found}")
-        self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
+        try:
+            self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
+        except UserError as error:
+            raise UserError(f"data.demonstrations: {error}") from None
         if self.model.examples is not None:  # of a user's own data, whose new concepts are judged by their demonstrations
             examples = concatenate([self.model.examples, self.demonstrations])
             config = self.model.config

@@ -157,8 +157,7 @@ class ConceptModel(nn.Module, ABC):
         self.view = find_view(domain, config.view)
         if config.perturb and (self.view is None or self.view.perturb is None):
             raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
-        if images := [name for name, feature in config.observed.items() if feature.kind == "image"]:
-            raise UserError(f"key 'observed/{images[0]}': expected vectors, found images, for which there is no encoder yet")
+        refuse_images(config.observed)
         self.normalization = normalization
         self.initial_normalization = initial_normalization
         self.register_buffer("empty", embeddings[0].clone())
@@ -357,6 +356,16 @@ class ConceptModel(nn.Module, ABC):
         except RuntimeError as error:
             raise UserError(f"{weights}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()})") from error
         return model.requires_grad_(False).eval()
+
+
+def refuse_images(features: Mapping[str, Feature]) -> None:
+    """Images are kept in files, but no model reads them.
+
+    Raises:
+        UserError: naming the first one.
+    """
+    if images := [name for name, feature in features.items() if feature.kind == "image"]:
+        raise UserError(f"key 'observed/{images[0]}': expected vectors, found images, for which there is no encoder yet")
 
 
 def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:

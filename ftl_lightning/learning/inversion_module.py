@@ -24,8 +24,9 @@ class InversionModule(Adaptation):
 
     Args:
         pretrained: folder of the pretrained model.
-        components, omega, initial_omega, off_span, initial_spread, restarts, learning_rate, weight_learning_rate, samples, loss,
-            timestep_power, seed: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
+        components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
+        initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
+        loss, timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.

@@ -28,7 +28,7 @@ from ftl_lightning.domains.paper import OURS
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import check_signature, sign
-from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors
+from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
@@ -148,6 +148,7 @@ class Pretraining(pl.LightningModule, ABC):
             resolution = data.domain.plans.resolution
             normalization = Normalization.fit(states, view.scales if view else (), resolution)
             beside = None
+            refuse_images(features)
             if features:
                 sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
                 beside = Normalization.fit(joined_vectors(seen, features), sizes.entities, resolution)

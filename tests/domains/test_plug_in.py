@@ -19,8 +19,10 @@ from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.registry import domain_names, load_domain, recorded_name
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from tests.conftest import ROOT
 
+PUSHES = ROOT / "examples" / "ftl-pushes"
 EXAMPLE = ROOT / "examples" / "ftl-strokes"
 SMALL = [
     "--trainer.enable_progress_bar=false",
@@ -108,6 +110,24 @@ def test_the_strokes_of_each_kind_are_recognised_as_that_kind_alone(strokes: Dom
         for goal in strokes.concepts.descriptions:
             assert measure(goal, drawn, None).float().mean() == float(goal == kind)
     assert not measure("arc upwards", torch.randn(50, 32, 2), None).any()
+
+
+def test_the_expert_s_pushes_are_right_in_open_and_closed_loop_and_a_random_target_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(PUSHES)
+    pushes = load_domain("ftl_pushes:DOMAIN")
+    source, measure, loop = pushes.source(None), pushes.metrics["accuracy"].measure, pushes.closed_loop
+    assert loop is not None
+    for task in pushes.concepts.descriptions:
+        drawn = source.draw(task, 40, 0)
+        starts = drawn.initial_states
+        assert torch.equal(starts.observed["world"], starts.require_scenes())
+        assert measure(task, drawn.states, starts).all()
+        assert measure(task, pushes.references["random target"](task, 40, starts, 0), starts).float().mean() < 0.8
+        rollout = roll_out(loop, starts, PlanFollower(fixed_plans(drawn.states), loop.act, loop.steps))
+        assert loop.judge(task, rollout)["success"].all()
+        assert len(loop.film(rollout.take(0, 1), drawn.states[:1])) > 1
+    held_out = source.split("validation", 5, 0)
+    assert not torch.equal(held_out.states, source.split("train", 5, 0).states)
 
 
 def test_a_domain_is_recorded_by_the_name_that_a_package_offers(strokes: Domain) -> None:
