@@ -90,7 +90,7 @@ class SampleOptions:
         seed: of the samples.
         sampler: see ftl_lightning.diffusion.samplers; empty for the one that the settings name.
         steps: of the sampler; 0 likewise.
-        temperature: the paper's alpha; lower is less diverse and more accurate; negative likewise.
+        temperature: the paper's alpha; lower is less diverse and more accurate; null likewise.
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
             drawn from the seed.
         initial: demonstrations file whose initial states are used instead; one sample of each.
@@ -110,7 +110,7 @@ class SampleOptions:
     seed: int = 0
     sampler: Literal["", "ddpm", "ddim", "dpm_solver"] = ""
     steps: int = 0
-    temperature: float = -1.0
+    temperature: float | None = None
     goal: str = ""
     initial: str = ""
     out: str = "states.safetensors"
@@ -172,7 +172,7 @@ def _sampling(options: SampleOptions) -> dict[str, Any]:
     """What differs from the configured way of sampling."""
     changes: dict[str, Any] = {"sampler": options.sampler} if options.sampler else {}
     changes |= {"steps": options.steps} if options.steps else {}
-    return changes | ({"temperature": options.temperature} if options.temperature >= 0 else {})
+    return changes | ({} if options.temperature is None else {"temperature": options.temperature})
 
 
 def _check_sample(options: SampleOptions, domain: "Domain") -> None:

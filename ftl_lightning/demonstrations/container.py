@@ -62,10 +62,10 @@ class Demonstrations:
                 f"key 'states': expected float32 of shape (demo, time, state), found {self.states.dtype} {tuple(self.states.shape)}"
             )
         count, time, state = self.states.shape
-        if not count or not time or not state:
-            raise UserError(
-                f"key 'states': expected at least one demonstration, time and column, found none in {tuple(self.states.shape)}"
-            )
+        if not count:
+            raise UserError("key 'states': expected at least one demonstration, found none")
+        if not time or not state:
+            raise UserError(f"key 'states': expected at least one time and column, found none in {tuple(self.states.shape)}")
         if self.lengths.shape != (count,) or self.lengths.min() < 1 or self.lengths.max() > time:
             raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {self.lengths.tolist()}")
         for key, values, expected in (

@@ -78,7 +78,7 @@ def test_npz_is_accepted_without_objects(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"states": torch.zeros(0, 1, 2)}, "at least one demonstration, time and column, found none"),
+        ({"states": torch.zeros(0, 1, 2)}, "at least one demonstration, found none"),
         ({"states": torch.full((1, 1, 2), float("nan"))}, r"key 'states': expected finite numbers, found nan at index \[0, 0, 0\]"),
         ({"states": torch.zeros(1, 2)}, r"expected float32 of shape \(demo, time, state\)"),
         ({"lengths": torch.tensor([3])}, "key 'lengths': expected 1 values between 1 and 1"),
