@@ -87,10 +87,10 @@ def _samples(rows: Sequence[Row]) -> str:
 def plain(table: Table) -> str:
     """The table as Markdown, as wide as it needs to be: for log files, pipes and TensorBoard."""
     own = copy.copy(table)
-    own.box, own.padding = box.MARKDOWN, (0, 1, 0, 1)
+    own.box, own.padding, own.title = box.MARKDOWN, (0, 1, 0, 1), None  # a title would be wrapped to the table's width
     file = io.StringIO()
     Console(file=file, width=100_000, color_system=None).print(own)
-    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
+    return "\n".join([str(table.title), *(line.rstrip() for line in file.getvalue().rstrip().splitlines())])
 
 
 def show(table: Table) -> None:
