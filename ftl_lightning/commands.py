@@ -158,7 +158,7 @@ def sample(options: SampleOptions) -> None:
     if options.execute and starts is not None:
         done = model.execute(composition, starts, goal, replan=options.replan or None, seed=options.seed, **_sampling(options))
         for name, value in done.outcomes.items():
-            print(f"closed loop, {name}: {value:.2f} of {len(starts)} episodes")
+            print(f"closed loop, {name}: {value:.2f}, mean of {len(starts)} episodes")
         if options.animation:
             done.save(options.animation)
     elif options.animation and film:
