@@ -20,7 +20,7 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import CONFIG, ConceptModel
+from ftl_lightning.learning.concept_model import CONFIG, DIFFUSION, ConceptModel
 from ftl_lightning.learning.inversion import InversionSettings, invert
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -176,7 +176,8 @@ class FewShot:
             folder = _from_hub(str(name))
         model = load_model(folder).to(device)
         if settings is None:
-            own = shipped(f"conf/invert/{model.config.domain}.yaml")
+            group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
+            own = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
             settings = own if own.is_file() else "conf/invert/own.yaml"
         return cls(model, Tuned.read(settings))
 

@@ -21,6 +21,11 @@ FORMAT = 1
 """Version of a file's form, unless its kind has versions of its own; a reader refuses others."""
 
 
+def cache_folder() -> Path:
+    """``$XDG_CACHE_HOME/ftl-lightning``, or ``~/.cache/ftl-lightning``."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ftl-lightning"
+
+
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name in the same folder, renamed to ``path`` when the block ends well and removed when it does not.

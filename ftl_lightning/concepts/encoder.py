@@ -1,6 +1,5 @@
 """Text to embedding: the shipped table, or any T5 or BERT-like language model."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.concepts.hashing import HashingEncoder
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import content_hash, file_hash, load_tensors, save_tensors
+from ftl_lightning.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
@@ -144,7 +143,7 @@ def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encod
             name = MINILM
     if name == HASHING:
         return HashingEncoder()
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ftl_lightning" / "embeddings"
+    cache = cache_folder() / "embeddings"
     if name == MINILM:
         import importlib.util
 

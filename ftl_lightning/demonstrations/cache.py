@@ -1,21 +1,14 @@
 """A cache of demonstrations that take long to make, in the user's cache folder."""
 
-import os
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from ftl_lightning.demonstrations.container import VERSION, Demonstrations
 from ftl_lightning.errors import UserError
 from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import content_hash
+from ftl_lightning.tensor_file import cache_folder, content_hash
 
 Tell = Callable[[], None]
-
-
-def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/ftl-lightning``, or ``~/.cache/ftl-lightning``."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ftl-lightning"
 
 
 def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demonstrations]) -> Demonstrations:

@@ -1,5 +1,6 @@
 """Inversion: learning concepts from a few demonstrations by gradient descent through the frozen model (Eq. 2 of the paper)."""
 
+import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,6 +8,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept, Origin
@@ -157,12 +159,16 @@ class Inversion(nn.Module):
             raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.learning_rate")
         return losses
 
+    @property
+    def rates(self) -> list[tuple[nn.Parameter, float]]:
+        """Each parameter with its learning rate."""
+        learned = isinstance(self.weights, nn.Parameter)
+        weights = [(self.weights, self.settings.weight_learning_rate)] if learned else []
+        return [(self.embeddings, self.settings.learning_rate), *weights]  # type: ignore[list-item]
+
     def optimizer(self, steps: int) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Adam, weights with a rate of their own, and its cosine decay over so many steps."""
-        groups = [{"params": [self.embeddings], "lr": self.settings.learning_rate}]
-        if isinstance(self.weights, nn.Parameter):
-            groups.append({"params": [self.weights], "lr": self.settings.weight_learning_rate})
-        optimizer = torch.optim.Adam(groups)
+        optimizer = torch.optim.Adam([{"params": [parameter], "lr": rate} for parameter, rate in self.rates])
         return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
     @torch.no_grad()
@@ -238,13 +244,45 @@ def invert(
         tell: called with the mean loss after each step.
     """
     inversion = Inversion(model, demonstrations, settings).to(model.device)
-    optimizer, decay = inversion.optimizer(steps)
+    groups = [_Group(parameter, rate) for parameter, rate in inversion.rates]
     for step in range(steps):
         losses = inversion.step_losses(step)
-        optimizer.zero_grad()
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
-        losses.mean(dim=1).sum().backward()
-        optimizer.step()
-        decay.step()
+        gradients = torch.autograd.grad(losses.mean(dim=1).sum(), [group.parameter for group in groups])
+        for group, gradient in zip(groups, gradients, strict=True):
+            group.step(gradient, step, steps)
         tell(losses.detach().mean().item())
     return inversion.learned()
+
+
+class _Group:
+    """A parameter and its state of Adam with cosine decay, the same arithmetic as :meth:`Inversion.optimizer`'s.
+
+    torch's optimiser classes import its compiler when they are used first, which takes longer than some concepts take to learn.
+    """
+
+    def __init__(self, parameter: nn.Parameter, rate: float) -> None:
+        self.parameter, self.rate = parameter, rate
+        self._mean, self._square = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        self._count = torch.zeros(())
+
+    @torch.no_grad()
+    def step(self, gradient: Tensor, step: int, steps: int) -> None:
+        """Follow the gradient of a step; the rate for the next is the decay's recursion in torch's order of arithmetic."""
+        adam(
+            [self.parameter],
+            [gradient],
+            [self._mean],
+            [self._square],
+            [],
+            [self._count],
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self.rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
+        after, before = (1 + math.cos(math.pi * done / steps) for done in (step + 1, step))
+        self.rate = after / before * self.rate

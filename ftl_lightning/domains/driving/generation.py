@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ftl_lightning.demonstrations.cache import cache_folder
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.environment import FEATURES_SEEN, OBSERVED, SCENARIO, SEEDS, STATE, TRAFFIC, scene
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import content_hash, load_tensors, save_tensors
+from ftl_lightning.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
 
 _LOG = logging.getLogger(__name__)
 
