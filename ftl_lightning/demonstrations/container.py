@@ -174,7 +174,7 @@ class Demonstrations:
 
     @property
     def hash(self) -> str:
-        """16 hexadecimal digits that states, lengths, observed features and scenes decide."""
+        """16-digit hash of states, lengths, observed features and scenes."""
         return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:

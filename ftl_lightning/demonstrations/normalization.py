@@ -26,20 +26,20 @@ class Normalization(nn.Module):
         self.register_buffer("high", high.float().clone())
 
     @classmethod
-    def fit(cls, states: Tensor, alike: Sequence[Sequence[int]] = (), resolution: float = 0.0) -> Self:
+    def fit(cls, states: Tensor, shared: Sequence[Sequence[int]] = (), resolution: float = 0.0) -> Self:
         """From states ``(..., state)``.
 
         Args:
             states: in the domain's units.
-            alike: columns of each exchangeable entity, in the same order: what is a position for one is a position for all, so
+            shared: columns of each exchangeable entity, in the same order: what is a position for one is a position for all, so
                 they share their extremes.
             resolution: in the domain's units: what varies less is rounding, which scaling to [-1, 1] would blow up, and counts as
                 constant.
         """
         flat = states.flatten(0, -2)
         low, high = flat.amin(dim=0), flat.amax(dim=0)
-        if alike:
-            columns = torch.tensor([list(entity) for entity in alike])
+        if shared:
+            columns = torch.tensor([list(entity) for entity in shared])
             low[columns] = low[columns].amin(dim=0).expand(columns.shape)
             high[columns] = high[columns].amax(dim=0).expand(columns.shape)
         rounding = RELATIVE * torch.maximum(low.abs(), high.abs())

@@ -41,7 +41,7 @@ def configuration(module: Evaluable, data: pl.LightningDataModule, settings: Map
 
 
 def config_hash(configured: Mapping[str, Any]) -> str:
-    """16 hexadecimal digits that everything configured decides."""
+    """16-digit hash of the full configuration."""
     return content_hash([__version__, configured])
 
 

@@ -34,7 +34,7 @@ def test_it_is_kept_with_a_model() -> None:
 
 def test_exchangeable_entities_share_their_extremes() -> None:
     states = torch.tensor([[0.0, 5.0, -2.0, 7.0], [1.0, 6.0, 0.0, 7.5]])
-    found = Normalization.fit(states, alike=((0, 1), (2, 3)))
+    found = Normalization.fit(states, shared=((0, 1), (2, 3)))
     assert found.low.tolist() == [-2, 5, -2, 5]
     assert found.high.tolist() == [1, 7.5, 1, 7.5]
 
