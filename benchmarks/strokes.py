@@ -1,0 +1,85 @@
+"""Behaviour that nothing was tuned on, through the command line alone: pen strokes, three kinds learned from five each.
+
+For each seed ``fit`` pretrains on eight kinds with ``conf/own.yaml``, ``invert`` learns three with ``conf/invert/own.yaml``,
+and fifty strokes of every kind are drawn. A rule that the method does not know, the nearest of sixty templates of each of eleven
+kinds, says what they are. Reference lines: fresh strokes of the generator, and what the model draws with the empty concept.
+
+    python benchmarks/strokes.py --out results/strokes.json
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from contextlib import chdir
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+from ftl_lightning.cli import main as ftl_lightning  # noqa: E402
+from ftl_lightning.few_shot import FewShot  # noqa: E402
+from ftl_lightning.learning.adaptation import file_name  # noqa: E402
+from ftl_lightning.tensor_file import write_text  # noqa: E402
+from tests.strokes import NEW, TRAINING, recognised, strokes  # noqa: E402
+
+SAMPLES, FEW, PRETRAINING = 50, 5, 100
+"""Strokes that are judged, learned from, and pretrained on, of each kind."""
+MODEL = "logs/own/fit/pretrained"
+
+
+def _write(path: str, kinds: tuple[str, ...], count: int, seed: int) -> None:
+    states = np.concatenate([strokes(kind, count, seed) for kind in kinds])
+    np.savez(path, states=states, concepts=np.repeat(kinds, count))
+
+
+def _rate(kind: str, states: np.ndarray) -> float:
+    return float(np.mean([found == kind for found in recognised(states)]))
+
+
+def run(seed: int) -> dict[str, dict[str, float]]:
+    """Rates in which each kind is recognised, by what generated it; in the current folder."""
+    _write("strokes.npz", TRAINING, PRETRAINING, seed)
+    _write("five.npz", NEW, FEW, 1_000_000 + seed)
+    common = [f"--seed_everything={seed}", "--trainer.accelerator=cpu"]
+    for verb, file, config in (("fit", "strokes.npz", "conf/own.yaml"), ("invert", "five.npz", "conf/invert/own.yaml")):
+        if ftl_lightning([verb, "--config", str(ROOT / config), f"--data.demonstrations={file}", *common]):
+            raise SystemExit(f"{verb} failed")
+    model = FewShot.from_pretrained(MODEL)
+    learned = {kind: model.load(f"logs/own/invert/concepts/{file_name(kind)}.safetensors") for kind in NEW}
+    drawn = {kind: model.sample(model[kind] * 1.2, SAMPLES, seed=seed).states.numpy() for kind in TRAINING}
+    drawn |= {kind: model.sample(concept, SAMPLES, seed=seed).states.numpy() for kind, concept in learned.items()}
+    empty = model.sample(model[TRAINING[0]] * 0.0, SAMPLES, seed=seed).states.numpy()
+    return {
+        "training kinds": {kind: _rate(kind, drawn[kind]) for kind in TRAINING},
+        "new kinds": {kind: _rate(kind, drawn[kind]) for kind in NEW},
+        "new kinds, empty concept": {kind: _rate(kind, empty) for kind in NEW},
+        "fresh strokes": {kind: _rate(kind, strokes(kind, SAMPLES, 2_000_000 + seed)) for kind in (*TRAINING, *NEW)},
+    }
+
+
+def main() -> None:
+    """Three seeds; prints and writes the rates."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    out = options.out and options.out.absolute()
+    found = {}
+    for seed in options.seeds:
+        with tempfile.TemporaryDirectory() as folder, chdir(folder):
+            found[f"seed {seed}"] = run(seed)
+    means = {
+        name: round(float(np.mean([list(rates[name].values()) for rates in found.values()])), 4)
+        for name in next(iter(found.values()))
+    }
+    text = json.dumps({"recognised": means, "by kind": found}, indent=2)
+    print(text)
+    if out:
+        write_text(out, text + "\n")
+
+
+if __name__ == "__main__":
+    main()
