@@ -46,7 +46,12 @@ def generate(
         raise UserError(f"out: expected a file, found the Minari data set {name!r}, which needs the extra 'minari'")
     found = load_domain(domain)
     source = found.source(Path(root) if root else None)
-    demonstrations = source.draw(task, count, seed, workers) if task else source.split("train", count, seed)
+    try:
+        demonstrations = source.draw(task, count, seed, workers) if task else source.split("train", count, seed)
+    except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
+        if task:
+            found.expect_goal(task, "task")
+        raise
     if name != out:
         from ftl_lightning.demonstrations.minari import write_minari
 
@@ -148,7 +153,8 @@ def sample(options: SampleOptions) -> None:
     told = {**plans.provenance, "concept": options.concept, "compose": options.compose}
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)
     plans.save(options.out)
-    print(f"{options.out}: {len(plans)} samples")
+    # Where a domain has no configuration of its own, what invert was told must be told again.
+    print(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
     for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
         print(f"{name} on '{goal}': {value:.2f}")
     if options.figure:
@@ -179,8 +185,10 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
     """Refuse what a domain cannot do, before anything is generated."""
     from ftl_lightning.errors import UserError
 
-    if options.goal and not domain.concepts.reads(options.goal):
-        raise UserError(f"goal: expected a task of {domain.name}, found {options.goal!r}")
+    if options.goal:
+        domain.expect_goal(options.goal)
+    if options.animation and options.execute and domain.closed_loop and domain.closed_loop.film is None:
+        raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
     if options.execute and domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     if options.animation and not options.execute and domain.show.film is None:

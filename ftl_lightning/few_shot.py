@@ -75,7 +75,7 @@ class Tuned:
             raise UserError(f"{path}: {error}") from None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LearnedConcept(Composition):
     """A learned concept; it composes with others like any composition.
 
@@ -86,6 +86,9 @@ class LearnedConcept(Composition):
 
     concept: Concept
     model: ConceptModel
+
+    def __repr__(self) -> str:
+        return f"LearnedConcept({self.concept.origin.name!r}, K = {len(self.weights)}, loss {self.concept.origin.loss:.3f})"
 
     def explain(self, nearest: int = 3) -> Explanation:
         """What its weighted sum is made of, in words of the training concepts."""
@@ -118,7 +121,7 @@ class Execution:
         """Share of episodes in which something happened, or its mean, by name; empty without a goal."""
         if not self.goal:
             return {}
-        found = _loop(self.domain).judge(self.goal, self.rollout)
+        found = self.domain.judge(self.goal, self.rollout)
         return {name: float(values.float().mean()) for name, values in found.items()}
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
@@ -126,7 +129,9 @@ class Execution:
         plans = self.followed.get(episode)
         if not plans:
             raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {episode}")
-        return _loop(self.domain).film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
+        if (film := _loop(self.domain).film) is None:
+            raise UserError(f"film: expected a domain that films episodes, found {self.domain.name}")
+        return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
 
     def save(self, path: str | Path, episode: int = 0) -> None:
         """Write an episode as an animated .gif."""
@@ -134,7 +139,7 @@ class Execution:
 
         if Path(path).suffix != ".gif":
             raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
-        outcomes = _loop(self.domain).judge(self.goal, self.rollout) if self.goal else {}
+        outcomes = self.domain.judge(self.goal, self.rollout) if self.goal else {}
         pictures = captioned(self.frames(episode), outcome_text(self.goal, outcomes, episode))
         with atomic(path) as temporary:
             temporary.write_bytes(gif(pictures))
@@ -152,10 +157,14 @@ class FewShot:
     Args:
         model: frozen.
         tuned: the settings that go with it, which every method takes unless it is told others.
+
+    Attributes:
+        settings: the configuration file that they were read from; empty if none was.
     """
 
     def __init__(self, model: ConceptModel, tuned: Tuned) -> None:
         self.model, self.tuned = model, tuned
+        self.settings = ""
         self._examples: list[Demonstrations] = [] if model.examples is None else [model.examples]
 
     @classmethod
@@ -179,7 +188,9 @@ class FewShot:
             group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
             own = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
             settings = own if own.is_file() else "conf/invert/own.yaml"
-        return cls(model, Tuned.read(settings))
+        found = cls(model, Tuned.read(settings))
+        found.settings = str(settings)
+        return found
 
     @property
     def domain(self) -> Domain:
@@ -374,16 +385,11 @@ class FewShot:
         Raises:
             UserError: for a goal that the domain cannot judge by, or a domain that judges no plans.
         """
-        found = self._judging.metrics
-        if not found:
+        if not self._judging.metrics:
             raise UserError(f"evaluate: expected a domain that judges plans, found {self.domain.name}; execute them")
-        self._check(goal)
-        starts = plans.initial_states
-        return {name: float(metric.measure(goal, plans.states, starts).float().mean()) for name, metric in found.items()}
-
-    def _check(self, goal: str) -> None:
-        if not self._judging.concepts.reads(goal):
-            raise UserError(f"goal: expected a task of {self.domain.name}, found {goal!r}")
+        self._judging.expect_goal(goal)
+        found = self._judging.measure(goal, plans.states, plans.initial_states)
+        return {name: float(values.float().mean()) for name, values in found.items()}
 
     @property
     def _judging(self) -> Domain:
@@ -400,8 +406,8 @@ class FewShot:
         """A picture of plans; with a goal, right ones are framed green and wrong ones red."""
         starts, right = plans.initial_states, None
         if goal:
-            self._check(goal)
-            judged = (metric.measure(goal, plans.states, starts) for metric in self._judging.metrics.values())
+            self._judging.expect_goal(goal)
+            judged = self._judging.measure(goal, plans.states, starts).values()
             right = next((one.tolist() for one in judged if one.dtype == torch.bool and one.dim()), None)
         return self.domain.show.picture(plans.states, right, goal or "samples", starts if self.domain.observed else None)
 
@@ -432,7 +438,7 @@ class FewShot:
 
         loop = _loop(self.domain)
         if goal:
-            self._check(goal)
+            self._judging.expect_goal(goal)
         if replan is not None and replan < 1:
             raise UserError(f"replan: expected 1 or more, found {replan}")
         starts = scenes if isinstance(scenes, InitialStates) else reset(loop, _tensor(scenes))

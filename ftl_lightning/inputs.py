@@ -7,7 +7,7 @@ from typing import Any
 
 from ftl_lightning.configuration import configurations, load
 from ftl_lightning.errors import UserError
-from ftl_lightning.shipped import pretrained_folder
+from ftl_lightning.shipped import pretrained_folder, shipped_models
 
 Check = Callable[[str], None]
 """Raises a :class:`UserError` for a path where nothing is that could be meant."""
@@ -16,7 +16,10 @@ Check = Callable[[str], None]
 def _model(path: str) -> None:
     config = Path(path) / "config.json"
     if not (pretrained_folder(path) / config.name).is_file():
-        raise UserError(f"{config}: expected a pretrained model, found nothing; run: python -m ftl_lightning fit")
+        raise UserError(
+            f"{config}: expected a pretrained model, found nothing; run: python -m ftl_lightning fit, or name one that ships: "
+            f"{', '.join(shipped_models())}"
+        )
 
 
 def _checkpoint(path: str) -> None:
@@ -84,7 +87,7 @@ def _flat(keys: Mapping[str, Any], above: str) -> Iterator[tuple[str, Any]]:
 
 def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Every option with its value, given as ``--option=value`` or ``--option value``."""
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
         if argument.startswith("--"):
             option, equals, value = argument[2:].partition("=")
             yield option, value if equals else following

@@ -28,6 +28,11 @@ def shipped(path: str | Path) -> Path:
     return path
 
 
+def shipped_models() -> list[str]:
+    """Names of the models that ship, such as ``agent``; baselines apart."""
+    return sorted(path.parent.name for path in (_PACKAGE / "pretrained").glob("*/config.json"))
+
+
 def pretrained_folder(name: str | Path) -> Path:
     """The folder of a pretrained model by its path, or by the name of one that ships, such as ``agent``."""
     for path in (Path(name), shipped(name), shipped(Path("pretrained") / name)):

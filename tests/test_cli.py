@@ -46,7 +46,7 @@ def test_the_overview_names_every_verb(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_verbs_without_a_trainer_start_at_once() -> None:
     code = (
-        "import sys; from ftl_lightning.cli import main; main(['generate', '--help']);"
+        "import sys; from ftl_lightning.cli import COMMANDS, TRAINER_VERBS, main; main(['generate', '--help']);"
         "sys.exit(any(m in sys.modules for m in ('lightning', 'torch', 'transformers')))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True).returncode == 0
@@ -71,7 +71,7 @@ def test_a_missing_input_file_is_told_before_anything_slow_is_imported() -> None
         ["sample", "--pretrained", "nowhere"],
     ):
         code = (
-            f"import sys; from ftl_lightning.cli import main; code = main({arguments!r});"
+            f"import sys; from ftl_lightning.cli import COMMANDS, TRAINER_VERBS, main; code = main({arguments!r});"
             "sys.exit(code if not {'lightning', 'torch', 'transformers', 'jsonargparse'} & sys.modules.keys() else 99)"
         )
         done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True, text=True)
@@ -321,3 +321,12 @@ def test_mistakes_are_told_before_anything_is_learned(
     told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", *options)
     assert expected in told
     assert not list(Path().rglob("concepts"))
+
+
+@pytest.mark.parametrize("verb", [*TRAINER_VERBS, *COMMANDS])
+def test_a_verb_without_options_says_what_it_needs(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([verb]) == 2
+    told = capsys.readouterr().err.strip()
+    assert told.startswith("error: ")
+    assert "expected" in told or "required" in told
+    assert "\n" not in told

@@ -253,6 +253,8 @@ class Demonstrations:
         for name, feature in features.items():
             if (own := found.features.get(name)) is None or own.shape != feature.shape:
                 told = "none" if own is None else f"shape {own.shape}"
+                if own is not None and own.shape[1:] == feature.shape and name not in found.per_step:
+                    told += " (observed at every time? then list it in per_step)"
                 raise UserError(f"key 'observed/{name}': expected shape {feature.shape} each, found {told}")
         return found
 

@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from ftl_lightning.concepts.encoder import Encoder, load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.demonstrations.features import expect_features
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
@@ -128,6 +129,10 @@ class PretrainingData(pl.LightningDataModule):
         source = self.domain.source(self.root)
         self.training = source.split("train", self.samples_per_concept, self.seed).fitted(self.domain.observed)
         self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
+        # Evaluation draws initial states: a mistake in them is told before training, not after.
+        starts = source.starts(self.domain.concepts.training[0], 1, self.seed) if self.domain.observed else None
+        if starts is not None:
+            expect_features(starts.observed, self.domain.observed)
 
     @property
     def examples(self) -> Demonstrations | None:

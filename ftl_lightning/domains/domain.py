@@ -3,6 +3,7 @@
 Name, plans, concepts and source have to be said; everything else has a default.
 """
 
+import difflib
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
+from ftl_lightning.errors import UserError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -178,7 +180,8 @@ class ClosedLoop:
             actions (episode, action)``.
         steps: at most, of an episode.
         judge: ``(goal, rollout) -> what happened``, by name ``(episode,)``; ``'success'``, of bool, is the paper's metric.
-        film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``.
+        film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``; ``None`` where episodes are
+            not filmed.
         keeps: observed features that ``judge`` and ``film`` ask for; all where empty.
         less_is_better: of which outcomes less is better.
         policies: policies to print beside every rate: name to ``(goal, initial states, demonstrations that the behaviour was
@@ -189,7 +192,7 @@ class ClosedLoop:
     act: Callable[[Tensor, int, Observed], Tensor]
     steps: int
     judge: Callable[[str, Rollout], dict[str, Tensor]]
-    film: Callable[[Rollout, Tensor], Frames]
+    film: Callable[[Rollout, Tensor], Frames] | None = None
     keeps: tuple[str, ...] = ()
     less_is_better: tuple[str, ...] = ()
     policies: Mapping[str, Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
@@ -218,6 +221,12 @@ class View:
     perturb: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
     act: Callable[[Tensor, int, Observed], Tensor] | None = None
     scales: tuple[tuple[int, ...], ...] = ()
+
+
+def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:
+    if not isinstance(values, Tensor) or tuple(values.shape) not in shapes:
+        found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+        raise UserError(f"{what}: expected a tensor of shape {' or '.join(map(str, shapes))}, found {found}")
 
 
 @dataclass(frozen=True)
@@ -256,6 +265,43 @@ class Domain:
     def __post_init__(self) -> None:
         if self.show is _LINES:
             object.__setattr__(self, "show", line_drawings(self.plans))
+
+    def measure(self, goal: str, states: Tensor, starts: InitialStates | None) -> dict[str, Tensor]:
+        """What each metric says of plans ``(sample, horizon, state)``, by name.
+
+        Raises:
+            UserError: for a metric that returns neither a number for each plan nor one for all of them.
+        """
+        found = {name: metric.measure(goal, states, starts) for name, metric in self.metrics.items()}
+        for name, values in found.items():
+            _expect(f"domain {self.name}, metric {name!r}", values, ((len(states),), ()))
+        return found
+
+    def judge(self, goal: str, rollout: Rollout) -> dict[str, Tensor]:
+        """What happened in episodes, by name ``(episode,)``.
+
+        Raises:
+            UserError: for a judge that returns something else, or no success.
+        """
+        assert self.closed_loop is not None
+        found = self.closed_loop.judge(goal, rollout)
+        if not isinstance(found, Mapping) or SUCCESS not in found:
+            told = ", ".join(found) if isinstance(found, Mapping) else type(found).__name__
+            raise UserError(f"domain {self.name}, judge: expected outcomes by name, {SUCCESS!r} among them, found {told}")
+        for name, values in found.items():
+            _expect(f"domain {self.name}, outcome {name!r}", values, ((len(rollout.failed),),))
+        return dict(found)
+
+    def expect_goal(self, goal: str, key: str = "goal") -> None:
+        """Refuse a goal that the domain cannot read.
+
+        Raises:
+            UserError: naming the nearest goals that it knows.
+        """
+        if not self.concepts.reads(goal):
+            known = [text for text in self.concepts.descriptions if self.concepts.reads(text)]
+            near = difflib.get_close_matches(goal, known, n=5, cutoff=0.4) or known[:5]
+            raise UserError(f"{key}: expected a task of {self.name}, such as {', '.join(map(repr, near))}, found {goal!r}")
 
     @property
     def main_metric(self) -> str:

@@ -38,9 +38,13 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
                 axes.plot(*plan[:1].T, "o", color=START, markersize=3)
                 axes.set(**_limits(low, high), box_aspect=None if spatial else 1)
             else:
+                axes.set_ylim(_room(min(low), max(high)))  # one scale for all
                 for column, name in enumerate(names):
                     axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=name)
-            axes.set(xticks=[], yticks=[])
+            lines = states.shape[2] not in (2, 3) or states.shape[1] == 1
+            axes.set(xticks=[])
+            if not lines or axes is not figure.axes[0]:  # the first panel tells the scale
+                axes.set(yticks=[])
             for spine in axes.spines.values():
                 spine.set(color=colour, linewidth=2.0)
         for axes in figure.axes[len(states) :]:
@@ -50,6 +54,11 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
         return figure
 
     return render
+
+
+def _room(low: float, high: float) -> tuple[float, float]:
+    margin = 0.05 * max(high - low, 1e-6)
+    return low - margin, high + margin
 
 
 def _limits(low: Sequence[float], high: Sequence[float]) -> dict[str, tuple[float, float]]:

@@ -29,8 +29,13 @@ def load_domain(name: str) -> Domain:
         raise UserError(f"domain: expected one of {', '.join(domain_names())}, or package.module:DOMAIN, found {name!r}")
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError, TypeError) as error:  # the last two for no or a relative module
-        raise UserError(f"domain {name!r}: cannot be imported ({error}); install its package or mend the name") from error
+    except UserError:
+        raise
+    except Exception as error:  # whatever a module raises that is imported
+        known = isinstance(error, ModuleNotFoundError | AttributeError | ValueError)
+        told = str(error) if known else f"{type(error).__name__}: {error}"
+        mend = "install its package or mend the name" if known else "mend its module"
+        raise UserError(f"domain {name!r}: cannot be imported ({told}); {mend}") from error
     if not isinstance(found, Domain):
         raise UserError(f"domain {name!r}: expected a Domain, found {type(found).__name__}")
     return found

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -15,6 +15,7 @@ from ftl_lightning.demonstrations.features import InitialStates, Observed, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop, Policy
 from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.progress import Advance, bar
 
@@ -67,6 +68,9 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
 
     def see(row: int, step: int, seen: Observed) -> None:
         for name, values in now.items():
+            if not isinstance(seen, Mapping) or name not in seen or tuple(np.shape(seen[name])) != tuple(values.shape[1:]):
+                found_shape = np.shape(seen[name]) if isinstance(seen, Mapping) and name in seen else "none"
+                raise UserError(f"environment: expected it to observe {name!r} {tuple(values.shape[1:])}, found {found_shape}")
             values[place[row]] = torch.as_tensor(seen[name])
             if name in found.observed:
                 found.observed[name][row, step:] = values[place[row]]
@@ -81,6 +85,8 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
             if not active:
                 break
             actions = policy(take(now, [place[row] for row in active]), active, step).numpy().astype(np.float32)
+            if len(actions) != len(active):
+                raise UserError(f"planner: expected actions of {len(active)} episodes, found shape {actions.shape}")
             going = []
             for row, action in zip(active, actions, strict=True):
                 if not np.isfinite(action).all():

@@ -5,6 +5,7 @@ model and :class:`Evaluable`.
 """
 
 import itertools
+import logging
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -33,6 +34,8 @@ from ftl_lightning.evaluation.summary import OWN, show, summary_table
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.seeding import EVALUATION_SEED, generator
+
+_LOG = logging.getLogger(__name__)
 
 
 def _key(task: EvaluationTask) -> tuple[int, ...]:
@@ -204,19 +207,22 @@ class Evaluator(pl.Callback):
             compared = self.references if self.references is not None else not getattr(data, "own", False)
             beside = references(self.judged, domain, module.demonstrated, self.seed) if compared else {}
             found = rows(module, domain, self.judged, beside, configured)
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                self._draw(logger, domain, trainer.global_step)
-                if stage == "test" or not self._projected:  # training embeddings do not change while fitting
-                    log_projector(logger, module.concept_embeddings(), trainer.global_step)
-                    self._projected = True
-                log_test(logger, configured, found, trainer.global_step)
-        if found:
+        if found:  # before anything is drawn, which may fail
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
             append_rows(path, found)
             show(summary_table(found, [row.task for row in found if row.setting == OWN]))
             if self.results is None:
                 print(f"{path}: {len(found)} rows")
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                try:
+                    self._draw(logger, domain, trainer.global_step)
+                except Exception as error:  # whatever a domain's pictures raise: numbers are there already
+                    _LOG.warning("domain %s: its pictures cannot be drawn: %r", domain.name, error)
+                if stage == "test" or not self._projected:  # training embeddings do not change while fitting
+                    log_projector(logger, module.concept_embeddings(), trainer.global_step)
+                    self._projected = True
+                log_test(logger, configured, found, trainer.global_step)
 
     def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
         for one in self.judged if self.figures else ():
@@ -226,8 +232,9 @@ class Evaluator(pl.Callback):
             title = one.task.name if one.right is None else f"{one.task.name}: {share(one.right):.2f}"
             figure = domain.show.picture(one.states[shown], right, title, start)
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
-            if one.rollout is not None and one.followed is not None and domain.closed_loop is not None:
-                pictures = domain.closed_loop.film(one.rollout.take(0, 1), one.followed)
+            film = domain.closed_loop.film if domain.closed_loop else None
+            if film and one.rollout is not None and one.followed is not None:
+                pictures = film(one.rollout.take(0, 1), one.followed)
                 log_animation(
                     logger,
                     f"{CLOSED}/{one.task.setting}/{one.task.name}",

@@ -43,13 +43,11 @@ class Judged:
     @classmethod
     def of(cls, task: EvaluationTask, states: Tensor, starts: InitialStates | None, domain: Domain) -> Self:
         """Judge states by the task's goal."""
-        found = {name: metric.measure(task.goal, states, starts) for name, metric in domain.metrics.items()}
-        return cls(task, states, found, starts)
+        return cls(task, states, domain.measure(task.goal, states, starts), starts)
 
     def executed(self, rollout: Rollout, domain: Domain) -> Self:
         """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
-        assert domain.closed_loop is not None
-        outcomes = domain.closed_loop.judge(self.task.goal, rollout)
+        outcomes = domain.judge(self.task.goal, rollout)
         return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
 
     @property

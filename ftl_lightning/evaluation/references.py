@@ -7,6 +7,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.tensor_file import bytes_hash
@@ -40,6 +41,8 @@ def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, se
     if key not in _KNOWN:
         _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.starts, seed)
     plans = _KNOWN[key]
+    if (expected := (len(one.states), domain.plans.horizon, one.states.shape[2])) != tuple(plans.shape):
+        raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")
     own = Judged.of(one.task, plans, one.starts, domain)
     if loop is None:
         return own

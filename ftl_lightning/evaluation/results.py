@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
@@ -117,6 +118,11 @@ def labels(rows: pd.DataFrame) -> pd.Series:
     return pd.Series([label(*pair) for pair in zip(rows["method"], rows["variant"], strict=True)], rows.index, dtype=str)
 
 
+def replaced(rows: pd.DataFrame) -> int:
+    """How many rows :func:`latest` leaves out because others about the same were measured later, however configured."""
+    return len(rows) - len(latest(rows))
+
+
 def latest(rows: pd.DataFrame) -> pd.DataFrame:
     """Of rows about the same that differ only in how they were configured, the one that was measured last."""
     return rows.drop_duplicates(_SUBJECT, keep="last")
@@ -133,9 +139,19 @@ def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
         UserError: as :func:`read_rows`.
     """
     path = Path(path)
-    files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
+    files = _files(path) if path.is_dir() else [path]
     own = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES))]
     return pd.concat([read_rows(file) for file in own], ignore_index=True) if own else pd.DataFrame(columns=COLUMNS)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Results files below a folder, ``invert_2`` before ``invert_10``."""
+    return sorted(folder.rglob("*.csv"), key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path)])
+
+
+def _parts(path: Path) -> list[str]:
+    # Every second part is a number, so that numbers are compared with numbers alone.
+    return re.split(r"(\d+)", path.as_posix())
 
 
 def read_rows(path: str | Path) -> pd.DataFrame:
@@ -145,7 +161,9 @@ def read_rows(path: str | Path) -> pd.DataFrame:
         UserError: if there is none, or a file has other columns. Files of older versions are read too, see :func:`upgraded`.
     """
     path = Path(path)
-    files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
+    if not path.exists():
+        raise UserError(f"{path}: expected a results file or a folder of them, found nothing; invert writes one to its log folder")
+    files = _files(path) if path.is_dir() else [path]
     tables = []
     for file in files:
         try:

@@ -1,5 +1,6 @@
 """Inversion: learning concepts from a few demonstrations by gradient descent through the frozen model (Eq. 2 of the paper)."""
 
+import logging
 import math
 import zlib
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
 from ftl_lightning.seeding import generator
+
+_LOG = logging.getLogger(__name__)
 
 FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
@@ -202,6 +205,9 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
         raise UserError(
             f"model.off_span: expected 1 (free) for {model.name}, whose concepts are no texts, found {settings.off_span}"
         )
+    pretrained = model.config.training.get("model", {}).get("loss", settings.loss)
+    if pretrained != settings.loss:
+        _LOG.warning("model.loss: the model was pretrained with %r; with %r concepts are learned worse", pretrained, settings.loss)
 
 
 def origin(model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float) -> Origin:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
 from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, growth
@@ -36,6 +36,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     """
     rows = read_rows(results)
     ablations, comparison, curves = (read_study(results, name) for name in ("", COMPARISON, CURVES))
+    if count := replaced(ablations):
+        print(f"{results}: {count} rows are left out, since the same was measured again later in another configuration")
     everything, headline = [], []
     for name in sorted(set(rows["domain"])):
         domain = domain_of(name, rows)

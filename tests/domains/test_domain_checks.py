@@ -1,0 +1,64 @@
+"""What a domain's author can get wrong is told in one line, not in wrong numbers."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import ClosedLoop, Domain, Metric
+from ftl_lightning.domains.object_rearrangement import DOMAIN
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.references import references
+
+STATES = torch.zeros(5, 1, 21)
+GOAL = "circle right of square"
+
+
+def with_metric(values: Any) -> Domain:
+    return replace(DOMAIN, metrics={"mine": Metric(lambda goal, states, starts: values)})
+
+
+@pytest.mark.parametrize("values", [torch.zeros(5, 5), torch.zeros(3), [True] * 5, STATES.numpy()[:, 0, 0]], ids=str)
+def test_a_metric_of_another_shape_is_refused(values: Any) -> None:
+    with pytest.raises(UserError, match=r"metric 'mine': expected a tensor of shape \(5,\) or \(\), found"):
+        Judged.of(EvaluationTask("s", GOAL), STATES, None, with_metric(values))
+
+
+@pytest.mark.parametrize("values", [torch.ones(5), torch.tensor(0.5)], ids=str)
+def test_a_number_for_each_plan_or_for_all_is_accepted(values: Tensor) -> None:
+    assert with_metric(values).measure(GOAL, STATES, None) == {"mine": values}
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "expected"),
+    [
+        ({"success": torch.ones(2, 2, dtype=torch.bool)}, r"outcome 'success': expected a tensor of shape \(2,\)"),
+        ({"crash": torch.ones(2)}, "expected outcomes by name, 'success' among them, found crash"),
+        (torch.ones(2), "expected outcomes by name, 'success' among them, found Tensor"),
+    ],
+    ids=str,
+)
+def test_a_judge_of_another_shape_is_refused(outcomes: Any, expected: str) -> None:
+    loop = ClosedLoop(lambda: None, lambda plans, step, observed: plans, 1, lambda goal, rollout: outcomes)  # type: ignore[arg-type,return-value]
+    rollout = Rollout(InitialStates({}, torch.zeros(2, 1)), {}, torch.zeros(2, dtype=torch.bool), [{}, {}])
+    with pytest.raises(UserError, match=expected):
+        replace(DOMAIN, closed_loop=loop).judge(GOAL, rollout)
+
+
+def test_a_reference_line_of_another_shape_is_refused() -> None:
+    domain = replace(DOMAIN, name="other", references={"mine": lambda goal, count, starts, seed: torch.zeros(count, 2, 21)})
+    one = Judged.of(EvaluationTask("s", GOAL), STATES, None, domain)
+    with pytest.raises(UserError, match=r"reference 'mine': expected plans \(5, 1, 21\), found \(5, 2, 21\)"):
+        references([one], domain, lambda concept: None, 0)
+
+
+def test_a_misspelt_goal_is_told_with_goals_that_are_near() -> None:
+    with pytest.raises(UserError, match="goal: expected a task of agent, such as 'go to red bowl'"):
+        load_domain("agent").expect_goal("go to red bowll")
