@@ -60,9 +60,8 @@ class Plans:
         return self.start_exponent if window >= self.horizon else 1.0
 
 
-def _described(text: str) -> bool:
-    """Stands for the default of :attr:`Concepts.reads`, which depends on the descriptions."""
-    raise NotImplementedError
+_UNSAID: Any = None
+"""Default of a field whose value follows from the others where it is not said."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Concepts:
     training: tuple[str, ...]
     suites: Mapping[str, Suite] = field(default_factory=dict)
     descriptions: tuple[str, ...] = ()
-    reads: Callable[[str], bool] = _described
+    reads: Callable[[str], bool] = _UNSAID
     sentence: Callable[[str], str] = str
     table: Path | None = None
 
@@ -93,7 +92,7 @@ class Concepts:
         if not self.descriptions:
             texts = dict.fromkeys((*self.training, *(goal for suite in self.suites.values() for goal in suite.goals)))
             object.__setattr__(self, "descriptions", tuple(texts))
-        if self.reads is _described:
+        if self.reads is _UNSAID:
             object.__setattr__(self, "reads", frozenset(self.descriptions).__contains__)
 
 
@@ -159,10 +158,6 @@ def line_drawings(plans: Plans) -> Show:
     Paths in two or three dimensions are also filmed.
     """
     return Show(line_plots.picture(plans.columns), line_plots.film if len(plans.columns) in (2, 3) else None)
-
-
-_LINES = Show(line_plots.picture(()))
-"""Stands for the default of :attr:`Domain.show`, which depends on the plans."""
 
 
 Policy = Callable[[Observed, list[int], int], Tensor]
@@ -253,7 +248,7 @@ class Domain:
     plans: Plans
     concepts: Concepts
     source: Callable[[Path | None], Source]
-    show: Show = _LINES
+    show: Show = _UNSAID
     observed: Mapping[str, Feature] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
     headline: str = ACCURACY
@@ -263,7 +258,7 @@ class Domain:
     paper: Paper | None = None
 
     def __post_init__(self) -> None:
-        if self.show is _LINES:
+        if self.show is _UNSAID:
             object.__setattr__(self, "show", line_drawings(self.plans))
 
     def measure(self, goal: str, states: Tensor, starts: InitialStates | None) -> dict[str, Tensor]:

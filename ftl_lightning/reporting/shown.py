@@ -5,8 +5,7 @@ from typing import NoReturn
 
 import pandas as pd
 
-from ftl_lightning.domains.domain import CLOSED, EXECUTED, Concepts, Domain, Metric, Plans, Show
-from ftl_lightning.domains.line_plots import picture
+from ftl_lightning.domains.domain import CLOSED, EXECUTED, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.paper import OURS, Published
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
@@ -25,12 +24,11 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
         own = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
         metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(own)}
         concepts = Concepts(training=(), suites={}, descriptions=(), reads=lambda text: False)
-        show = Show(picture(()))
-        return Domain(name, Plans(0, (), ()), concepts, _unknown, show, metrics=metrics, headline=next(iter(metrics), EXECUTED))
+        return Domain(name, Plans(0, (), ()), concepts, _unknown, metrics=metrics, headline=next(iter(metrics), EXECUTED))
 
 
 def _unknown(*arguments: object) -> NoReturn:
-    raise NotImplementedError("this domain is known by its results alone")
+    raise UserError("domain: expected an installed one, found one that is known by its results alone; install its package")
 
 
 def _suite(domain: Domain, name: str) -> tuple[str, ...]:
