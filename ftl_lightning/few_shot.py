@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition, parse_composition
@@ -17,62 +17,23 @@ from ftl_lightning.concepts.explanation import Explanation, explain
 from ftl_lightning.demonstrations.container import Demonstrations, padded
 from ftl_lightning.demonstrations.features import Feature, InitialStates
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.domain import ClosedLoop, Domain
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.execution import Execution, closed_loop_of
 from ftl_lightning.learning.concept_model import CONFIG, DIFFUSION, ConceptModel
-from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 from ftl_lightning.shipped import pretrained_folder, shipped
 from ftl_lightning.tensor_file import atomic
+from ftl_lightning.tuned import Tuned
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Start = InitialStates | Mapping[str, ArrayLike] | ArrayLike
 """Where behaviour starts: initial states, observed features by name, or the only feature's values ``(sample, *shape)``."""
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """The settings that go with a model.
-
-    Attributes:
-        inversion: how concepts are learned.
-        learning_steps: of gradient descent.
-        sampling: how behaviour is generated.
-        replan: steps that a plan is followed in closed loop before a new one is made.
-    """
-
-    inversion: InversionSettings
-    learning_steps: int
-    sampling: Sampling
-    replan: int
-
-    @classmethod
-    def read(cls, path: str | Path) -> Self:
-        """From a configuration file of ``invert``.
-
-        Raises:
-            UserError: naming the file, if it is none or a value is not allowed.
-        """
-        from ftl_lightning.configuration import load  # OmegaConf, which nothing else here needs
-
-        content = load(path)
-        model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
-        learning, seen = model.get("init_args") or {}, {field.name for field in fields(InversionSettings)} - {"seed"}
-        sampling = {field.name: evaluation[field.name] for field in fields(Sampling) if field.name in evaluation}
-        try:
-            return cls(
-                inversion=InversionSettings(**{key: value for key, value in learning.items() if key in seen}),
-                learning_steps=int((data.get("init_args") or {}).get("steps", 400)),
-                sampling=Sampling(**sampling),
-                replan=int(evaluation.get("replan", 1)),
-            )
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from None
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,57 +59,6 @@ class LearnedConcept(Composition):
     def save(self, path: str | Path) -> None:
         """Write it to a file that every command reads."""
         self.concept.save(path)
-
-
-@dataclass(frozen=True)
-class Execution:
-    """Episodes in which plans were executed.
-
-    Attributes:
-        domain: whose environment it was.
-        goal: in words; empty if nobody judged.
-        rollout: what happened.
-        followed: for each episode the plan ``(horizon, state)`` of each of its steps.
-    """
-
-    domain: Domain
-    goal: str
-    rollout: Rollout
-    followed: Mapping[int, Sequence[Tensor]]
-
-    @property
-    def outcomes(self) -> dict[str, float]:
-        """Share of episodes in which something happened, or its mean, by name; empty without a goal."""
-        if not self.goal:
-            return {}
-        found = self.domain.judge(self.goal, self.rollout)
-        return {name: float(values.float().mean()) for name, values in found.items()}
-
-    def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
-        """Pictures ``(height, width, 3)`` of an episode."""
-        plans = self.followed.get(episode)
-        if not plans:
-            raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {episode}")
-        if (film := _loop(self.domain).film) is None:
-            raise UserError(f"film: expected a domain that films episodes, found {self.domain.name}")
-        return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
-
-    def save(self, path: str | Path, episode: int = 0) -> None:
-        """Write an episode as an animated .gif."""
-        from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
-
-        if Path(path).suffix != ".gif":
-            raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
-        outcomes = self.domain.judge(self.goal, self.rollout) if self.goal else {}
-        pictures = captioned(self.frames(episode), outcome_text(self.goal, outcomes, episode))
-        with atomic(path) as temporary:
-            temporary.write_bytes(gif(pictures))
-
-
-def _loop(domain: Domain) -> ClosedLoop:
-    if domain.closed_loop is None:
-        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
-    return domain.closed_loop
 
 
 class FewShot:
@@ -436,7 +346,7 @@ class FewShot:
         """
         from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, reset, roll_out, sampled_plans
 
-        loop = _loop(self.domain)
+        loop = closed_loop_of(self.domain)
         if goal:
             self._judging.expect_goal(goal)
         if replan is not None and replan < 1:

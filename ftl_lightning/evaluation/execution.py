@@ -1,0 +1,70 @@
+"""Executed plans as a user of the Python API holds them: outcomes, frames, a film."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.domains.domain import ClosedLoop, Domain
+from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
+from ftl_lightning.tensor_file import atomic
+
+
+@dataclass(frozen=True)
+class Execution:
+    """Episodes in which plans were executed.
+
+    Attributes:
+        domain: whose environment it was.
+        goal: in words; empty if nobody judged.
+        rollout: what happened.
+        followed: for each episode the plan ``(horizon, state)`` of each of its steps.
+    """
+
+    domain: Domain
+    goal: str
+    rollout: Rollout
+    followed: Mapping[int, Sequence[Tensor]]
+
+    @property
+    def outcomes(self) -> dict[str, float]:
+        """Share of episodes in which something happened, or its mean, by name; empty without a goal."""
+        if not self.goal:
+            return {}
+        found = self.domain.judge(self.goal, self.rollout)
+        return {name: float(values.float().mean()) for name, values in found.items()}
+
+    def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
+        """Pictures ``(height, width, 3)`` of an episode."""
+        plans = self.followed.get(episode)
+        if not plans:
+            raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {episode}")
+        if (film := closed_loop_of(self.domain).film) is None:
+            raise UserError(f"film: expected a domain that films episodes, found {self.domain.name}")
+        return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
+
+    def save(self, path: str | Path, episode: int = 0) -> None:
+        """Write an episode as an animated .gif."""
+        if Path(path).suffix != ".gif":
+            raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
+        outcomes = self.domain.judge(self.goal, self.rollout) if self.goal else {}
+        pictures = captioned(self.frames(episode), outcome_text(self.goal, outcomes, episode))
+        with atomic(path) as temporary:
+            temporary.write_bytes(gif(pictures))
+
+
+def closed_loop_of(domain: Domain) -> ClosedLoop:
+    """How a domain executes plans.
+
+    Raises:
+        UserError: for one that cannot.
+    """
+    if domain.closed_loop is None:
+        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
+    return domain.closed_loop

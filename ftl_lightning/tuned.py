@@ -1,0 +1,49 @@
+"""The settings that go with a pretrained model, from its domain's configuration of ``invert``."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Self
+
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.inversion import InversionSettings
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The settings that go with a model.
+
+    Attributes:
+        inversion: how concepts are learned.
+        learning_steps: of gradient descent.
+        sampling: how behaviour is generated.
+        replan: steps that a plan is followed in closed loop before a new one is made.
+    """
+
+    inversion: InversionSettings
+    learning_steps: int
+    sampling: Sampling
+    replan: int
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """From a configuration file of ``invert``.
+
+        Raises:
+            UserError: naming the file, if it is none or a value is not allowed.
+        """
+        from ftl_lightning.configuration import load  # OmegaConf, which nothing else here needs
+
+        content = load(path)
+        model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
+        learning, seen = model.get("init_args") or {}, {field.name for field in fields(InversionSettings)} - {"seed"}
+        sampling = {field.name: evaluation[field.name] for field in fields(Sampling) if field.name in evaluation}
+        try:
+            return cls(
+                inversion=InversionSettings(**{key: value for key, value in learning.items() if key in seen}),
+                learning_steps=int((data.get("init_args") or {}).get("steps", 400)),
+                sampling=Sampling(**sampling),
+                replan=int(evaluation.get("replan", 1)),
+            )
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
