@@ -123,7 +123,9 @@ def short_overview(results: pd.DataFrame) -> Table:
 
 def _overview(results: pd.DataFrame, lines: list[list[str]]) -> Table:
     papers = " [the paper's]" if any(map(published, _domains(results))) else ""
-    caption = f"Ours and the baselines, mean ± standard error over tasks{papers}; by how much ours is better than the best baseline"
+    caption = (
+        f"Ours and the baselines, mean ± standard error over tasks{papers}; lead: by how much ours is better than the best baseline"
+    )
     columns = ["domain", "setting, metric", *methods(results), "lead", "reference lines"]
     return Table("overview", caption, pd.DataFrame(lines, columns=columns, dtype=str))
 
