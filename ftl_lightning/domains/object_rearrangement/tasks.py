@@ -125,9 +125,9 @@ COMPOSITIONS = Suite(
     + tuple(
         EvaluationTask("not", f"{text}{AND}{NOT}{other}", texts=(text,), without=(other,))
         for text, other in (
-            ("circle above square", "circle right of square"),
-            ("triangle right of circle", "triangle above circle"),
-            ("square above triangle", "square right of triangle"),
+            ("circle above square", "triangle right of square"),
+            ("triangle right of circle", "square above triangle"),
+            ("square above triangle", "circle right of triangle"),
             ("circle right of triangle", "square above triangle"),
             ("square above circle", "triangle right of circle"),
             ("triangle right of square", "circle above square"),
@@ -135,8 +135,8 @@ COMPOSITIONS = Suite(
     )
 )
 """Compositions that the validation suite has none of: of two of its learned concepts, of one of its rings with a training concept,
-of three training concepts (never two that are a task of the paper), and of one without another: three times of the same two shapes,
-three times of one with the third. For tuning, like the validation suite, whose learned concepts they share."""
+of three training concepts (never two that are a task of the paper), and of one without another that would often hold by chance (of
+the same two shapes none would). For tuning, like the validation suite, whose learned concepts they share."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSITIONS}
 
