@@ -206,6 +206,22 @@ def test_a_task_is_composed_of_all_that_it_names_with_the_weight_of_each(tiny: P
     assert negated.weights.tolist() == pytest.approx([1.2, WITHOUT_WEIGHT])  # nothing learned: the paper's omega
 
 
+def test_the_compositions_suite_is_learned_and_judged_with_all_its_settings(invert: Callable[..., Path]) -> None:
+    invert(
+        "--data.suite=compositions", "--evaluation.suites=[compositions]", "--evaluation.figures=0", "--evaluation.results=r.csv"
+    )
+    rows = read_rows("r.csv")
+    rows = rows[rows["role"] == "method"]
+    assert rows["setting"].value_counts().to_dict() == {
+        "two learned concepts": 6,
+        "ring + training": 4,
+        "three texts": 6,
+        "not": 6,
+    }
+    shown = rows.groupby("setting")["demonstrations"].unique().map(list).to_dict()
+    assert shown == {"two learned concepts": [10], "ring + training": [5], "three texts": [0], "not": [0]}
+
+
 def test_inverting_twice_gives_the_same_rows(invert: Callable[..., Path]) -> None:
     options = ["--evaluation.suites=[paper, components]", "--evaluation.figures=0", "--evaluation.results=r.csv"]
     invert(*options)
