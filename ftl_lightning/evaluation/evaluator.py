@@ -123,17 +123,16 @@ class Evaluator(pl.Callback):
             if name not in suites:
                 raise UserError(f"evaluation.suites: expected some of {', '.join(suites)}, found {name!r}")
         tasks = [task for name in self.asked for task in suites[name].tasks]
-        asked = {task.learned for task in tasks}
+        asked = {name for task in tasks for name in task.learned}
         own = [name for name in learned if name not in asked and (domain.concepts.reads(name) or not domain.metrics)]
-        return tasks + [EvaluationTask(OWN, name, learned=name) for name in own]
+        return tasks + [EvaluationTask(OWN, name, learned=(name,)) for name in own]
 
     def _start(self, task: EvaluationTask, module: Evaluable, domain: Domain) -> InitialStates | None:
         """Where a task's behaviour starts, or ``None`` where the domain has no initial states."""
         if not domain.observed:
             return None
         if task.initial == "demonstrated":
-            assert task.learned is not None
-            own = module.demonstrated(task.learned)
+            own = module.demonstrated(task.learned[0])
             assert own is not None
             return own.initial_states
         return domain.source(self.root).starts(task.goal, self.samples, EVALUATION_SEED + self.seed)

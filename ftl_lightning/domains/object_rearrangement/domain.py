@@ -11,7 +11,7 @@ from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse, sentence
-from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
 
@@ -51,6 +51,7 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
+        descriptions=DESCRIBED,
         reads=reads,
         sentence=sentence,
         table=Path(__file__).parent / "embeddings.safetensors",
