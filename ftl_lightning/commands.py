@@ -231,8 +231,11 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     model.check(learned, concept)
     names = model.config.training_concepts
     print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
-    parts = [(f"component {number}, weight {weight:.2f}", embedding) for number, (weight, embedding) in learned.numbered()]
-    if len(parts) > 1:
+    if learned.modes is not None:
+        how = "a random mixture of them" if learned.modes.mixed else "one of them"
+        print(f"alone it generates from {how}: {len(learned.modes)} modes; composed, from the components that have no mode")
+    parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
+    if len(learned.weights) > 1:
         parts.append(("weighted sum", learned.weights @ learned.embeddings))
     for name, embedding in parts:
         print(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")

@@ -49,7 +49,8 @@ class LearnedConcept(Composition):
     model: ConceptModel
 
     def __repr__(self) -> str:
-        return f"LearnedConcept({self.concept.origin.name!r}, K = {len(self.weights)}, loss {self.concept.origin.loss:.3f})"
+        modes = "" if self.modes is None else f", {len(self.modes)} modes{', mixed' if self.modes.mixed else ''}"
+        return f"LearnedConcept({self.concept.origin.name!r}, K = {len(self.weights)}{modes}, loss {self.concept.origin.loss:.3f})"
 
     def explain(self, nearest: int = 3) -> Explanation:
         """What its weighted sum is made of, in words of the training concepts."""
@@ -145,7 +146,8 @@ class FewShot:
 
     def _learned(self, concept: Concept) -> LearnedConcept:
         device = self.model.device
-        return LearnedConcept(concept.embeddings.to(device), concept.weights.to(device), concept, self.model)
+        own = concept.composition.to(device)
+        return LearnedConcept(own.embeddings, own.weights, concept, self.model, modes=own.modes)
 
     def demonstrations(
         self,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,50 @@ Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Context], Tensor]
 each sample's row of ``concepts``."""
 
 
+STRETCH = 1.5
+"""Mixtures of modes lie so much farther from the modes' mean than convex combinations: these alone vary less than the modes do."""
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Several sets of embeddings of one concept: behaviours that are right in different ways.
+
+    Attributes:
+        embeddings: ``(mode, K, n)``.
+        weights: ``(mode, K)``, omega.
+        mixed: whether a sample is generated from a random mixture of the modes, which suits concepts of which one set of embeddings
+            says enough, or from one mode, drawn at random.
+    """
+
+    embeddings: Tensor
+    weights: Tensor
+    mixed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def __mul__(self, factor: float) -> "Modes":
+        return replace(self, weights=factor * self.weights)
+
+    def to(self, device: torch.device) -> "Modes":
+        """The same on a device."""
+        return replace(self, embeddings=self.embeddings.to(device), weights=self.weights.to(device))
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
+        """What ``count`` samples are generated from: a composition ``(row, K, n)``, and each sample's row ``(count,)``.
+
+        A mixture is ``mean + STRETCH * sum_m share_m (mode_m - mean)``, the shares even on the simplex (Dirichlet(1)).
+        """
+        if not self.mixed:
+            chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)
+            return Composition(self.embeddings, self.weights), chosen.to(self.weights.device)
+        even = torch.empty(count, len(self), device=generator.device).exponential_(generator=generator)
+        shares = (even / even.sum(dim=1, keepdim=True)).to(self.weights.device)
+        shares = STRETCH * shares + (1 - STRETCH) / len(self)
+        mixture = Composition(torch.einsum("sm,mkn->skn", shares, self.embeddings), shares @ self.weights)
+        return mixture, torch.arange(count, device=self.weights.device)
+
+
 @dataclass(frozen=True)
 class Composition:
     """Concepts and the guidance weights with which they are composed; sums, differences and multiples are
@@ -24,16 +68,18 @@ class Composition:
     Attributes:
         embeddings: ``(..., K, n)``.
         weights: ``(..., K)``, omega.
+        modes: what samples are generated from where a learned concept stands alone; its embeddings are used where it is composed.
     """
 
     embeddings: Tensor
     weights: Tensor
+    modes: Modes | None = field(default=None, kw_only=True)
 
     def __add__(self, other: "Composition") -> "Composition":
         return Composition(torch.cat((self.embeddings, other.embeddings), dim=-2), torch.cat((self.weights, other.weights), dim=-1))
 
     def __mul__(self, factor: float) -> "Composition":
-        return Composition(self.embeddings, factor * self.weights)
+        return Composition(self.embeddings, factor * self.weights, modes=self.modes and self.modes * factor)
 
     __rmul__ = __mul__
 
@@ -45,19 +91,57 @@ class Composition:
 
     def to(self, device: torch.device) -> "Composition":
         """The same on a device."""
-        return Composition(self.embeddings.to(device), self.weights.to(device))
+        return Composition(self.embeddings.to(device), self.weights.to(device), modes=self.modes and self.modes.to(device))
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
+        """What ``count`` samples are generated from: a composition ``(row, K, n)``, and each sample's row ``(count,)``.
+
+        Nothing is drawn from the generator where there are no modes.
+        """
+        if self.modes is not None:
+            return self.modes.draw(count, generator)
+        return Composition(self.embeddings[None], self.weights[None]), torch.zeros(
+            count, dtype=torch.int64, device=self.weights.device
+        )
+
+    def drawn(self, generator: torch.Generator) -> "Composition":
+        """The composition ``(K, n)`` of a single sample, without modes."""
+        if self.modes is None:
+            return self
+        rows, row = self.draw(1, generator)
+        return Composition(rows.embeddings[row[0]], rows.weights[row[0]])
 
 
-def batched(compositions: Sequence[Composition]) -> Composition:
-    """Compositions ``(K, n)`` of maybe different K as one ``(composition, most K, n)``, padded with weights of zero."""
-    return Composition(
-        nn.utils.rnn.pad_sequence([one.embeddings for one in compositions], batch_first=True),
-        nn.utils.rnn.pad_sequence([one.weights for one in compositions], batch_first=True),
-    )
+def batched(compositions: Sequence[Composition], count: int, generators: Sequence[torch.Generator]) -> tuple[Composition, Tensor]:
+    """Everything that is generated together.
+
+    Args:
+        compositions: ``(K, n)`` each, of maybe different K.
+        count: samples of each.
+        generators: of each composition's draws of modes.
+
+    Returns:
+        One composition ``(row, most K, n)``, padded with weights of zero, and each sample's row ``(composition * count,)``.
+    """
+    embeddings, weights, rows, first = [], [], [], 0
+    for composition, draw in zip(compositions, generators, strict=True):
+        own, index = composition.draw(count, draw)
+        embeddings += list(own.embeddings)
+        weights += list(own.weights)
+        rows.append(first + index)
+        first += len(own.weights)
+    pad = nn.utils.rnn.pad_sequence
+    return Composition(pad(embeddings, batch_first=True), pad(weights, batch_first=True)), torch.cat(rows)
 
 
 def composed_epsilon(
-    denoiser: Denoiser, x: Tensor, t: Tensor, composition: Composition, empty: Tensor, context: Context = ()
+    denoiser: Denoiser,
+    x: Tensor,
+    t: Tensor,
+    composition: Composition,
+    empty: Tensor,
+    context: Context = (),
+    own: Tensor | None = None,
 ) -> Tensor:
     """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, all branches in one call of the network.
 
@@ -65,18 +149,20 @@ def composed_epsilon(
 
     Args:
         denoiser: estimates noise for one concept a sample.
-        x: noisy plans ``(batch, horizon, state)``: equally many, one after another, for each composition.
+        x: noisy plans ``(batch, horizon, state)``.
         t: timesteps ``(batch,)``.
         composition: ``(composition, K, n)``; K may be 0.
         empty: the empty concept ``(n,)``.
         context: of each sample.
+        own: each sample's composition ``(batch,)`` int64; ``None`` for equally many samples of each, one after another.
 
     Returns:
         ``(batch, horizon, state)``.
     """
     concepts, weights = composition.embeddings, composition.weights
     compositions, count = concepts.shape[:2]
-    own = torch.arange(compositions, device=x.device).repeat_interleave(len(x) // compositions)  # each sample's composition
+    if own is None:
+        own = torch.arange(compositions, device=x.device).repeat_interleave(len(x) // compositions)
 
     def evaluate(concepts: Tensor, index: Tensor) -> Tensor:
         """Noise ``(branch, batch, horizon, state)`` for ``index (branch, batch)`` into ``concepts``."""

@@ -147,8 +147,9 @@ def sampled_plans(
         model: the model.
         compositions: of each episode, ``(K, n)``.
         sampling: sampler, steps and temperature.
-        generators: of each episode's noise.
+        generators: of each episode's noise, and of its mode, which it keeps to its end.
     """
+    compositions = [one.drawn(draw) for one, draw in zip(compositions, generators, strict=True)]
 
     def make(observed: Observed, rows: list[int]) -> Tensor:
         own, draws = [compositions[row] for row in rows], [generators[row] for row in rows]

@@ -14,6 +14,10 @@ from ftl_lightning.tensor_file import content_hash, file_hash
 from ftl_lightning.version import __version__
 
 
+LATER = (("modes", 1), ("tolerance", None))
+"""Settings that came later, at the values under which everything is as before: they are left out, so that hashes stay."""
+
+
 def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Hyper-parameters without those that Lightning's command line adds for itself."""
     return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
@@ -28,8 +32,9 @@ def configuration(module: Evaluable, data: pl.LightningDataModule, settings: Map
         settings: the evaluator's.
     """
     own = data.hparams.get("demonstrations")
+    hparams = [(key, value) for key, value in _public(module.hparams) if key not in ("pretrained", "output")]
     return {
-        **{f"model/{key}": value for key, value in _public(module.hparams) if key not in ("pretrained", "output")},
+        **{f"model/{key}": value for key, value in hparams if (key, value) not in LATER},
         **{f"data/{key}": value for key, value in _public(data.hparams) if key not in ("demonstrations", "root")},
         **{f"evaluation/{key}": value for key, value in settings.items()},
         "model/pretrained": module.model.hash,

@@ -133,7 +133,13 @@ class Adaptation(pl.LightningModule, ABC):
         return self._omega
 
     def composition(self, task: EvaluationTask) -> Composition | None:
-        """What generates a task, or ``None`` if a concept of it was not learned here."""
+        """What generates a task, or ``None`` if a concept of it was not learned here.
+
+        The modes of a learned concept are used where it stands alone.
+        """
+        if len(task.learned) == 1 and task.component is None and not (task.texts or task.without):
+            found = self._found.get(task.learned[0])
+            return found and found.composition.to(self.device)
         embeddings = [self.model.concept(text) for text in (*task.texts, *task.without)]
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
         for name in task.learned:
@@ -152,9 +158,9 @@ class Adaptation(pl.LightningModule, ABC):
     def concept_embeddings(self) -> dict[str, Tensor]:
         """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""
         learned = {
-            f"{name} [component {number}]": embedding
+            f"{name} [{part}]": embedding
             for name, concept in self._found.items()
-            for number, embedding in enumerate(concept.embeddings, start=1)
+            for part, (_, embedding) in concept.parts().items()
         }
         return self.model.named_embeddings() | learned
 

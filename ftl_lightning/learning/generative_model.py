@@ -129,11 +129,11 @@ class GenerativeModel(TextConceptModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        together, seen = batched(compositions), observed or {}
+        (together, own), seen = batched(compositions, count, generators), observed or {}
         context = self.observe(seen)
 
         def epsilon(x: Tensor, t: Tensor) -> Tensor:
-            return composed_epsilon(self.denoiser, x, t, together, self.empty, context)
+            return composed_epsilon(self.denoiser, x, t, together, self.empty, context, own)
 
         shape = (count, self.config.horizon, self.config.state_dim)
 

@@ -11,19 +11,24 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
-from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
+from ftl_lightning.learning.stopping import Stopping
 from ftl_lightning.seeding import generator
 
 _LOG = logging.getLogger(__name__)
 
 FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
+HELD_OUT = 64
+"""Noised demonstrations whose loss decides when a run stops."""
+EXPLAINED = 0.35
+"""Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +45,14 @@ class InversionSettings:
         restarts: independent starts of each concept; the one with the lowest loss on common noise is kept.
         learning_rate: of the embeddings (Adam, cosine decay to 0).
         weight_learning_rate: of the weights; with the embeddings' rate they collapse.
-        samples: noised demonstrations a step and run, spread over demonstrations and timesteps.
+        samples: noised demonstrations a step and run, spread over the run's demonstrations and timesteps.
+        modes: sets of embeddings of a concept, see :class:`~ftl_lightning.concepts.composition.Modes`. 1 is the paper's form;
+            otherwise beside it, from the same start, a set is learned from every demonstration (``'each'``), or from every
+            n-th one for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes where one set explains the
+            demonstrations at least :data:`EXPLAINED` as well as they do, and from single modes elsewhere.
+        tolerance: a run stops when each of two rounds of 25 steps lowers its loss on held-out noise by less than this share of
+            all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
+            :class:`~ftl_lightning.learning.stopping.Stopping`. ``None`` for all steps, the rate decaying to 0.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
@@ -61,6 +73,8 @@ class InversionSettings:
     learning_rate: float = 0.1
     weight_learning_rate: float = 3e-3
     samples: int = 32
+    modes: int | Literal["each", "auto"] = 1
+    tolerance: float | None = None
     loss: str = "epsilon"
     timestep_power: float = 1.0
     seed: int = 0
@@ -69,6 +83,12 @@ class InversionSettings:
         for name in ("components", "restarts", "samples"):
             if (value := getattr(self, name)) < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
+        if isinstance(self.modes, int) and self.modes < 1:
+            raise UserError(f"model.modes: expected 1 or more, 'each' or 'auto', found {self.modes}")
+        if isinstance(self.modes, str) and self.modes not in ("each", "auto"):
+            raise UserError(f"model.modes: expected a number, 'each' or 'auto', found {self.modes!r}")
+        if self.tolerance is not None and not 0 <= self.tolerance < 1:
+            raise UserError(f"model.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
         if not 0 <= self.off_span <= 1:
             raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {self.off_span}")
         if self.timestep_power < 1:
@@ -77,11 +97,26 @@ class InversionSettings:
             raise UserError(f"model.loss: expected one of {', '.join(LOSSES)}, found {self.loss!r}")
 
 
+@dataclass(frozen=True)
+class _Run:
+    """Embeddings that are learned from some demonstrations.
+
+    Attributes:
+        concept: its place among the concepts.
+        rows: of its demonstrations.
+        mode: its number from 1; 0 for the embeddings that are learned from all demonstrations of the concept.
+    """
+
+    concept: int
+    rows: tuple[int, ...]
+    mode: int
+
+
 class Inversion(nn.Module):
     """K embeddings and their weights for every concept of some demonstrations, all in one batch.
 
-    Its only parameters are ``embeddings (run, K, n)`` and, unless omega is fixed, ``weights (run, K)``, where the runs are
-    concepts times restarts. The model is frozen and no part of it.
+    Its only parameters are ``embeddings (run, K, n)`` and, unless omega is fixed, ``weights (run, K)``. A run is a concept, or a
+    mode of one, and a restart. The model is frozen and no part of it.
 
     Args:
         model: that concepts are learned through.
@@ -105,62 +140,99 @@ class Inversion(nn.Module):
         # Rows span the training embeddings, whose mean is the origin of the concept space.
         basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
         self.register_buffer("basis", basis, persistent=False)
-        # A generator for each concept, so that its start does not depend on what is learned beside it.
+        self.runs = self._runs()
+        # A generator for each concept, so that its start does not depend on what is learned beside it. Its modes start alike.
         shape = (settings.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
-        start = torch.cat([torch.randn(shape, generator=draw) for draw in draws])
+        starts = [torch.randn(shape, generator=draw) for draw in draws]
+        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.restarts]])
         self.embeddings = nn.Parameter(settings.initial_spread * start)
         runs = (len(start), settings.components)
         if settings.omega == "learned":
             self.weights = nn.Parameter(torch.full(runs, float(settings.initial_omega)))
         else:
             self.register_buffer("weights", torch.full(runs, float(settings.omega)), persistent=False)
+        self.stopping: Stopping | None = None
+        if settings.tolerance is not None:
+            self.stopping = Stopping(self.embeddings, self.weights, settings.tolerance)
+
+    def _runs(self) -> list[_Run]:
+        """Of each concept the run of all its demonstrations, then those of its modes; restarts of a run stand together."""
+        texts, modes, found = self.demonstrations.concepts, self.settings.modes, []
+        for concept, name in enumerate(self.concepts):
+            rows = tuple(row for row, text in enumerate(texts) if text == name)
+            count = min(modes, len(rows)) if isinstance(modes, int) else len(rows)
+            parts = [rows, *((rows[mode::count] for mode in range(count)) if count > 1 else ())]
+            found += [_Run(concept, part, mode) for mode, part in enumerate(parts) for _ in range(self.settings.restarts)]
+        return found
 
     @property
     def model(self) -> ConceptModel:
         """That concepts are learned through."""
         return self._model[0]
 
-    def _rows(self, samples: int) -> Tensor:
-        """Which demonstration each sample of each run uses, evenly: ``(run, samples)``."""
-        texts = self.demonstrations.concepts
-        rows = [[row for row, text in enumerate(texts) if text == concept] for concept in self.concepts]
-        each = torch.tensor([[own[sample % len(own)] for sample in range(samples)] for own in rows])
-        return each.repeat_interleave(self.settings.restarts, dim=0)
-
-    @property
-    def parametrised(self) -> Tensor:
-        """The embeddings ``(run, K, n)`` after the part off the span is scaled."""
+    def parametrised(self, embeddings: Tensor) -> Tensor:
+        """Embeddings ``(run, K, n)`` after their part off the span is scaled."""
         if self.settings.off_span == 1:
-            return self.embeddings
-        inside = self.embeddings @ self.basis.T @ self.basis
-        return inside + self.settings.off_span * (self.embeddings - inside)
+            return embeddings
+        inside = embeddings @ self.basis.T @ self.basis
+        return inside + self.settings.off_span * (embeddings - inside)
 
-    def losses(self, samples: int, draw: torch.Generator) -> Tensor:
-        """The model's loss (ours is Eq. 2) for every run and sample, ``(run, samples)``. Runs share what is random in it and, as
-        a share of a demonstration's length, the windows' starts.
+    def _losses(self, samples: int, draw: torch.Generator, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
+        """The model's loss (ours is Eq. 2) for every sample ``(run, samples)``. Runs share what is random in it and, as a share of
+        a demonstration's length, the windows' starts.
+
+        Args:
+            samples: noised demonstrations of each run, evenly spread over its own.
+            draw: of noise, timesteps and windows.
+            embeddings: of every run ``(run, K, n)``.
+            weights: of every run ``(run, K)``.
+            chosen: which runs ``(run,)`` of bool; ``None`` for all.
         """
+        runs = self.runs
+        if chosen is not None:
+            embeddings, weights = embeddings[chosen], weights[chosen]
+            runs = [run for run, own in zip(runs, chosen.tolist(), strict=True) if own]
         model, device = self.model, self.embeddings.device
-        runs, window = len(self.embeddings), model.window
+        window = model.window
         draws = model.draws(samples, self.settings.timestep_power, draw)
-        rows = self._rows(samples).flatten()
-        share = torch.rand(samples, generator=draw, device=device).cpu().repeat(runs)
+        rows = torch.tensor([run.rows[sample % len(run.rows)] for run in runs for sample in range(samples)])
+        share = torch.rand(samples, generator=draw, device=device).cpu().repeat(len(runs))
         starts = self.demonstrations.starts(rows, share, model.domain.plans.exponent(window), window)
         states, observed = self.demonstrations.windows(rows, starts, window)
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
-        return model.losses(states, seen, Composition(self.parametrised, self.weights), draws, self.settings.loss)
+        composition = Composition(self.parametrised(embeddings), weights)
+        return model.losses(states, seen, composition, draws, self.settings.loss)
 
     def step_losses(self, step: int) -> Tensor:
-        """The losses of a training step ``(run, samples)``.
+        """The losses of a training step ``(run, samples)``, of the runs that have not stopped.
 
         Raises:
             UserError: if they are not finite.
         """
-        losses = self.losses(self.settings.samples, generator(self.embeddings.device, self.settings.seed, 1, step))
+        draw = generator(self.embeddings.device, self.settings.seed, 1, step)
+        if self.stopping is not None and step == 0:
+            self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
+        going = None if self.stopping is None else self.stopping.going
+        losses = self._losses(self.settings.samples, draw, self.embeddings, self.weights, going)
         mean = losses.detach().mean()
         if not mean.isfinite():
             raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.learning_rate")
         return losses
+
+    def stepped(self, step: int) -> bool:
+        """Take note of a step that was made, by its number from 0.
+
+        Returns:
+            Whether any run goes on.
+        """
+        return self.stopping is None or self.stopping.stepped(step, self.embeddings, self.weights, self._held_out)
+
+    @torch.no_grad()
+    def _held_out(self, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
+        """Mean losses ``(run,)`` on noise that no step sees."""
+        draw = generator(self.embeddings.device, self.settings.seed, 3)
+        return self._losses(HELD_OUT, draw, embeddings, weights, chosen).mean(dim=1)
 
     @property
     def rates(self) -> list[tuple[nn.Parameter, float]]:
@@ -170,29 +242,44 @@ class Inversion(nn.Module):
         return [(self.embeddings, self.settings.learning_rate), *weights]  # type: ignore[list-item]
 
     def optimizer(self, steps: int) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        """Adam, weights with a rate of their own, and its cosine decay over so many steps."""
+        """Adam, weights with a rate of their own, and its cosine decay over so many steps, or no decay where runs are stopped."""
         optimizer = torch.optim.Adam([{"params": [parameter], "lr": rate} for parameter, rate in self.rates])
+        if self.settings.tolerance is not None:
+            return optimizer, torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
         return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
-        """The concepts by name: of each, the restart with the lowest loss on common noise."""
-        restarts = self.settings.restarts
-        # Noise that is common to all runs and always the same.
-        losses = self.losses(FINAL_SAMPLES, generator(self.embeddings.device, self.settings.seed, 2)).mean(dim=1)
-        losses = losses.unflatten(0, (-1, restarts))
-        best = losses.argmin(dim=1)
-        embeddings = self.parametrised.detach().unflatten(0, (-1, restarts))
-        weights = self.weights.detach().unflatten(0, (-1, restarts))
+        """The concepts by name: of each run, the restart with the lowest loss on common noise."""
+        restarts, source = self.settings.restarts, self.stopping or self
+        raw, weights = source.embeddings.detach(), source.weights.detach()
+        losses = self._final(raw, weights)
+        best = torch.arange(0, len(losses), restarts, device=losses.device) + losses.unflatten(0, (-1, restarts)).argmin(dim=1)
+        auto = self.settings.modes == "auto"
+        empty = self._final(raw, torch.zeros_like(weights)) if auto else losses
+        embeddings = self.parametrised(raw)
         kind = "learned" if self.settings.omega == "learned" else "fixed"
-        return {
-            name: Concept(
-                embeddings[index, best[index]].cpu(),
-                weights[index, best[index]].cpu(),
-                origin(self.model, self.demonstrations, name, kind, losses[index, best[index]].item()),
+        found = {}
+        for index, name in enumerate(self.concepts):
+            whole, *modes = [run for run in best.tolist() if self.runs[run].concept == index]
+            mixed = auto and bool(explained(empty[whole], losses[whole], losses[modes].mean()) >= EXPLAINED)
+            found[name] = Concept(
+                embeddings[whole].cpu(),
+                weights[whole].cpu(),
+                origin(self.model, self.demonstrations, name, kind, losses[whole].item()),
+                Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
             )
-            for index, name in enumerate(self.concepts)
-        }
+        return found
+
+    def _final(self, embeddings: Tensor, weights: Tensor) -> Tensor:
+        """Mean losses ``(run,)`` on noise that is common to all runs and always the same."""
+        draw = generator(self.embeddings.device, self.settings.seed, 2)
+        return self._losses(FINAL_SAMPLES, draw, embeddings, weights, None).mean(dim=1)
+
+
+def explained(empty: Tensor, one: Tensor, modes: Tensor) -> Tensor:
+    """The share of what several modes lower the empty concept's loss by that one set of embeddings lowers it by."""
+    return (empty - one) / (empty - modes)
 
 
 def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
@@ -256,8 +343,10 @@ def invert(
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         gradients = torch.autograd.grad(losses.mean(dim=1).sum(), [group.parameter for group in groups])
         for group, gradient in zip(groups, gradients, strict=True):
-            group.step(gradient, step, steps)
+            group.step(gradient, None if settings.tolerance is not None else (step, steps))
         tell(losses.detach().mean().item())
+        if not inversion.stepped(step):
+            break
     return inversion.learned()
 
 
@@ -273,8 +362,13 @@ class _Group:
         self._count = torch.zeros(())
 
     @torch.no_grad()
-    def step(self, gradient: Tensor, step: int, steps: int) -> None:
-        """Follow the gradient of a step; the rate for the next is the decay's recursion in torch's order of arithmetic."""
+    def step(self, gradient: Tensor, decay: tuple[int, int] | None) -> None:
+        """Follow the gradient of a step; the rate for the next is the decay's recursion in torch's order of arithmetic.
+
+        Args:
+            gradient: like the parameter.
+            decay: the step's number from 0 and the number of steps, or ``None`` for a constant rate.
+        """
         adam(
             [self.parameter],
             [gradient],
@@ -290,5 +384,7 @@ class _Group:
             eps=1e-8,
             maximize=False,
         )
-        after, before = (1 + math.cos(math.pi * done / steps) for done in (step + 1, step))
-        self.rate = after / before * self.rate
+        if decay is not None:
+            step, steps = decay
+            after, before = (1 + math.cos(math.pi * done / steps) for done in (step + 1, step))
+            self.rate = after / before * self.rate

@@ -26,7 +26,7 @@ class InversionModule(Adaptation):
         pretrained: folder of the pretrained model.
         components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
         initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
-        loss, timestep_power, seed: likewise.
+        modes, tolerance, loss, timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -48,6 +48,8 @@ class InversionModule(Adaptation):
         learning_rate: float = 0.1,
         weight_learning_rate: float = 3e-3,
         samples: int = 32,
+        modes: int | Literal["each", "auto"] = 1,
+        tolerance: float | None = None,
         loss: str = "epsilon",
         timestep_power: float = 1.0,
         training_omega: float | None = None,
@@ -64,7 +66,9 @@ class InversionModule(Adaptation):
     def variant(self) -> str:
         off_span, weight = self.settings.off_span, self.hparams["training_omega"]
         form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
-        return ", ".join([*self.model.traits, form, *([] if weight is None else [f"training weight {weight:g}"])])
+        modes = self.settings.modes
+        several = [] if modes == 1 else [f"{modes} modes" if isinstance(modes, int) else f"modes {modes}"]
+        return ", ".join([*self.model.traits, form, *several, *([] if weight is None else [f"training weight {weight:g}"])])
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
@@ -78,6 +82,11 @@ class InversionModule(Adaptation):
         self.log("train/loss", losses.detach().mean(), prog_bar=True)
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         return losses.mean(dim=1).sum()
+
+    def on_train_batch_end(self, outputs: Any, batch: int, batch_idx: int) -> None:
+        """Stop when no concept gains any more."""
+        if not self.inversion.stepped(self.global_step - 1):
+            self.trainer.should_stop = True
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Adam with cosine decay; weights have a rate of their own."""
@@ -102,6 +111,8 @@ class InversionModule(Adaptation):
             "demonstrations": self.demonstrations.hash,
             "components": self.settings.components,
             "restarts": self.settings.restarts,
+            **({} if self.settings.modes == 1 else {"modes": self.settings.modes}),
+            **({} if self.settings.tolerance is None else {"tolerance": self.settings.tolerance}),
             "omega": self.settings.omega,
         }
 

@@ -147,15 +147,15 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
         seed: of the map.
     """
     training = model.config.training_concepts
-    learned = [(concept.origin.name, number, own) for concept in concepts for number, (_, own) in concept.numbered()]
-    embeddings = torch.cat((model.training_embeddings.cpu(), *(own[None] for _, _, own in learned)))
+    learned = [(f"{concept.origin.name} [{part}]", own) for concept in concepts for part, (_, own) in concept.parts().items()]
+    embeddings = torch.cat((model.training_embeddings.cpu(), *(own[None] for _, own in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)
     places = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots()
     axes.scatter(*places[: len(training)].T, color=PAPER_COLOUR, label="training concepts")
     axes.scatter(*places[len(training) :].T, color=COLOURS[0], marker="^", label="learned components")
-    names = [*training, *(f"{name} [{number}]" for name, number, _ in learned)]
+    names = [*training, *(name for name, _ in learned)]
     for place, name in zip(places, names, strict=True):
         axes.annotate(name, place, fontsize=6, xytext=(3, 3), textcoords="offset points")
     axes.set(xticks=[], yticks=[], title=f"{model.config.domain}: concepts, t-SNE")

@@ -119,7 +119,7 @@ def drawn(count: int, seed: int) -> Composition:
 
 def score(composition: Composition, of: dict[str, torch.Tensor]) -> torch.Tensor:
     """What a composition ``(K, 4)`` adds to the noise of the empty concept, of every sample."""
-    together = batched([composition])
+    together, _ = batched([composition], 1, [torch.Generator()])
     everywhere = of | {"concepts": together.embeddings, "weights": together.weights}
     return composed(everywhere) - plain(of, EMPTY.expand(len(of["x"]), -1))
 
@@ -162,7 +162,8 @@ def test_sums_and_multiples_leave_their_parts_as_they_were() -> None:
 
 def test_compositions_of_different_lengths_in_one_batch_are_those_alone() -> None:
     parts = [drawn(count, count) for count in (1, 3, 0, 2)]
-    together = batched(parts)
+    together, own = batched(parts, 2, [torch.Generator()] * 4)
+    assert own.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert together.embeddings.shape == (4, 3, 4)
     of = inputs(1, 5, batch=8)
     whole = composed(of | {"concepts": together.embeddings, "weights": together.weights})

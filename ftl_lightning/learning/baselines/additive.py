@@ -1,7 +1,6 @@
 """What methods have in common that compose concepts by adding them (paper, 'Implementation Details')."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -25,12 +24,11 @@ class AdditiveModel(ConceptModel):
         """
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
-        runs = len(composition.weights)
-        runs_apart = zip(composition.embeddings, composition.weights, strict=True)
-        each = added([Composition(embeddings, weights) for embeddings, weights in runs_apart])
+        runs, each = len(composition.weights), added(composition)
         return self.errors(states, observed, each.repeat_interleave(len(states) // runs, dim=0)).unflatten(0, (runs, -1))
 
 
-def added(compositions: Sequence[Composition]) -> Tensor:
-    """Weighted sums ``(composition, n)`` of concepts ``(K, n)``; K may differ between them."""
-    return torch.stack([one.weights @ one.embeddings for one in compositions])
+def added(composition: Composition) -> Tensor:
+    """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, n)``."""
+    rows = zip(composition.weights, composition.embeddings, strict=True)
+    return torch.stack([weights @ embeddings for weights, embeddings in rows])

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.composition import Composition, batched
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
@@ -116,8 +116,9 @@ class CloningModel(AdditiveModel, TextConceptModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Deterministic: ``sampling`` and ``generators`` do not matter."""
-        condition = added(compositions).repeat_interleave(count, dim=0)
+        """Deterministic but for the modes of concepts: ``sampling`` does not matter."""
+        together, own = batched(compositions, count, generators)
+        condition = added(together)[own]
         member = torch.arange(len(condition), device=self.device) % count % self.config.members
         rows = torch.arange(len(condition), device=self.device)
 

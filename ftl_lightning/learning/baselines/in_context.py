@@ -145,7 +145,8 @@ class InContextModel(ConceptModel):
 
         Weights, sampler and steps do not matter.
         """
-        prompts, temperature = batched(compositions).embeddings, sampling.temperature
+        prompts = batched(compositions, count, generators)[0].embeddings
+        temperature = sampling.temperature
         counts = torch.tensor([len(one.weights) for one in compositions], device=self.device)
         given = torch.arange(prompts.shape[1], device=self.device) < counts[:, None]
         memory = self.read(prompts, given)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.composition import Composition, batched
 from ftl_lightning.demonstrations.features import Observed, moved
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
@@ -81,11 +81,11 @@ class VAEModel(AdditiveModel):
         observed: Observed | None = None,
     ) -> Tensor:
         """The temperature is the variance of the noise that is added to z; sampler and steps do not matter."""
-        shape = (count, self.config.concept_dim)
-        noise = torch.stack([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
-        z = added(compositions)[:, None] + sampling.temperature**0.5 * noise
+        shape, (together, own) = (count, self.config.concept_dim), batched(compositions, count, generators)
+        noise = torch.cat([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
+        z = added(together)[own] + sampling.temperature**0.5 * noise
         seen = observed or {}
-        return self.decode(self.plans(z.flatten(0, 1), seen), seen).unflatten(0, (len(compositions), count))
+        return self.decode(self.plans(z, seen), seen).unflatten(0, (len(compositions), count))
 
 
 class VAEPretraining(Pretraining):
