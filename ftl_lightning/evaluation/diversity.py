@@ -94,10 +94,15 @@ class Real:
     def values(self, plans: Tensor) -> dict[str, float]:
         """Novelty and coverage of plans ``(sample, horizon, state)``, by name, so far as there is something to compare with.
 
+        Nothing for plans of another length than the domain's, such as those of methods that plan a step at a time: their distances
+        would be those of other times.
+
         Raises:
-            UserError: for a domain whose distance returns something else than distances.
+            UserError: for plans that the domain's distance does not fit, or a distance that returns something else.
         """
-        found = {}
+        found: dict[str, float] = {}
+        if plans.shape[1] != self.domain.plans.horizon:
+            return found
         if self.demonstrations is not None:
             known = self._windows(self.demonstrations)
             found[NOVELTY] = novelty(self.domain.distances(plans, known, self._distance))

@@ -117,11 +117,13 @@ def test_a_task_that_cannot_be_drawn_has_no_coverage(caplog: pytest.LogCaptureFi
 
 def test_driving_has_novelty_alone_since_its_expert_is_slow() -> None:
     driving = load_domain("driving")
-    demonstrations = driving.source(None).split("validation", 2, 0)
+    demonstrations = driving.source(None).split("validation", 3, 0)
     task = EvaluationTask("new initial state", "highway", learned="highway")
     real = Real.of(task, driving, 3, demonstrations)
     rows = torch.arange(3)
-    assert real.values(demonstrations.windows(rows, 0 * rows, driving.plans.horizon)[0]) == {"novelty": 0}
+    plans = demonstrations.windows(rows, 0 * rows, driving.plans.horizon)[0]
+    assert real.values(plans) == {"novelty": 0}
+    assert real.values(plans[:, :2]) == {}  # of a method that plans a step at a time
 
 
 def test_distances_that_do_not_fit_are_refused_in_one_line() -> None:
