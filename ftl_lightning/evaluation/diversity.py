@@ -111,9 +111,12 @@ class Real:
         return found
 
     def lines(self) -> dict[str, Judged]:
-        """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples."""
+        """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples.
+
+        Where nothing but novelty is measured, there is nothing to say of demonstrations: theirs is 0.
+        """
         found = {}
-        if self.demonstrations is not None:
+        if self.demonstrations is not None and (self.domain.metrics or self.fresh):
             turns = torch.arange(self.count) % len(self.demonstrations)
             found[REPLAYED] = self._judged(self.demonstrations.rows(turns.tolist()))
         if self.fresh:

@@ -123,6 +123,7 @@ def test_driving_has_novelty_alone_since_its_expert_is_slow() -> None:
     rows = torch.arange(3)
     plans = demonstrations.windows(rows, 0 * rows, driving.plans.horizon)[0]
     assert real.values(plans) == {"novelty": 0}
+    assert real.lines() == {}  # nothing else is measured of plans
     assert real.values(plans[:, :2]) == {}  # of a method that plans a step at a time
 
 
