@@ -46,7 +46,7 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     assert set(ours["metric"]) == {"accuracy", "novelty", "coverage"} | executed
     assert set(ours["setting"]) == {"training concept", "training composition", "new initial state"}
     assert set(zip(ours["method"], ours["variant"], strict=True)) == {("FTL-IGM", "entities, free")}
-    assert len(ours) == 4 * (4 + 5 + 5)
+    assert len(ours) == 4 * (4 + 5 + 5) + 4 + 2 * 5  # coverage of training concepts; both from new initial states
     oracle = rows[rows["method"] == "expert (oracle)"]
     assert (oracle.loc[oracle["metric"] == "accuracy", "value"] == 1).all()
     assert oracle.loc[oracle["metric"] == "closed loop success", "value"].mean() > 0.9
