@@ -114,7 +114,7 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
         return
     config = load(form.config.format(domain=domain.name))
     drawn = InversionData(domain.name, suite, seed=seed).demonstrations
-    learned = dict.fromkeys(task.learned for task in tasks if task.learned)
+    learned = dict.fromkeys(name for task in tasks for name in task.learned)
     module: Any = adapted(form, config, concatenate([drawn.select(concept) for concept in learned]), seed)
     sampling = {key: config["evaluation"][key] for key in ("sampler", "steps") if key in config["evaluation"]}
     for temperature in missing:

@@ -18,7 +18,8 @@ each sample's row of ``concepts``."""
 
 @dataclass(frozen=True)
 class Composition:
-    """Concepts and the guidance weights with which they are composed; sums and multiples are compositions too.
+    """Concepts and the guidance weights with which they are composed; sums, differences and multiples are
+    compositions too.
 
     Attributes:
         embeddings: ``(..., K, n)``.
@@ -35,6 +36,12 @@ class Composition:
         return Composition(self.embeddings, factor * self.weights)
 
     __rmul__ = __mul__
+
+    def __neg__(self) -> "Composition":
+        return -1.0 * self
+
+    def __sub__(self, other: "Composition") -> "Composition":
+        return self + -other
 
     def to(self, device: torch.device) -> "Composition":
         """The same on a device."""

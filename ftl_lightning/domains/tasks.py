@@ -3,6 +3,11 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from ftl_lightning.errors import UserError
+
+WITHOUT_WEIGHT = -0.5
+"""Guidance weight of the texts that a task is generated without."""
+
 
 @dataclass(frozen=True)
 class EvaluationTask:
@@ -11,24 +16,38 @@ class EvaluationTask:
     Attributes:
         setting: name of the group it is averaged in, e.g. ``'training composition'``.
         goal: the task in words, as the domain's metrics read it.
-        learned: name of the learned concept that is used, or ``None``.
+        learned: names of the learned concepts that are composed, usually one.
         texts: training concepts that are composed in.
+        without: training concepts that are composed in with :data:`WITHOUT_WEIGHT`: what the behaviour should not be.
         component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
         initial: where behaviour starts, in domains with initial states: in new ones, or in those of the demonstrations that the
             concept was learned from.
+
+    Raises:
+        UserError: at construction, for ``learned``, ``texts`` or ``without`` that are no tuples, or where a single component or the
+            demonstrations' starts are asked for without exactly one learned concept.
     """
 
     setting: str
     goal: str
-    learned: str | None = None
+    learned: tuple[str, ...] = ()
     texts: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
     component: int | None = None
     initial: Literal["new", "demonstrated"] = "new"
+
+    def __post_init__(self) -> None:
+        for key in ("learned", "texts", "without"):
+            if not isinstance(found := getattr(self, key), tuple):
+                raise UserError(f"evaluation task {self.goal!r}: {key}: expected a tuple of names, found {found!r}")
+        if len(self.learned) != 1 and (self.component is not None or self.initial == "demonstrated"):
+            what = "component" if self.component is not None else "initial"
+            raise UserError(f"evaluation task {self.goal!r}: {what}: expected one learned concept, found {len(self.learned)}")
 
     @property
     def name(self) -> str:
         """Its name within its setting."""
-        return self.goal if self.component is None else f"{self.goal} (learned from: {self.learned})"
+        return self.goal if self.component is None else f"{self.goal} (learned from: {self.learned[0]})"
 
 
 @dataclass(frozen=True)
@@ -40,7 +59,7 @@ class Suite:
     @property
     def learned(self) -> tuple[str, ...]:
         """Names of the concepts to learn, each once, in order."""
-        return tuple(dict.fromkeys(task.learned for task in self.tasks if task.learned))
+        return tuple(dict.fromkeys(name for task in self.tasks for name in task.learned))
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -63,4 +82,4 @@ def few_shot_suites(training: tuple[str, ...], new: tuple[str, ...]) -> dict[str
 
     The goal of each is its own text.
     """
-    return {"training": training_suite(training), "new": Suite(tuple(EvaluationTask("new concept", text, text) for text in new))}
+    return {"training": training_suite(training), "new": Suite(tuple(EvaluationTask("new concept", text, (text,)) for text in new))}

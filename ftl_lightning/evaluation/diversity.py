@@ -73,7 +73,7 @@ class Real:
         """
         if task.initial == "demonstrated":
             return cls(task, domain, count, None, None)
-        shown = known if known is not None and task.learned == task.goal and len(known) else None
+        shown = known if known is not None and task.learned == (task.goal,) and len(known) else None
         drawn = _drawn(domain, task.goal, 2 * count, root, seed)
         parts = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
         return cls(task, domain, count, shown, parts)

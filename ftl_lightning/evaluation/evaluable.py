@@ -1,11 +1,12 @@
 """What an evaluated module offers."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -35,3 +36,14 @@ class Evaluable(Protocol):
     def demonstrated(self, concept: str) -> Demonstrations | None: ...
 
     def concept_embeddings(self) -> dict[str, Tensor]: ...
+
+
+def demonstrations_of(task: EvaluationTask, demonstrated: Callable[[str], Demonstrations | None]) -> Demonstrations | None:
+    """What a task's concepts were learned from, one after another; ``None`` if nothing was learned.
+
+    Args:
+        task: what is evaluated.
+        demonstrated: what a concept was learned from, by its name.
+    """
+    found = [own for name in task.learned if (own := demonstrated(name)) is not None]
+    return concatenate(found) if len(found) > 1 else next(iter(found), None)

@@ -26,7 +26,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.evaluation.diversity import Real, lines
-from ftl_lightning.evaluation.evaluable import Evaluable
+from ftl_lightning.evaluation.evaluable import Evaluable, demonstrations_of
 from ftl_lightning.evaluation.judged import Judged, executed, share
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.results import Row, append_rows
@@ -129,17 +129,16 @@ class Evaluator(pl.Callback):
             if name not in suites:
                 raise UserError(f"evaluation.suites: expected some of {', '.join(suites)}, found {name!r}")
         tasks = [task for name in self.asked for task in suites[name].tasks]
-        asked = {task.learned for task in tasks}
+        asked = {name for task in tasks for name in task.learned}
         own = [name for name in learned if name not in asked and (domain.concepts.reads(name) or not domain.metrics)]
-        return tasks + [EvaluationTask(OWN, name, learned=name) for name in own]
+        return tasks + [EvaluationTask(OWN, name, learned=(name,)) for name in own]
 
     def _start(self, task: EvaluationTask, module: Evaluable, domain: Domain) -> InitialStates | None:
         """Where a task's behaviour starts, or ``None`` where the domain has no initial states."""
         if not domain.observed:
             return None
         if task.initial == "demonstrated":
-            assert task.learned is not None
-            own = module.demonstrated(task.learned)
+            own = module.demonstrated(task.learned[0])
             assert own is not None
             return own.initial_states
         return domain.source(self.root).starts(task.goal, self.samples, EVALUATION_SEED + self.seed)
@@ -190,7 +189,7 @@ class Evaluator(pl.Callback):
         found = []
         with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
             for one in judged:
-                known = module.demonstrated(one.task.learned) if one.task.learned else None
+                known = demonstrations_of(one.task, module.demonstrated)
                 found.append(Real.of(one.task, module.domain, len(one.states), known, self.root, self.seed))
                 advance()
         return found

@@ -9,6 +9,7 @@ from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
+from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.tensor_file import bytes_hash
 
@@ -58,7 +59,7 @@ def _acted(
     """A policy that acts as it goes; ``None`` where it would take too long."""
     assert domain.closed_loop is not None
     assert one.starts is not None
-    known = demonstrated(one.task.learned) if one.task.learned else None
+    known = demonstrations_of(one.task, demonstrated)
     key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.starts), seed)
     if key not in _KNOWN:
         policy = domain.closed_loop.policies[name](one.task.goal, one.starts, known, seed)

@@ -7,7 +7,7 @@ from typing import Any
 import lightning.pytorch as pl
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.evaluation.evaluable import Evaluable
+from ftl_lightning.evaluation.evaluable import Evaluable, demonstrations_of
 from ftl_lightning.evaluation.judged import Judged, paired, share
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row
 from ftl_lightning.tensor_file import content_hash, file_hash
@@ -79,7 +79,7 @@ def rows(
     def of(one: Judged, what: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
         subject = {"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]}
         # Reference plans are drawn without demonstrations; policies are given them.
-        known = module.demonstrated(one.task.learned) if one.task.learned and what["method"] not in domain.references else None
+        known = demonstrations_of(one.task, module.demonstrated) if what["method"] not in domain.references else None
         subject["demonstrations"] = 0 if known is None else len(known)
         return [Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in values.items()]
 

@@ -13,7 +13,7 @@ from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import recorded_name
-from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
@@ -133,11 +133,11 @@ class Adaptation(pl.LightningModule, ABC):
         return self._omega
 
     def composition(self, task: EvaluationTask) -> Composition | None:
-        """What generates a task, or ``None`` if its concept was not learned here."""
-        embeddings = [self.model.concept(text) for text in task.texts]
-        weights = [self.training_weight(task)] * len(task.texts)
-        if task.learned:
-            concept = self._found.get(task.learned)
+        """What generates a task, or ``None`` if a concept of it was not learned here."""
+        embeddings = [self.model.concept(text) for text in (*task.texts, *task.without)]
+        weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
+        for name in task.learned:
+            concept = self._found.get(name)
             if concept is None or (task.component or 0) > len(concept.weights):
                 return None
             chosen = slice(None) if task.component is None else slice(task.component - 1, task.component)

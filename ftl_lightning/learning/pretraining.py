@@ -25,7 +25,7 @@ from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
-from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
@@ -225,8 +225,9 @@ class Pretraining(pl.LightningModule, ABC):
         """What generates a task, or ``None`` if it needs a learned concept."""
         if task.learned:
             return None
-        embeddings = torch.stack([self.model.concept(text) for text in task.texts])
-        return Composition(embeddings, embeddings.new_full((len(embeddings),), self.guidance))
+        embeddings = torch.stack([self.model.concept(text) for text in (*task.texts, *task.without)])
+        weights = [self.guidance] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
+        return Composition(embeddings, embeddings.new_tensor(weights))
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
         """What a concept was learned from: nothing is learned here."""

@@ -1,22 +1,31 @@
 """Our method against the baselines, each number beside the paper's and their difference."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS, Published
-from ftl_lightning.evaluation.judged import standard_error
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, latest
-from ftl_lightning.reporting.shown import domain_of, headlines, lookup, metrics, published, settings, training_settings
-from ftl_lightning.reporting.tables import MISSING, Number, Table, difference_to, make_table, paper, select, summarise
+from ftl_lightning.reporting.paired import leads, least_certain, same_outcome, signed
+from ftl_lightning.reporting.shown import (
+    domain_of,
+    headlines,
+    lookup,
+    metrics,
+    policies,
+    published,
+    settings,
+    training_settings,
+)
+from ftl_lightning.reporting.tables import MISSING, Number, Table, against, difference_to, make_table, paper, select, summarise
 
 LANGUAGE = "language"
 METHODS = (OURS, "BC", "CVAE", "in-context", LANGUAGE)
 """The order of methods in tables; others come after them."""
-RESOLUTION = 0.005
-"""What is nearer than that looks the same in the table."""
+ALIKE = 0.9
+"""In this share of episodes, at least, a reference policy ends as ours does to be told."""
 LINES = 8
 """At most, of the short overview."""
 
@@ -38,7 +47,7 @@ def methods(rows: pd.DataFrame) -> list[str]:
 
 
 def comparison_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """One line for each setting, metric and method: measured, its errors, the paper's number, and the difference."""
+    """One line for each setting, metric and method: measured, its errors, the paper's number, the difference, the paired test."""
     rows, references = compared(domain, results), reference_lines(domain, results)
     lines = []
     for setting in settings(domain, rows):
@@ -46,11 +55,18 @@ def comparison_table(domain: Domain, results: pd.DataFrame) -> Table:
             own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
             numbers = [(method, summarise(select(own, method=method))) for method in methods(rows)]
             numbers += [(name, summarise(select(around, method=name))) for name in sorted(set(around["method"]))]
+            tested = {
+                lead.baseline: [signed(lead.difference), lead.shown]
+                for lead in leads(own, OURS, rivals(domain, rows, setting), domain.less_is_better(metric))
+            }
             for method, number in numbers:
                 if number:
-                    lines.append([setting, metric, method, *beside(number, lookup(domain, setting, metric, method=method))])
+                    theirs = lookup(domain, setting, metric, method=method)
+                    lines.append([setting, metric, method, *beside(number, theirs), *tested.get(method, [MISSING, MISSING])])
     caption = f"{domain.name}: all methods{_learned_from(rows)}"
-    return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", *BESIDE])
+    return make_table(
+        domain, "comparison", caption, lines, ["setting", "metric", "method", *BESIDE, "ours is better by", "ours is"]
+    )
 
 
 def _learned_from(rows: pd.DataFrame) -> str:
@@ -70,25 +86,10 @@ def beside(number: Number, theirs: Published | None) -> list[str]:
     return [f"{number.mean:.2f}", error, spread, paper(theirs), difference_to(theirs, number)]
 
 
-def lead(rows: pd.DataFrame, less: bool = False, others: Sequence[str] = METHODS[1:]) -> tuple[float, float] | None:
-    """Ours less the best baseline, and its standard error; negative where a baseline is better. ``None`` of a single difference.
-
-    Differences are taken task for task; of a single task, seed for seed.
-
-    Args:
-        rows: of one setting and metric, see :func:`compared`.
-        less: of the metric less is better.
-        others: baselines that are compared with.
-    """
-    sign = -1 if less else 1
-    by = "task" if len(set(rows["task"])) > 1 else "seed"
-    means = sign * rows.pivot_table(index=by, columns="method", values="value")
-    others = [name for name in others if name in means]
-    if OURS not in means or not others:
-        return None
-    best = max(others, key=lambda name: means[name].mean())
-    differences = (means[OURS] - means[best]).dropna()
-    return (float(differences.mean()), standard_error(differences.tolist())) if len(differences) > 1 else None
+def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[str]:
+    """The baselines of a setting; of training concepts language is ours, the same model and the same words."""
+    same = setting in training_settings(domain)
+    return [name for name in methods(rows) if name != OURS and not (name == LANGUAGE and same)]
 
 
 def overview(results: pd.DataFrame) -> Table:
@@ -122,7 +123,9 @@ def short_overview(results: pd.DataFrame) -> Table:
 
 def _overview(results: pd.DataFrame, lines: list[list[str]]) -> Table:
     papers = " [the paper's]" if any(map(published, _domains(results))) else ""
-    caption = f"Ours and the baselines, mean ± standard error over tasks{papers}; then ours less the best baseline"
+    caption = (
+        f"Ours and the baselines, mean ± standard error over tasks{papers}; lead: by how much ours is better than the best baseline"
+    )
     columns = ["domain", "setting, metric", *methods(results), "lead", "reference lines"]
     return Table("overview", caption, pd.DataFrame(lines, columns=columns, dtype=str))
 
@@ -134,12 +137,11 @@ def _domains(results: pd.DataFrame) -> list[Domain]:
 def _line(
     domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, names: Sequence[str]
 ) -> list[str]:
-    """A line of the overview; on training concepts language is ours, the same model and the same words."""
-    same = setting in training_settings(domain)
-    others = [name for name in names if name != OURS and not (name == LANGUAGE and same)]
     own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
     cells = [_cell(domain, own, method, setting, metric) for method in names]
-    return [domain.name, f"{setting}, {metric}", *cells, _lead(lead(own, domain.less_is_better(metric), others)), _around(around)]
+    lead = least_certain(leads(own, OURS, rivals(domain, rows, setting), domain.less_is_better(metric)))
+    alike = _alike(domain, select(rows, setting=setting, method=OURS)) if metric == domain.headline else {}
+    return [domain.name, f"{setting}, {metric}", *cells, MISSING if lead is None else str(lead), _around(around, alike)]
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric: str) -> str:
@@ -150,15 +152,17 @@ def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric:
     return f"{number.mean:.2f}{error}" + ("" if theirs is None else f" [{theirs.value:.2f}]")
 
 
-def _around(rows: pd.DataFrame) -> str:
+def _alike(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
+    """Of reference policies whose episodes nearly all end as ours do: in how many."""
+    counted = {policy: against(ours, policy) for policy in policies(domain)}
+    return {
+        policy: same_outcome(*counts)
+        for policy, counts in counted.items()
+        if counts is not None and sum(counts[:2]) <= (1 - ALIKE) * counts[2]
+    }
+
+
+def _around(rows: pd.DataFrame, alike: Mapping[str, str]) -> str:
     means = rows.groupby("method")["value"].mean().sort_values()
-    return ", ".join(f"{method} {mean:.2f}" for method, mean in means.items()) or MISSING
-
-
-def _lead(found: tuple[float, float] | None) -> str:
-    if found is None:
-        return MISSING
-    difference, error = found
-    margin = max(error, RESOLUTION)
-    verdict = "ahead" if difference > margin else "behind" if difference < -margin else "even"
-    return f"{difference:+.2f} ± {error:.2f}, {verdict}"
+    named = [(str(method), f"{method} {mean:.2f}") for method, mean in means.items()]
+    return ", ".join(shown + (f" ({alike[method]})" if method in alike else "") for method, shown in named) or MISSING

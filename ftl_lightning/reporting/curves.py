@@ -30,12 +30,15 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
 
 
 def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """One line for each setting and each of the two."""
+    """One line for each setting and each of the two; the spread over seeds stands behind where there are several."""
     lines, grown = [], {axis: points(domain, results, axis) for axis in AXES}
     counts = sorted({count for axis, rows in grown.items() for count in rows[axis]})
     for axis, rows in grown.items():
         for setting in dict.fromkeys(rows["setting"]):
             numbers = [summarise(rows[(rows["setting"] == setting) & (rows[axis] == count)]) for count in counts]
             lines.append([setting, axis, *(MISSING if number is None else str(number) for number in numbers)])
-    caption = f"{domain.name}: as demonstrations (with K = 2) and components K (from five demonstrations, learned weights) grow"
+    caption = (
+        f"{domain.name}: as demonstrations (with K = 2) and components K (from five demonstrations, learned weights) grow. "
+        "Mean ± standard error over tasks (spread over seeds)"
+    )
     return Table("curves", caption, pd.DataFrame(lines, columns=["setting", "of", *map(str, counts)], dtype=str))

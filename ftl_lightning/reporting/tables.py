@@ -1,6 +1,5 @@
 """Tables from results, each number beside the paper's: Markdown to read, LaTeX to paste."""
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
 from ftl_lightning.domains.paper import OURS, Published
 from ftl_lightning.evaluation.judged import LOST, WON, standard_error
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, labels, latest
+from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.reporting.shown import (
     component_tasks,
     learned_settings,
@@ -97,7 +97,7 @@ class Table:
 
 
 def _escape(text: str) -> str:
-    for plain, escaped in (("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$")):
+    for plain, escaped in (("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$"), ("<", "$<$")):
         text = text.replace(plain, escaped)
     return text
 
@@ -258,18 +258,13 @@ def _outcomes(domain: Domain, every: pd.DataFrame) -> Table:
     return make_table(domain, "outcomes", caption, lines, ["setting", "", *_beside_head(learned), *references])
 
 
-def difference(won: int, lost: int, count: int) -> str:
-    """A paired difference of two success rates with its 95 % interval, and McNemar's exact p.
-
-    Args:
-        won, lost: pairs in which only the one succeeds, and only the other.
-        count: all pairs.
-    """
-    mean = (won - lost) / count
-    error = 1.96 * math.sqrt(won + lost - (won - lost) ** 2 / count) / count
-    fewer, apart = min(won, lost), won + lost
-    chance = min(1.0, 2 * sum(math.comb(apart, k) for k in range(fewer + 1)) / 2**apart)
-    return f"{mean:+.2f} [{mean - error:+.2f}, {mean + error:+.2f}], p = {chance:.3f}"
+def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
+    """In how many episodes only ours succeeds, in how many only the policy from the same start, and of how many; maybe ``None``."""
+    won, lost = (select(ours, metric=f"{what}{policy}") for what in (WON, LOST))
+    if won.empty:
+        return None
+    gains, losses = (round(float((rows["value"] * rows["n"]).sum())) for rows in (won, lost))
+    return gains, losses, int(won["n"].sum())
 
 
 def _paired(domain: Domain, every: pd.DataFrame) -> Table:
@@ -279,15 +274,15 @@ def _paired(domain: Domain, every: pd.DataFrame) -> Table:
     lines = []
     for setting in settings(domain, ours):
         for policy in policies(domain):
-            line = []
-            for label in learned:
-                won, lost = (select(ours, setting=setting, label=label, metric=f"{what}{policy}") for what in (WON, LOST))
-                gains, losses = (round(float((rows["value"] * rows["n"]).sum())) for rows in (won, lost))
-                line.append(MISSING if won.empty else difference(gains, losses, int(won["n"].sum())))
+            counted = [against(select(ours, setting=setting, label=label), policy) for label in learned]
+            line = [MISSING if counts is None else episodes(*counts) for counts in counted]
             if set(line) - {MISSING}:
                 lines.append([setting, policy, *line])
     compared = domain.headline.removeprefix(f"{CLOSED} ")
-    caption = f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p"
+    caption = (
+        f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
+        "(of these learned concepts: the episodes of a seed share one)"
+    )
     return make_table(domain, "paired", caption, lines, ["setting", "compared with", *learned])
 
 

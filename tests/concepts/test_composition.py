@@ -106,6 +106,7 @@ def test_the_empty_branch_is_evaluated_without_gradient_and_the_rest_in_one_call
 def test_compositions_in_words() -> None:
     assert parse_composition("") == []
     assert parse_composition("a right of b:1.2 + c above d") == [("a right of b", 1.2), ("c above d", 1.0)]
+    assert parse_composition("a right of b:1.2 + c above d:-0.5") == [("a right of b", 1.2), ("c above d", -0.5)]
     for wrong in ("a:heavy", "a:nan", "a:inf", ":1", "a + "):
         with pytest.raises(UserError, match="expected 'concept:weight"):
             parse_composition(wrong)
@@ -134,6 +135,15 @@ def test_a_sum_adds_what_its_parts_do_and_a_multiple_multiplies_it(seed: int, co
     apart = factor * one + other * factor
     assert torch.equal(both.embeddings, apart.embeddings)
     assert torch.equal(both.weights, apart.weights)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=seeds, factor=st.floats(-3, 3))
+def test_a_difference_takes_away_what_its_second_part_does(seed: int, factor: float) -> None:
+    of, one, other = inputs(1, seed), drawn(2, seed), drawn(1, seed + 1)
+    assert close(score(one - factor * other, of), score(one, of) - factor * score(other, of))
+    assert torch.equal((-one).weights, -1 * one.weights)
+    assert torch.equal((one - 0.5 * other).weights, torch.cat((one.weights, -0.5 * other.weights)))
 
 
 def test_sums_and_multiples_leave_their_parts_as_they_were() -> None:

@@ -16,13 +16,14 @@ from ftl_lightning.domains.object_rearrangement.relations import (
     holds,
     overlap,
     parse,
+    sentence,
 )
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.errors import UserError
 
 DOMAIN = load_domain("object_rearrangement")
 SOURCE = DOMAIN.source(None)
-TASKS = [task.goal for suite in ("training", "paper", "validation") for task in DOMAIN.concepts.suites[suite].tasks]
+TASKS = [task.goal for suite in ("training", "paper", "validation", "compositions") for task in DOMAIN.concepts.suites[suite].tasks]
 
 
 def succeeded(task: str, states: torch.Tensor) -> torch.Tensor:
@@ -50,6 +51,15 @@ def test_the_papers_numbers_of_concepts_and_tasks() -> None:
     learned = DOMAIN.concepts.suites["validation"].learned
     assert not set(learned) & set(DOMAIN.concepts.suites["paper"].learned)
     assert len(DOMAIN.concepts.suites["paper"].learned) == 10
+
+
+def test_compositions_for_tuning_share_learned_concepts_with_validation_and_hold_no_task_of_the_paper() -> None:
+    suites = DOMAIN.concepts.suites
+    assert set(suites["compositions"].learned) <= set(suites["validation"].learned)
+    for goal in suites["compositions"].goals:
+        parts = {str(relation) for relation in parse(goal)}
+        assert not any({str(relation) for relation in parse(other)} <= parts for other in suites["paper"].goals)
+        assert goal not in suites["validation"].goals
 
 
 def test_the_training_set_is_the_papers_size_and_quick() -> None:
@@ -120,6 +130,40 @@ def test_ring_by_hand() -> None:
     assert not holds(ring, line, relaxed=True).item()
 
 
+def test_a_negated_relation_is_read_written_and_told() -> None:
+    task = "circle above square and not square diagonal to triangle and not circle, triangle and square in a circle of radius 2"
+    above, diagonal, ring = parse(task)
+    assert (above.negated, diagonal.negated, ring.negated) == (False, True, True)
+    assert ring == Relation("ring", SHAPES, 2.0, negated=True)
+    assert " and ".join(map(str, (above, diagonal, ring))) == task
+    assert sentence(task).split(" and not ")[1] == "square right and above diagonally to triangle"
+
+
+@pytest.mark.parametrize("dx", [0.5, 0.9, 1.1])  # 0.5: exact; 0.9: only relaxed; 1.1: not even that
+def test_a_negated_relation_holds_where_the_relation_does_not_even_hold_relaxed(dx: float) -> None:
+    state = scene(circle=(2 + dx, 4, 0.5), square=(2, 1, 0.3))
+    for relaxed in (False, True):
+        assert holds(parse("not circle above square")[0], state, relaxed).item() == (dx > 1)
+    assert not succeeded("circle above square and not circle above square", state[:, None]).item()
+
+
+def test_generated_scenes_of_a_negation_are_right_and_no_line_is_forced_on_them() -> None:
+    task = "circle right of square and not circle diagonal to triangle"
+    states = SOURCE.draw(task, 50, 0).states
+    assert succeeded(task, states).all()
+    x, y, _ = columns(states[:, 0])
+    assert ((x[:, 0] - y[:, 0]).abs() > 1e-2).float().mean() > 0.9
+
+
+def test_a_ring_can_be_laid_onto_either_diagonal() -> None:
+    ring = str(Relation("ring", SHAPES, 1.25))
+    for pair in ("circle diagonal to triangle", "square antidiagonal to circle"):
+        for task in (f"{ring} and {pair}", f"{pair} and {ring}"):
+            states = SOURCE.draw(task, 40, 1).states[:, 0]
+            assert all(holds(relation, states, relaxed=False).all() for relation in parse(task))
+            assert states[:, 0].std() > 0.2  # not always at the same place
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**31))
 def test_relaxed_contains_exact_and_right_of_excludes_its_reverse(seed: int) -> None:
@@ -143,7 +187,16 @@ def test_the_circumradius_is_that_of_the_circle_points_were_put_on(
 
 
 @pytest.mark.parametrize(
-    "task", ["circle left of square", "circle right of circle", "circle right of square and", "", "circle right of squarex"]
+    "task",
+    [
+        "circle left of square",
+        "circle right of circle",
+        "circle right of square and",
+        "",
+        "circle right of squarex",
+        "not",
+        "not not circle above square",
+    ],
 )
 def test_an_unreadable_task_is_a_clear_error(task: str) -> None:
     with pytest.raises(UserError, match="expected 'A <relation> B'"):

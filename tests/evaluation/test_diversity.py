@@ -21,7 +21,7 @@ from ftl_lightning.seeding import DEMONSTRATION_SEED
 
 SCENES = load_domain("object_rearrangement")
 NEW = "square diagonal to triangle"
-TASK = EvaluationTask("new concept", NEW, learned=NEW)
+TASK = EvaluationTask("new concept", NEW, learned=(NEW,))
 
 
 def five(domain: Domain = SCENES, goal: str = NEW) -> Demonstrations:
@@ -94,10 +94,10 @@ def test_wider_plans_do_not_seem_nearer_for_it() -> None:
     ("task", "names"),
     [
         (TASK, ["novelty", "coverage"]),
-        (EvaluationTask("new + training", f"{NEW} and circle above square", NEW, ("circle above square",)), ["coverage"]),
-        (EvaluationTask("component 1", "circle above square", learned=NEW, component=1), ["coverage"]),
+        (EvaluationTask("new + training", f"{NEW} and circle above square", (NEW,), ("circle above square",)), ["coverage"]),
+        (EvaluationTask("component 1", "circle above square", learned=(NEW,), component=1), ["coverage"]),
         (EvaluationTask("training concept", "circle above square", texts=("circle above square",)), ["coverage"]),
-        (EvaluationTask("own demonstrations", "my way", learned="my way"), ["novelty"]),
+        (EvaluationTask("own demonstrations", "my way", learned=("my way",)), ["novelty"]),
         (replace(TASK, initial="demonstrated"), []),
     ],
 )
@@ -118,7 +118,7 @@ def test_a_task_that_cannot_be_drawn_has_no_coverage(caplog: pytest.LogCaptureFi
 def test_driving_has_novelty_alone_since_its_expert_is_slow() -> None:
     driving = load_domain("driving")
     demonstrations = driving.source(None).split("validation", 3, 0)
-    task = EvaluationTask("new initial state", "highway", learned="highway")
+    task = EvaluationTask("new initial state", "highway", learned=("highway",))
     real = Real.of(task, driving, 3, demonstrations)
     rows = torch.arange(3)
     plans = demonstrations.windows(rows, 0 * rows, driving.plans.horizon)[0]
@@ -187,7 +187,7 @@ def test_own_behaviour_is_compared_by_time_warping_and_has_no_fresh_samples() ->
     states = torch.stack([wave(shift) for shift in (0.0, 0.1, 0.2)])
     examples = Demonstrations(states, torch.full((3,), 12), "own", ("x", "y"), ("", ""), ("a", "a", "b"))
     domain = own_domain(examples, ("a", "b"), 12, {"nearest_demonstration": 1})
-    task = EvaluationTask("new concept", "a", learned="a")
+    task = EvaluationTask("new concept", "a", learned=("a",))
     real = Real.of(task, domain, 4, examples.select("a"))
     assert list(real.values(states)) == ["novelty"]
     assert real.lines()[REPLAYED].values["novelty"] == 0

@@ -16,6 +16,7 @@ from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import Row, append_rows, labels, read_rows
@@ -110,6 +111,18 @@ def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: P
     assert all(torch.equal(one.states, other.states) for one, other in zip(first, again, strict=True))
     with pytest.raises(UserError, match="suites: expected some of training, paper"):
         Evaluator(suites=["exam"]).evaluate(Trained(GenerativeModel.load(tiny)))
+
+
+def test_what_a_task_is_learned_from_is_that_of_all_its_concepts() -> None:
+    source = load_domain("object_rearrangement").source(None)
+    shown = {text: source.draw(text, count, 0) for text, count in (("circle above square", 3), ("square above circle", 4))}
+    one, other = shown
+    assert demonstrations_of(EvaluationTask("s", one, learned=(one,)), shown.get) is shown[one]
+    both = demonstrations_of(EvaluationTask("s", "g", learned=(one, other)), shown.get)
+    assert both is not None
+    assert both.concepts == (one,) * 3 + (other,) * 4
+    assert demonstrations_of(EvaluationTask("s", one, texts=(one,)), shown.get) is None
+    assert demonstrations_of(EvaluationTask("s", "g", learned=("unknown",)), shown.get) is None
 
 
 def row(**changes: object) -> Row:

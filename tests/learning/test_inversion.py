@@ -9,6 +9,7 @@ import torch
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.data import InversionData
+from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import read_rows
@@ -183,6 +184,44 @@ def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: P
     first = file_hash("states.safetensors")
     assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors"]) == 0
     assert file_hash("states.safetensors") == first
+    negative = f"--compose=circle above square:1.2 + circle right of square:-0.5 + {file}:0.5"
+    rest = [f"--pretrained={tiny}", negative, "--count=4", "--steps=3", "--goal=circle above square and not circle right of square"]
+    assert main(["sample", *rest, "--out=others.safetensors"]) == 0
+    assert "accuracy on 'circle above square and not circle right of square'" in capsys.readouterr().out
+    assert file_hash("others.safetensors") != first
+
+
+def test_a_task_is_composed_of_all_that_it_names_with_the_weight_of_each(tiny: Path) -> None:
+    module = learn(tiny, omega=1.2, training_omega=0.8, components=2)
+    module.on_validation_start()
+    first, second, *_ = module.concepts
+    text, other = module.model.config.training_concepts[:2]
+    found = module.composition(EvaluationTask("s", "g", learned=(first, second), texts=(text,), without=(other,)))
+    assert found is not None
+    assert found.weights.tolist() == pytest.approx([0.8, WITHOUT_WEIGHT, 1.2, 1.2, 1.2, 1.2])
+    expected = [module.model.concept(text)[None], module.model.concept(other)[None]]
+    expected += [module.learned()[name].embeddings for name in (first, second)]
+    assert torch.equal(found.embeddings, torch.cat(expected))
+    assert module.composition(EvaluationTask("s", "g", learned=(first, "never learned"))) is None
+    negated = module.composition(EvaluationTask("s", "g", texts=(text,), without=(other,)))
+    assert negated is not None
+    assert negated.weights.tolist() == pytest.approx([1.2, WITHOUT_WEIGHT])  # nothing learned: the paper's omega
+
+
+def test_the_compositions_suite_is_learned_and_judged_with_all_its_settings(invert: Callable[..., Path]) -> None:
+    invert(
+        "--data.suite=compositions", "--evaluation.suites=[compositions]", "--evaluation.figures=0", "--evaluation.results=r.csv"
+    )
+    rows = read_rows("r.csv")
+    rows = rows[rows["role"] == "method"]
+    assert rows["setting"].value_counts().to_dict() == {
+        "two learned concepts": 6,
+        "ring + training": 4,
+        "three texts": 6,
+        "not": 6,
+    }
+    shown = rows.groupby("setting")["demonstrations"].unique().map(list).to_dict()
+    assert shown == {"two learned concepts": [10], "ring + training": [5], "three texts": [0], "not": [0]}
 
 
 def test_inverting_twice_gives_the_same_rows(invert: Callable[..., Path]) -> None:

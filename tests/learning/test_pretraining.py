@@ -10,6 +10,8 @@ import torch
 from safetensors.torch import load_file
 
 from ftl_lightning.cli import main
+from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
+from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.generative_model import GenerativeModel
 from tests.conftest import CONF, ROOT, TINY
 
@@ -99,7 +101,6 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(capsys: p
 
 def test_condition_dropout_is_drawn_per_sample() -> None:
     from ftl_lightning.domains.object_rearrangement.datamodule import ObjectRearrangementData
-    from ftl_lightning.learning import PretrainingModule
     from ftl_lightning.trainer import Trainer
 
     seen = []
@@ -119,6 +120,17 @@ def test_condition_dropout_is_drawn_per_sample() -> None:
     module.raw.denoiser.register_forward_pre_hook(spy)
     trainer.fit(module, datamodule=data)
     assert 140 < (seen[0] == 0).sum() < 260  # neither none nor all, as once a batch would give
+
+
+def test_a_task_of_texts_is_composed_with_the_guidance_weight_and_against_others(tiny: Path) -> None:
+    module = PretrainingModule(guidance=1.5)
+    module.model = GenerativeModel.load(tiny)
+    one, other = module.model.config.training_concepts[:2]
+    found = module.composition(EvaluationTask("s", "g", texts=(one,), without=(other,)))
+    assert found is not None
+    assert found.weights.tolist() == [1.5, WITHOUT_WEIGHT]
+    assert torch.equal(found.embeddings, torch.stack([module.model.concept(one), module.model.concept(other)]))
+    assert module.composition(EvaluationTask("s", "g", learned=("new",), texts=(one,))) is None
 
 
 def test_the_model_folder_round_trips_and_refuses_mixtures(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,6 @@
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import pandas as pd
 import pytest
 import torch
 
@@ -10,7 +9,7 @@ from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.reporting.comparison import comparison_table, lead, overview, short_overview
+from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
 from tests.conftest import ROOT
@@ -56,39 +55,19 @@ def results(tmp_path: Path) -> Path:
 def test_every_number_stands_beside_the_papers_with_their_difference(results: Path) -> None:
     table = comparison_table(DOMAIN, read_study(results, "comparison")).cells.set_index("method")
     assert list(table.index) == ["FTL-IGM", "BC", "CVAE", "language", "random scenes"]
-    assert table.loc["BC"].tolist() == ["new concept", "accuracy", "0.50", "0.30", "-", "0.67 ± 0.15", "-0.17"]
+    measured = ["new concept", "accuracy", "0.50", "0.30", "-", "0.67 ± 0.15", "-0.17"]
+    assert table.loc["BC"].tolist() == [*measured, "+0.30", "undecided (2 pairs)"]
+    assert table.loc["random scenes", ["ours is better by", "ours is"]].tolist() == ["-", "-"]
     assert table.loc["FTL-IGM", ["paper", "difference"]].tolist() == ["0.82 ± 0.09", "-0.02"]
 
 
-def test_the_lead_is_taken_task_for_task() -> None:
-    rows = pd.DataFrame(
-        [
-            {"method": method, "task": task, "seed": 0, "value": value}
-            for method, values in (("FTL-IGM", (0.9, 0.7)), ("BC", (0.8, 0.2)), ("CVAE", (0.1, 0.1)))
-            for task, value in zip("ab", values, strict=True)
-        ]
-    )
-    assert lead(rows) == pytest.approx((0.3, 0.2))  # 0.1 and 0.5 ahead of BC
-    assert lead(rows, less=True) == pytest.approx((-0.7, 0.1))  # of crashes CVAE has the fewest
-    one = pd.DataFrame(
-        [
-            {"method": f, "task": "a", "seed": s, "value": v}
-            for f, vs in (("FTL-IGM", (0.5, 0.7)), ("BC", (0.4, 0.5)))
-            for s, v in enumerate(vs)
-        ]
-    )
-    assert lead(one) == pytest.approx((0.15, 0.05))  # a single task: seed for seed
-    assert lead(rows[rows["method"] != "FTL-IGM"]) is None
-    assert lead(rows[rows["task"] == "a"]) is None  # of a single difference nobody knows the error
-
-
-def test_the_overview_fits_on_one_screen_and_says_who_is_ahead(results: Path) -> None:
+def test_the_overview_fits_on_one_screen_and_names_the_best_baseline(results: Path) -> None:
     cells = overview(read_study(results, "comparison")).cells
     assert len(cells) == 1
     line = cells.iloc[0]
     assert line["FTL-IGM"] == "0.80 ± 0.10 [0.82]"
     assert "in-context" not in cells
-    assert line["lead"] == "+0.30 ± 0.20, ahead"
+    assert line["lead"] == "+0.30 against BC, undecided (2 pairs)"
     assert line["reference lines"] == "random scenes 0.15"
 
 
@@ -112,8 +91,31 @@ def test_a_method_of_ones_own_stands_beside_the_others(results: Path) -> None:
     rows = read_study(results, "comparison")
     cells = overview(rows).cells
     assert list(cells.columns[2:-2]) == ["FTL-IGM", "BC", "CVAE", "language", "mine"]
-    assert cells.iloc[0]["lead"] == "-0.20 ± 0.10, behind"
+    assert cells.iloc[0]["lead"] == "-0.20 against mine, undecided (2 pairs)"
     assert "mine" in comparison_table(DOMAIN, rows).cells["method"].tolist()
+
+
+def test_the_overview_says_who_is_ahead_by_the_paired_test(results: Path) -> None:
+    # Eight tasks and three baselines: all signs agree against each of them, p = 3 * 2 / 2^8.
+    levels = {"FTL-IGM": 0.9, "BC": 0.5, "CVAE": 0.6, "language": 0.1}
+    append_rows(results / "comparison.csv", [row(name, task, value) for name, value in levels.items() for task in "abcdefgh"])
+    line = overview(read_study(results, "comparison")).cells.iloc[0]
+    assert line["lead"] == "+0.30 against CVAE, ahead (p = .024)"
+
+
+def test_where_a_policy_of_no_learning_ends_as_ours_does_the_overview_says_in_how_many_episodes(tmp_path: Path) -> None:
+    driving = {"domain": "driving", "setting": "new initial state", "task": "roundabout"}
+    strict = {**driving, "metric": "closed loop strict success"}
+    rows = [row("FTL-IGM", seed=seed, value=0.5, **strict) for seed in (0, 1)]
+    for policy, lost in (("FASTER", 0.02), ("IDLE", 0.5)):
+        rows += [row(policy, seed=seed, value=0.4, variant="", role="reference", K=0, omega="", **strict) for seed in (0, 1)]
+        for seed in (0, 1):
+            rows += [row("FTL-IGM", seed=seed, value=0.0, **(driving | {"metric": f"won against {policy}"}))]
+            rows += [row("FTL-IGM", seed=seed, value=lost * seed, **(driving | {"metric": f"lost against {policy}"}))]
+    append_rows(tmp_path / "comparison.csv", rows)
+    line = overview(read_study(tmp_path, "comparison")).cells.iloc[0]
+    assert line["reference lines"] == "FASTER 0.40 (same outcome in 99 of 100), IDLE 0.40"
+    assert line["lead"] == "-"
 
 
 def test_figures_show_measured_bars_and_the_papers_diamonds(results: Path) -> None:

@@ -13,8 +13,8 @@ TRAINING = training_suite(TRAINING_CONCEPTS)
 
 def _suite(learned: Sequence[str]) -> Suite:
     return Suite(
-        tuple(EvaluationTask("training composition", task, learned=task, initial="demonstrated") for task in learned)
-        + tuple(EvaluationTask("new initial state", task, learned=task) for task in learned)
+        tuple(EvaluationTask("training composition", task, learned=(task,), initial="demonstrated") for task in learned)
+        + tuple(EvaluationTask("new initial state", task, learned=(task,)) for task in learned)
     )
 
 
@@ -35,7 +35,7 @@ def _parts(task: str) -> tuple[str, str]:
 
 COMPONENTS = Suite(
     tuple(
-        EvaluationTask(f"component {component}", part, learned=task, component=component)
+        EvaluationTask(f"component {component}", part, learned=(task,), component=component)
         for task in COMPOSITIONS
         for part in _parts(task)
         for component in (1, 2)
@@ -43,4 +43,18 @@ COMPONENTS = Suite(
 )
 """What each of two learned components generates alone (paper, table 'Analysis of learned concepts')."""
 
-SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION}
+COMPOSED = Suite(
+    (
+        *(
+            EvaluationTask("two learned concepts", f"go to {colour} {shape}", learned=(f"go to {colour} object", f"go to {shape}"))
+            for colour, shape in (("green", "cone"), ("green", "sphere"), ("purple", "sphere"))
+        ),
+        EvaluationTask("new + training", "go to red cone", learned=("go to cone",), texts=("go to red object",)),
+        EvaluationTask("new + training", "go to yellow sphere", learned=("go to sphere",), texts=("go to yellow object",)),
+        EvaluationTask("new + training", "go to purple bowl", learned=("go to purple object",), texts=("go to bowl",)),
+    )
+)
+"""The targets of the validation suite once more, each composed of a colour and a shape that were learned apart, or of one that was
+learned and one of pretraining. For tuning, like the validation suite."""
+
+SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSED}

@@ -6,8 +6,8 @@ TRAINING_CONCEPTS = ("highway", "exit", "merge", "intersection")
 NEW = "new initial state"
 
 TRAINING = training_suite(TRAINING_CONCEPTS)
-PAPER = Suite((EvaluationTask(NEW, "roundabout", learned="roundabout"),))
-VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned="roundabout third exit"),))
+PAPER = Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),))
+VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),))
 """Another way through the same roundabout."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "validation": VALIDATION}

@@ -12,7 +12,7 @@ from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES, holds, parse, sentence
-from ftl_lightning.domains.object_rearrangement.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
 
@@ -59,6 +59,7 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
+        descriptions=DESCRIBED,
         reads=reads,
         sentence=sentence,
         table=Path(__file__).parent / "embeddings.safetensors",

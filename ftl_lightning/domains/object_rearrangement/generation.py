@@ -24,6 +24,8 @@ PROPOSALS = 32_768
 """Scenes proposed at a time."""
 PATIENCE = 200
 """Rounds without reaching the count after which a task is declared infeasible."""
+_ALONG = {"diagonal to": (1 + 1j) / abs(1 + 1j), "antidiagonal to": (-1 + 1j) / abs(-1 + 1j)}
+"""The way from B to A on the line of a relation, as a complex number x + iy."""
 
 
 def generate(task: str, count: int, seed: int) -> Tensor:
@@ -75,11 +77,17 @@ def _related(relation: Relation) -> tuple[Relation, ...]:
 
 
 def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tensor:
-    """Uniform scenes ``(PROPOSALS, 21)``, with centres put where a relation of measure zero wants them."""
+    """Uniform scenes ``(PROPOSALS, 21)``, with centres put where a relation of measure zero wants them: rings first, which are
+    then moved as they are.
+    """
     scenes = _uniform_scenes(rng, PROPOSALS)
-    for relation in relations:
+    wanted = sorted((one for one in relations if not one.negated), key=lambda one: one.kind != "ring")
+    on_ring = bool(wanted) and wanted[0].kind == "ring"
+    for relation in wanted:
         which = [SHAPES.index(shape) for shape in relation.shapes]
-        if relation.kind == "diagonal to":
+        if on_ring and relation.kind in _ALONG:
+            scenes[..., :2] = _moved_onto(_ALONG[relation.kind], scenes[..., :2], which[0], which[1])
+        elif relation.kind == "diagonal to":
             scenes[:, which, 1] = scenes[:, which, 0]
         elif relation.kind == "antidiagonal to":
             scenes[:, which, 1] = EXTENT - scenes[:, which, 0]
@@ -91,6 +99,21 @@ def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tenso
             scenes[..., :2] = centre + relation.radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
     inside = ((scenes[..., :2] >= 0) & (scenes[..., :2] <= EXTENT)).all(axis=(1, 2))
     return _flat(scenes[inside])
+
+
+def _moved_onto(along: complex, centres: NDArray[np.float32], a: int, b: int) -> NDArray[np.float32]:
+    """Centres ``(scene, shape, 2)`` turned and shifted, their distances kept, until A and B lie on a line, A further along it.
+
+    Args:
+        along: way of the line, of length 1; it goes through the middle of the square.
+        centres: of the shapes.
+        a, b: which shapes are A and B.
+    """
+    points = centres[..., 0] + 1j * centres[..., 1]
+    way, middle = points[:, [a]] - points[:, [b]], (1 + 1j) * EXTENT / 2
+    turned = (points - points[:, [a]]) * along * abs(way) / way
+    moved = turned + middle + along * ((points[:, [a]] - middle) * along.conjugate()).real
+    return np.stack((moved.real, moved.imag), axis=-1).astype(np.float32)
 
 
 def _uniform_scenes(rng: np.random.Generator, count: int) -> NDArray[np.float32]:

@@ -1,13 +1,14 @@
 """Spatial relations between the three shapes: their grammar, their exact form and their relaxed form.
 
-A task is a conjunction of relations written in words (``'circle right of square and triangle above square'``).
+A task is a conjunction of relations written in words (``'circle right of square and triangle above square'``), each of which may be
+negated (``'circle above square and not circle right of square'``).
 Each relation is defined once, in :func:`holds`; generation uses the exact margin, evaluation the relaxed one
 (Netanyahu et al., 2024, appendix 'Object Rearrangement').
 """
 
 import itertools
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ PER_SHAPE = 4 + len(SHAPES)
 ORDERED_PAIRS = tuple(itertools.permutations(SHAPES, 2))
 AND = " and "
 """Joins the relations of a task."""
+NOT = "not "
+"""Negates the relation that follows."""
 PAIRWISE = ("right of", "above", "diagonal to", "antidiagonal to", "next to")
 RADIUS_TOLERANCE = 0.3
 """A ring's circumradius may differ from its nominal value by this much in evaluation."""
@@ -40,16 +43,25 @@ class Relation:
         kind: one of :data:`PAIRWISE`, or ``'ring'`` (all three shapes on the circumference of a circle).
         shapes: the ordered pair (A, B), or all three shapes for a ring.
         radius: circumradius of a ring, 0 otherwise.
+        negated: whether it must not hold.
     """
 
     kind: str
     shapes: tuple[str, ...]
     radius: float = 0.0
+    negated: bool = False
 
     def __str__(self) -> str:
+        if self.negated:
+            return f"{NOT}{self.plain}"
         if self.kind == "ring":
             return f"circle, triangle and square in a circle of radius {self.radius:g}"
         return f"{self.shapes[0]} {self.kind} {self.shapes[1]}"
+
+    @property
+    def plain(self) -> "Relation":
+        """The relation itself, without a negation."""
+        return replace(self, negated=False)
 
 
 def sentence(task: str) -> str:
@@ -58,6 +70,8 @@ def sentence(task: str) -> str:
 
 
 def _told(relation: Relation) -> str:
+    if relation.negated:
+        return f"{NOT}{_told(relation.plain)}"
     if relation.kind == "ring":
         return f"circle triangle and square in a circle of radius {relation.radius:g}"
     if relation.kind == "diagonal to":
@@ -70,7 +84,7 @@ TRAINING_RELATIONS = tuple(Relation(kind, pair) for kind in ("right of", "above"
 _SHAPE, _KIND = "|".join(SHAPES), "|".join(PAIRWISE)
 _PAIR = rf"(?P<a>{_SHAPE}) (?P<kind>{_KIND}) (?!(?P=a))(?P<b>{_SHAPE})"
 _RING = r"circle,? triangle and square in a circle of radius (?P<radius>\d+(?:\.\d+)?)"
-_RELATION = re.compile(f"{_PAIR}|{_RING}")
+_RELATION = re.compile(f"(?P<negated>{NOT})?(?:{_PAIR}|{_RING})")
 
 
 def parse(task: str) -> tuple[Relation, ...]:
@@ -93,12 +107,13 @@ def parse(task: str) -> tuple[Relation, ...]:
             raise UserError(
                 f"object_rearrangement task {task!r}: found {task[max(end, 0) :]!r}, expected 'A <relation> B' with A, B different "
                 f"among {', '.join(SHAPES)} and <relation> among {', '.join(PAIRWISE)}, or "
-                f"'{Relation('ring', SHAPES, 1.67)}', joined by '{AND}'"
+                f"'{Relation('ring', SHAPES, 1.67)}', after '{NOT}' or not, joined by '{AND}'"
             )
+        negated = bool(found["negated"])
         if found["radius"]:
-            relations.append(Relation("ring", SHAPES, float(found["radius"])))
+            relations.append(Relation("ring", SHAPES, float(found["radius"]), negated))
         else:
-            relations.append(Relation(found["kind"], (found["a"], found["b"])))
+            relations.append(Relation(found["kind"], (found["a"], found["b"]), negated=negated))
         end = found.end()
     return tuple(relations)
 
@@ -123,11 +138,13 @@ def holds(relation: Relation, states: Tensor, relaxed: bool) -> Tensor:
     Args:
         relation: the relation.
         states: ``(scene, 21)`` in the domain's units.
-        relaxed: the margins of evaluation instead of those of generation.
+        relaxed: the margins of evaluation instead of those of generation. A negated relation must not even hold relaxed, always.
 
     Returns:
         ``(scene,)`` of bool.
     """
+    if relation.negated:
+        return ~holds(relation.plain, states, relaxed=True)
     x, y, radius = columns(states)
     if relation.kind == "ring":
         return (circumradius(x, y) - relation.radius).abs() < (RADIUS_TOLERANCE if relaxed else EXACT_TOLERANCE)

@@ -1,6 +1,6 @@
 """The paper's settings for object rearrangement, as data, and the validation suite on which everything is tuned."""
 
-from ftl_lightning.domains.object_rearrangement.relations import SHAPES, TRAINING_RELATIONS, Relation
+from ftl_lightning.domains.object_rearrangement.relations import AND, NOT, SHAPES, TRAINING_RELATIONS, Relation
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 
 TRAINING_CONCEPTS = tuple(str(relation) for relation in TRAINING_RELATIONS)
@@ -8,10 +8,10 @@ TRAINING_CONCEPTS = tuple(str(relation) for relation in TRAINING_RELATIONS)
 
 def _suite(compositions: tuple[str, ...], new_concepts: tuple[str, ...], with_training: dict[str, tuple[str, ...]]) -> Suite:
     return Suite(
-        tuple(EvaluationTask("training composition", task, learned=task) for task in compositions)
-        + tuple(EvaluationTask("new concept", task, learned=task) for task in new_concepts)
+        tuple(EvaluationTask("training composition", task, learned=(task,)) for task in compositions)
+        + tuple(EvaluationTask("new concept", task, learned=(task,)) for task in new_concepts)
         + tuple(
-            EvaluationTask("new + training", f"{new} and {text}", learned=new, texts=(text,))
+            EvaluationTask("new + training", f"{new} and {text}", learned=(new,), texts=(text,))
             for new, texts in with_training.items()
             for text in texts
         )
@@ -76,13 +76,71 @@ VALIDATION = _suite(
 
 COMPONENTS = Suite(
     tuple(
-        EvaluationTask(f"component {component}", part, learned=task.goal, component=component)
+        EvaluationTask(f"component {component}", part, learned=(task.goal,), component=component)
         for task in PAPER.tasks
         if task.setting == "training composition"
-        for part in task.goal.split(" and ")
+        for part in task.goal.split(AND)
         for component in (1, 2)
     )
 )
 """What each of two learned components generates alone (paper, table 'Analysis of learned concepts')."""
 
-SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION}
+
+def _ring(radius: float) -> str:
+    return str(Relation("ring", SHAPES, radius))
+
+
+COMPOSITIONS = Suite(
+    tuple(
+        EvaluationTask("two learned concepts", AND.join(pair), learned=pair)
+        for pair in (
+            ("square antidiagonal to circle", "circle antidiagonal to triangle"),
+            ("circle antidiagonal to triangle", "triangle antidiagonal to square"),
+            ("triangle antidiagonal to square", "square antidiagonal to circle"),
+            (_ring(1.0), "circle antidiagonal to triangle"),
+            (_ring(1.25), "square antidiagonal to circle"),
+            (_ring(2.1), "triangle antidiagonal to square"),
+        )
+    )
+    + tuple(
+        EvaluationTask("ring + training", f"{ring}{AND}{text}", learned=(ring,), texts=(text,))
+        for ring, text in (
+            (_ring(1.0), "circle above square"),
+            (_ring(1.25), "triangle right of circle"),
+            (_ring(2.1), "square above triangle"),
+            (_ring(2.3), "circle right of triangle"),
+        )
+    )
+    + tuple(
+        EvaluationTask("three texts", AND.join(texts), texts=texts)
+        for texts in (
+            ("circle right of triangle", "circle right of square", "square above triangle"),
+            ("triangle right of circle", "triangle right of square", "square above circle"),
+            ("square above circle", "square above triangle", "circle right of triangle"),
+            ("square above circle", "square above triangle", "triangle right of circle"),
+            ("triangle right of circle", "circle right of square", "triangle right of square"),
+            ("circle above triangle", "triangle above square", "circle above square"),
+        )
+    )
+    + tuple(
+        EvaluationTask("not", f"{text}{AND}{NOT}{other}", texts=(text,), without=(other,))
+        for text, other in (
+            ("circle above square", "triangle right of square"),
+            ("triangle right of circle", "square above triangle"),
+            ("square above triangle", "circle right of triangle"),
+            ("circle right of triangle", "square above triangle"),
+            ("square above circle", "triangle right of circle"),
+            ("triangle right of square", "circle above square"),
+        )
+    )
+)
+"""Compositions that the validation suite has none of: of two of its learned concepts, of one of its rings with a training concept,
+of three training concepts (never two that are a task of the paper), and of one without another that would often hold by chance (of
+the same two shapes none would). For tuning, like the validation suite, whose learned concepts they share."""
+
+SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSITIONS}
+
+DESCRIBED = tuple(
+    dict.fromkeys((*TRAINING_CONCEPTS, *(goal for suite in (TRAINING, PAPER, COMPONENTS, VALIDATION) for goal in suite.goals)))
+)
+"""The texts of the table of embeddings; compositions are not among them, since their parts are."""

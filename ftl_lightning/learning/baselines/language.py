@@ -62,6 +62,6 @@ class LanguageAdaptation(Adaptation):
 
     def composition(self, task: EvaluationTask) -> Composition | None:
         """The description of the whole task, with its weight."""
-        if task.learned and (task.learned not in self._found or task.component is not None):
+        if task.component is not None or not set(task.learned) <= set(self._found):
             return None
         return Composition(self._embedding(task.goal), torch.tensor([self._omega], device=self.device))
