@@ -11,6 +11,8 @@ DEMONSTRATION_SEED = 2_000_000
 """Added to the seed of new tasks' demonstrations, so that they share no random stream with pretraining."""
 EVALUATION_SEED = 3_000_000
 """Added to the seed of new initial states, so that they share no random stream with demonstrations."""
+FRESH_SEED = 4_000_000
+"""Added to the seed of fresh behaviour of a task, which generated behaviour is compared with: independent of all that was seen."""
 
 
 def generator(device: torch.device | str, *key: int) -> torch.Generator:

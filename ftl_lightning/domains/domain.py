@@ -19,6 +19,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
 from ftl_lightning.domains import line_plots
+from ftl_lightning.domains.distances import Distance
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 ACCURACY = "accuracy"
 SUCCESS = "success"
+NOVELTY, COVERAGE = "novelty", "coverage"
+"""Distances of generated plans to demonstrations and of fresh behaviour to generated plans, in every domain, see
+:mod:`ftl_lightning.evaluation.diversity`; a metric of a domain's own by one of these names stands in its place."""
 CLOSED = "closed loop"
 EXECUTED = f"{CLOSED} {SUCCESS}"
 Split = Literal["train", "validation"]
@@ -241,6 +245,10 @@ class Domain:
             -> states (sample, horizon, state)``.
         views: by name, how a model may see behaviour; without any, as it is.
         closed_loop: how plans are executed; ``None`` where they cannot be.
+        distance: of plans, by which novelty and coverage are measured; ``None`` for
+            :func:`~ftl_lightning.domains.distances.scaled_distance` to behaviour of the task.
+        fresh: whether the source can draw behaviour of any goal quickly enough to do so in every evaluation; without it there is no
+            coverage.
         paper: the paper's numbers, if it has any.
     """
 
@@ -255,6 +263,8 @@ class Domain:
     references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
     views: Mapping[str, View] = field(default_factory=dict)
     closed_loop: ClosedLoop | None = None
+    distance: Distance | None = None
+    fresh: bool = True
     paper: Paper | None = None
 
     def __post_init__(self) -> None:
@@ -271,6 +281,23 @@ class Domain:
         for name, values in found.items():
             _expect(f"domain {self.name}, metric {name!r}", values, ((len(states),), ()))
         return found
+
+    def distances(self, states: Tensor, others: Tensor, distance: Distance) -> Tensor:
+        """Between plans ``(a, horizon, state)`` and others ``(b, horizon, state)``: ``(a, b)``.
+
+        Plans that are not finite are infinitely far from all others.
+
+        Args:
+            states, others: of one shape but for their numbers.
+            distance: the domain's, or what stands for it.
+
+        Raises:
+            UserError: for plans of different shapes, or a distance that returns something else.
+        """
+        _expect(f"domain {self.name}, distance", others, ((len(others), *states.shape[1:]),))
+        found = distance(states, others)
+        _expect(f"domain {self.name}, distance", found, ((len(states), len(others)),))
+        return found.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def judge(self, goal: str, rollout: Rollout) -> dict[str, Tensor]:
         """What happened in episodes, by name ``(episode,)``.
@@ -305,6 +332,8 @@ class Domain:
 
     def less_is_better(self, metric: str) -> bool:
         """Whether a smaller value of a metric, or of an outcome in closed loop, is better."""
+        if metric == COVERAGE and metric not in self.metrics:
+            return True
         outcome = metric.removeprefix(f"{CLOSED} ")
         if outcome != metric:
             return self.closed_loop is not None and outcome in self.closed_loop.less_is_better

@@ -19,6 +19,7 @@ import importlib.util
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -107,6 +108,8 @@ def own_domain(
         observed=examples.features,
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
         headline=next(iter(metrics), ""),
+        distance=partial(_warped, examples),
+        fresh=False,  # there is no more behaviour than the file's
     )
 
 
@@ -193,6 +196,14 @@ def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_leng
 
 def _whole(states: Tensor) -> Tensor:
     return torch.full((len(states),), states.shape[1])
+
+
+def _warped(examples: Demonstrations, states: Tensor, others: Tensor) -> Tensor:
+    """:func:`warped_distances` ``(a, b)`` of whole plans, columns scaled alike: what :func:`_nearest_demonstration` compares."""
+    (_, one), (_, other) = (_scaled(examples, each) for each in (states, others))
+    if len(other) < len(one):  # the rounds are those of the fewer
+        return warped_distances(other, _whole(other), one, _whole(one)).T
+    return warped_distances(one, _whole(one), other, _whole(other))
 
 
 def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:

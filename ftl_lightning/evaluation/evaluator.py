@@ -25,7 +25,8 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
-from ftl_lightning.evaluation.evaluable import Evaluable
+from ftl_lightning.evaluation.diversity import Real, lines
+from ftl_lightning.evaluation.evaluable import Evaluable, demonstrations_of
 from ftl_lightning.evaluation.judged import Judged, executed, share
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.results import Row, append_rows
@@ -33,6 +34,7 @@ from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.summary import OWN, show, summary_table
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.progress import bar
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 
 _LOG = logging.getLogger(__name__)
@@ -60,6 +62,8 @@ class Evaluator(pl.Callback):
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
         references: also measure reference policies when testing; the same for every method, they are needed once a seed. ``None``
             for all but the user's own demonstrations.
+        diversity: also measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.diversity`; adds rows and
+            changes none.
         seed: of the samples.
     """
 
@@ -75,6 +79,7 @@ class Evaluator(pl.Callback):
         figures: int = 16,
         results: str | None = None,
         references: bool | None = None,
+        diversity: bool = True,
         seed: int = 0,
     ) -> None:
         try:
@@ -98,6 +103,7 @@ class Evaluator(pl.Callback):
         self.figures = figures
         self.results = results
         self.references = references
+        self.diversity = diversity
         self.seed = seed
         self.judged: list[Judged] = []
         self.root: Path | None = None
@@ -178,6 +184,16 @@ class Evaluator(pl.Callback):
         firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
         return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(done, firsts, strict=True)]
 
+    def real(self, module: Evaluable, judged: Sequence[Judged]) -> list[Real]:
+        """The real behaviour that the plans of each task are compared with."""
+        found = []
+        with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
+            for one in judged:
+                known = demonstrations_of(one.task, module.demonstrated)
+                found.append(Real.of(one.task, module.domain, len(one.states), known, self.root, self.seed))
+                advance()
+        return found
+
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Tell mistakes before hours of training, not after."""
         if not isinstance(pl_module, Evaluable):
@@ -205,6 +221,10 @@ class Evaluator(pl.Callback):
         if stage == "test" and self.judged:
             compared = self.references if self.references is not None else not getattr(data, "own", False)
             beside = references(self.judged, domain, module.demonstrated, self.seed) if compared else {}
+            if self.diversity:
+                real = self.real(module, self.judged)
+                self.judged = [known.added(one) for known, one in zip(real, self.judged, strict=True)]
+                beside |= lines(real) if compared else {}
             found = rows(module, domain, self.judged, beside, configured)
         if found:  # before anything is drawn, which may fail
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"

@@ -30,6 +30,7 @@ class Judged:
         rollout: what happened when they were executed, if they were.
         followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
         outcomes: the domain's judgement of that, by name ``(sample,)``.
+        diversity: novelty and coverage, so far as they are known, see :mod:`ftl_lightning.evaluation.diversity`.
     """
 
     task: EvaluationTask
@@ -39,6 +40,7 @@ class Judged:
     rollout: Rollout | None = None
     followed: Tensor | None = None
     outcomes: Mapping[str, Tensor] = field(default_factory=dict)
+    diversity: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, task: EvaluationTask, states: Tensor, starts: InitialStates | None, domain: Domain) -> Self:
@@ -50,6 +52,10 @@ class Judged:
         outcomes = domain.judge(self.task.goal, rollout)
         return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
 
+    def compared(self, diversity: Mapping[str, float]) -> Self:
+        """The same with novelty and coverage."""
+        return replace(self, diversity=diversity)
+
     @property
     def right(self) -> Tensor | None:
         """Whether each plan is right ``(sample,)``, by the first metric that says so; ``None`` if none does."""
@@ -57,9 +63,10 @@ class Judged:
 
     @property
     def values(self) -> dict[str, float]:
-        """Every metric's value: those of plans and, after ``closed loop``, what happened when they were executed."""
+        """Every metric's value: those of plans, what happened when they were executed after ``closed loop``, and diversity."""
         plans = {name: share(values) for name, values in self.measured.items()}
-        return plans | {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
+        plans |= {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
+        return {**plans, **{name: value for name, value in self.diversity.items() if name not in plans}}
 
 
 def share(values: Tensor) -> float:

@@ -9,9 +9,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from ftl_lightning.domains.domain import COVERAGE, NOVELTY
 from ftl_lightning.evaluation.judged import LOST, WON, standard_error
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row, label
 
+DIVERSITY = (NOVELTY, COVERAGE)
 OWN = "own demonstrations"
 """The setting of learned concepts that no suite asks for."""
 
@@ -28,6 +30,7 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
     """
     measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
     metrics = list(dict.fromkeys(row.metric for row in measured))
+    metrics.sort(key=lambda name: DIVERSITY.index(name) if name in DIVERSITY else -1)  # behind what is right, in their order
     table = Table(title=_title(measured), box=box.SIMPLE, title_justify="left", padding=0)
     table.add_column("mean ± error over tasks")
     for name in (*metrics, "n"):

@@ -10,6 +10,7 @@ from sklearn.manifold import TSNE
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import REFERENCE, latest
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
@@ -21,6 +22,8 @@ PAPER_COLOUR = "#9a9a9a"
 COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3", "#c9a227")
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
 """Of reference policies."""
+REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
+"""Of the reference lines of novelty and coverage."""
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
@@ -136,6 +139,50 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
             axes.legend(fontsize=8, loc="lower right")
     figure.suptitle(domain.name, fontsize=10)
     return figure
+
+
+def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
+    """Accuracy over coverage, one panel for each suite and setting: a line for each method, its temperature from dark to light.
+
+    Means over tasks and seeds. The better a method, the further up and to the left: the axis of coverage, of which less is better,
+    is not turned round. Crosses and stars are the reference lines *demonstrations replayed* and *fresh samples*.
+
+    Args:
+        domain: the domain.
+        rows: see :func:`ftl_lightning.reporting.frontier.read_frontier`.
+    """
+    rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])
+    rows = rows.assign(panel=rows["setting"] + (", " + rows["suite"] if len(set(rows["suite"])) > 1 else ""))
+    shown = list(dict.fromkeys(rows["panel"]))
+    figure = Figure(figsize=(3.6 * max(len(shown), 1) + 2.2, 3.6), layout="constrained")
+    panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
+    lines = labelled(rows[~rows["method"].isin(list(REFERENCE_MARKS))])
+    forms = list(dict.fromkeys(lines["label"]))
+    for axes, panel in zip(panels, shown, strict=False):
+        own = rows[rows["panel"] == panel]
+        for colour, form in zip(itertools.cycle(COLOURS), forms, strict=False):
+            each = lines[(lines["panel"] == panel) & (lines["label"] == form)]
+            means = each.groupby("temperature", dropna=False)[["coverage", "accuracy"]].mean().sort_index()
+            if means.empty:
+                continue
+            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=form)
+            strengths = [1 - 0.75 * place / len(means) for place in range(len(means))]
+            axes.scatter(means["coverage"], means["accuracy"], color=colour, alpha=strengths, s=22)
+        for method, mark in REFERENCE_MARKS.items():
+            mean = own.loc[own["method"] == method, ["coverage", "accuracy"]].mean()
+            if mean.notna().all():
+                axes.plot(mean["coverage"], mean["accuracy"], mark, color="black", markersize=8, label=method)
+        axes.set(xlabel="coverage (less is better)", ylim=(-0.05, 1.05), title=panel)
+    panels[0].set_ylabel(domain.main_metric)
+    found = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(found.values()), list(found), fontsize=8, loc="outside right upper")
+    figure.suptitle(f"{domain.name}: temperature from {_range(lines)}", fontsize=10)
+    return figure
+
+
+def _range(lines: pd.DataFrame) -> str:
+    known = lines["temperature"].dropna()
+    return "none" if known.empty else f"{known.min():g} (dark) to {known.max():g}"
 
 
 def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> Figure:

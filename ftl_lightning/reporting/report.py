@@ -10,7 +10,8 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
 from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
-from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, growth
+from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth
+from ftl_lightning.reporting.frontier import read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.tables import Table, select, tables
 from ftl_lightning.tensor_file import atomic, write_text
@@ -36,6 +37,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     """
     rows = read_rows(results)
     ablations, comparison, curves = (read_study(results, name) for name in ("", COMPARISON, CURVES))
+    measured = read_frontier(results).dropna(subset=["accuracy", "coverage"])
     if count := replaced(ablations):
         print(f"{results}: {count} rows are left out, since the same was measured again later in another configuration")
     everything, headline = [], []
@@ -50,6 +52,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         if name in set(curves["domain"]):
             found.append(_written(curves_table(domain, curves), out / name))
             _save(growth(domain, curves), out / name / "curves.png")
+        if name in set(measured["domain"]):
+            _save(frontier(domain, measured), out / name / "frontier.png")
         everything += found
     if not comparison.empty:
         everything.append(_written(overview(comparison), out))

@@ -5,7 +5,7 @@ from typing import NoReturn
 
 import pandas as pd
 
-from ftl_lightning.domains.domain import CLOSED, EXECUTED, Concepts, Domain, Metric, Plans
+from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.paper import OURS, Published
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
@@ -22,7 +22,7 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
         return load_domain(name)
     except UserError:
         own = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
-        metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(own)}
+        metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(own) if metric not in (NOVELTY, COVERAGE)}
         concepts = Concepts(training=(), suites={}, descriptions=(), reads=lambda text: False)
         return Domain(name, Plans(0, (), ()), concepts, _unknown, metrics=metrics, headline=next(iter(metrics), EXECUTED))
 

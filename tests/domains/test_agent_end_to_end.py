@@ -42,10 +42,11 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET]) == 0
     rows = pd.read_csv("logs/agent/invert/results.csv", keep_default_na=False)
     ours = rows[rows["K"] == 2]
-    assert set(ours["metric"]) == {"accuracy", "closed loop success", "closed loop distractor", "closed loop progress"}
+    executed = {"closed loop success", "closed loop distractor", "closed loop progress"}
+    assert set(ours["metric"]) == {"accuracy", "novelty", "coverage"} | executed
     assert set(ours["setting"]) == {"training concept", "training composition", "new initial state"}
     assert set(zip(ours["method"], ours["variant"], strict=True)) == {("FTL-IGM", "entities, free")}
-    assert len(ours) == 4 * (4 + 5 + 5)
+    assert len(ours) == 4 * (4 + 5 + 5) + 4 + 2 * 5  # coverage of training concepts; both from new initial states
     oracle = rows[rows["method"] == "expert (oracle)"]
     assert (oracle.loc[oracle["metric"] == "accuracy", "value"] == 1).all()
     assert oracle.loc[oracle["metric"] == "closed loop success", "value"].mean() > 0.9

@@ -295,7 +295,7 @@ def test_a_new_concept_is_learned_generated_and_judged_beside_the_known_ones(fit
     assert 2 < y < 6.5
     assert one.values["nearest_demonstration"] > 0.5
     rows = read_rows("r.csv")
-    assert set(rows["metric"]) == set(JUDGED)
+    assert set(rows["metric"]) == {*JUDGED, "novelty"}
     assert set(rows["task"]) == {"go between"}
     assert set(rows["demonstrations"]) == {4}
     with pytest.raises(UserError, match=r"data\.demonstrations: expected a file of the new concepts' demonstrations, found none"):

@@ -11,6 +11,7 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.generative_model import GenerativeModel
@@ -174,7 +175,8 @@ def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: P
     (file,) = (log / "concepts").iterdir()
     assert Concept.load(file).origin.weights == "learned"
     rows = read_rows(log / "results.csv")
-    assert rows[["setting", "task", "role"]].to_numpy().tolist() == [["own demonstrations", task, "method"]]  # judged alone
+    assert set(rows[["setting", "task", "role"]].itertuples(index=False, name=None)) == {("own demonstrations", task, "method")}
+    assert rows["metric"].tolist() == ["accuracy", "novelty", "coverage"]  # judged alone
     options = [f"--pretrained={tiny}", f"--concept={file}", "--compose=circle above square:1.2", "--count=4", "--steps=3"]
     assert main(["sample", *options, f"--goal={task}", "--out=states.safetensors", "--figure=states.png"]) == 0
     assert "accuracy on" in capsys.readouterr().out
@@ -211,7 +213,7 @@ def test_the_compositions_suite_is_learned_and_judged_with_all_its_settings(inve
         "--data.suite=compositions", "--evaluation.suites=[compositions]", "--evaluation.figures=0", "--evaluation.results=r.csv"
     )
     rows = read_rows("r.csv")
-    rows = rows[rows["role"] == "method"]
+    rows = rows[(rows["role"] == "method") & (rows["metric"] == "accuracy")]
     assert rows["setting"].value_counts().to_dict() == {
         "two learned concepts": 6,
         "ring + training": 4,
@@ -230,7 +232,7 @@ def test_inverting_twice_gives_the_same_rows(invert: Callable[..., Path]) -> Non
     assert read_rows("r.csv").equals(first)  # replaced, not added
     ours = first[first["K"] == 2]
     assert set(ours["setting"]) == {"training composition", "new concept", "new + training", "component 1", "component 2"}
-    assert set(first["method"]) == {"FTL-IGM", "random scenes", "generator (oracle)"}
+    assert set(first["method"]) == {"FTL-IGM", "random scenes", "generator (oracle)", REPLAYED, FRESH}
     assert set(ours["variant"]) == {"free, training weight 0.8"}
     oracle = first[(first["method"] == "generator (oracle)")]
     assert (oracle["value"] == 1).all()

@@ -17,6 +17,7 @@ from ftl_lightning.domains.agent.published import PUBLISHED
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
+from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split, deferred
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
@@ -144,6 +145,20 @@ def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> T
     return torch.stack([drive[rows.clamp(max=len(drive) - 1), :STATE] for drive in drives])
 
 
+def _from_start(states: Tensor) -> Tensor:
+    """Paths ``(plan, horizon, 2)`` in the plane, from where each starts."""
+    paths = states[..., list(PLANE)]
+    return paths - paths[:, :1]
+
+
+def distance(states: Tensor, others: Tensor) -> Tensor:
+    """Root mean square distance ``(a, b)`` in metres of the agent's paths in the plane, each seen from its own start.
+
+    Where a plan starts is given, not generated. Where it leads depends on the scene: plans that are right in new scenes are novel.
+    """
+    return path_distance(_from_start(states), _from_start(others))
+
+
 DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, start_exponent=3.0, resolution=1e-3),
@@ -163,5 +178,6 @@ DOMAIN = Domain(
     closed_loop=ClosedLoop(
         environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, film=deferred(f"{RENDERING}:film")
     ),
+    distance=distance,
     paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
 )

@@ -8,11 +8,13 @@ from torch import Tensor
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split, deferred
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, DrivingEnvironment, initial_states, scene
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
+from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED
 from ftl_lightning.domains.driving.scenarios import make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
@@ -68,6 +70,20 @@ def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
     return found | {name: found[name] > 0 for name in ("success", "strict success", "crash")}
 
 
+def _from_start(states: Tensor) -> Tensor:
+    """Paths ``(plan, horizon, 2)``: metres along and across from where, and as, each starts."""
+    first = states[:, :1]
+    return turned(states[..., 1:3] - first[..., 1:3], first[..., 5], -first[..., 6])
+
+
+def distance(states: Tensor, others: Tensor) -> Tensor:
+    """Root mean square distance ``(a, b)`` in metres of the controlled vehicle's paths, each seen from its own start and heading.
+
+    Where a plan starts is given, not generated; how it goes on depends on the traffic.
+    """
+    return path_distance(_from_start(states), _from_start(others))
+
+
 DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, resolution=1e-3),
@@ -90,5 +106,7 @@ DOMAIN = Domain(
         less_is_better=("crash",),
         policies=policies.POLICIES,
     ),
+    distance=distance,
+    fresh=False,  # the expert takes some four seconds for an episode
     paper=Paper(PUBLISHED, omega="learned", ours="learned"),
 )

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, deferred
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
-from ftl_lightning.domains.object_rearrangement.relations import SHAPES, holds, parse, sentence
+from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES, holds, parse, sentence
 from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
@@ -20,6 +21,8 @@ STATE_NAMES = tuple(
     f"{shape}.{column}" for shape in SHAPES for column in ("x", "y", "radius", "angle", *(f"is_{other}" for other in SHAPES))
 )
 STATE_UNITS = ("length", "length", "length", "rad", "1", "1", "1") * len(SHAPES)
+CENTRES = tuple(shape * PER_SHAPE + axis for shape in range(len(SHAPES)) for axis in range(2))
+"""Columns of the shapes' centres."""
 PLANS = Plans(1, STATE_NAMES, STATE_UNITS, resolution=1e-3)
 
 
@@ -45,6 +48,11 @@ def succeeded(goal: str, states: Tensor, starts: InitialStates | None = None) ->
     return torch.stack([holds(relation, states[:, 0], relaxed=True) for relation in parse(goal)]).all(dim=0)
 
 
+def distance(states: Tensor, others: Tensor) -> Tensor:
+    """Euclidean distance ``(a, b)`` over the centres of the three shapes, in length units; no task is about sizes or angles."""
+    return path_distance(states[..., CENTRES], others[..., CENTRES])
+
+
 DOMAIN = Domain(
     name=NAME,
     plans=PLANS,
@@ -63,5 +71,6 @@ DOMAIN = Domain(
         "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
         "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
     },
+    distance=distance,
     paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
 )

@@ -1,0 +1,162 @@
+"""Novelty and coverage: what accuracy does not see.
+
+*Novelty* is the mean distance of a generated plan to the nearest demonstration of the concept that it was learned from: 0 for a
+method that replays them. *Coverage* is the mean distance of fresh behaviour of the task to the nearest generated plan: less is
+better, and a method that generates one plan again and again has a large one however right that is. Both in the domain's distance.
+
+Neither is read alone: wrong plans are as novel as you like. Two lines stand beside every number: *demonstrations replayed* in turn
+(right, nothing new) and *fresh samples*, an independent draw of the task (right, and as novel as new behaviour is).
+
+Coverage falls with the number of plans, so that numbers are comparable where as many plans were generated: the column n of results.
+As many samples are drawn to be covered, and as many for the line.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.distances import Distance, scaled_distance
+from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
+from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.seeding import FRESH_SEED
+
+_LOG = logging.getLogger(__name__)
+
+REPLAYED, FRESH = "demonstrations replayed", "fresh samples"
+"""Names of the reference lines."""
+_DRAWN: dict[tuple[Any, ...], Demonstrations | None] = {}
+"""Fresh behaviour by all that decides it: every method is compared with the same."""
+
+
+@dataclass(frozen=True)
+class Real:
+    """Real behaviour of one task, which generated plans are compared with.
+
+    Attributes:
+        task: that it shows.
+        domain: whose it is.
+        count: of plans that are generated.
+        demonstrations: that the task's concept was learned from; ``None`` where a plan is not to be like them.
+        fresh: ``count`` samples of the task that are to be covered, and as many others; ``None`` where none can be drawn.
+    """
+
+    task: EvaluationTask
+    domain: Domain
+    count: int
+    demonstrations: Demonstrations | None
+    fresh: tuple[Demonstrations, Demonstrations] | None
+
+    @classmethod
+    def of(
+        cls, task: EvaluationTask, domain: Domain, count: int, known: Demonstrations | None, root: Path | None = None, seed: int = 0
+    ) -> Self:
+        """What there is.
+
+        A plan is to be like the demonstrations, though none of them, where the task is what they show: not where it is composed
+        with training concepts, nor generated from a single component. Where behaviour starts in the demonstrations' initial states,
+        there is nothing to compare: there a good plan is one of them, and there are as few as they are.
+
+        Args:
+            task: what is generated.
+            domain: whose task it is.
+            count: of plans that are generated.
+            known: demonstrations of the task's learned concept, if there are any.
+            root: folder of the user's copy of the data.
+            seed: of the fresh samples.
+        """
+        if task.initial == "demonstrated":
+            return cls(task, domain, count, None, None)
+        shown = known if known is not None and task.learned == (task.goal,) and len(known) else None
+        drawn = _drawn(domain, task.goal, 2 * count, root, seed)
+        parts = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
+        return cls(task, domain, count, shown, parts)
+
+    @property
+    def _distance(self) -> Distance:
+        if self.domain.distance is not None:
+            return self.domain.distance
+        real = self.fresh[0] if self.fresh else self.demonstrations
+        assert real is not None
+        return scaled_distance(self._windows(real), self.domain.plans.resolution)
+
+    def _windows(self, demonstrations: Demonstrations) -> Tensor:
+        """Their first windows, as long as a plan ``(demo, horizon, state)``."""
+        rows = torch.arange(len(demonstrations))
+        return demonstrations.windows(rows, torch.zeros_like(rows), self.domain.plans.horizon)[0]
+
+    def values(self, plans: Tensor) -> dict[str, float]:
+        """Novelty and coverage of plans ``(sample, horizon, state)``, by name, so far as there is something to compare with.
+
+        Nothing for plans of another length than the domain's, such as those of methods that plan a step at a time: their distances
+        would be those of other times.
+
+        Raises:
+            UserError: for plans that the domain's distance does not fit, or a distance that returns something else.
+        """
+        found: dict[str, float] = {}
+        if plans.shape[1] != self.domain.plans.horizon:
+            return found
+        if self.demonstrations is not None:
+            known = self._windows(self.demonstrations)
+            found[NOVELTY] = novelty(self.domain.distances(plans, known, self._distance))
+        if self.fresh:
+            found[COVERAGE] = coverage(self.domain.distances(plans, self._windows(self.fresh[0]), self._distance))
+        return found
+
+    def lines(self) -> dict[str, Judged]:
+        """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples.
+
+        Where nothing but novelty is measured, there is nothing to say of demonstrations: theirs is 0.
+        """
+        found = {}
+        if self.demonstrations is not None and (self.domain.metrics or self.fresh):
+            turns = torch.arange(self.count) % len(self.demonstrations)
+            found[REPLAYED] = self._judged(self.demonstrations.rows(turns.tolist()))
+        if self.fresh:
+            found[FRESH] = self._judged(self.fresh[1])
+        return found
+
+    def _judged(self, behaviour: Demonstrations) -> Judged:
+        starts = behaviour.initial_states if self.domain.observed else None
+        return self.added(Judged.of(self.task, self._windows(behaviour), starts, self.domain))
+
+    def added(self, one: Judged) -> Judged:
+        """The same with its novelty and coverage."""
+        return one.compared(self.values(one.states))
+
+
+def novelty(distances: Tensor) -> float:
+    """Mean distance of a plan to the nearest demonstration, of distances ``(plan, demonstration)``."""
+    return float(distances.amin(dim=1).mean())
+
+
+def coverage(distances: Tensor) -> float:
+    """Mean distance of a fresh sample to the nearest plan, of distances ``(plan, sample)``; more plans never have a larger one."""
+    return float(distances.amin(dim=0).mean())
+
+
+def lines(found: Sequence[Real]) -> dict[str, list[Judged]]:
+    """The reference lines of some tasks, by name."""
+    each = [one.lines() for one in found]
+    return {name: own for name in (REPLAYED, FRESH) if (own := [one[name] for one in each if name in one])}
+
+
+def _drawn(domain: Domain, goal: str, count: int, root: Path | None, seed: int) -> Demonstrations | None:
+    """Fresh samples of a goal; ``None`` where the domain has none."""
+    if not domain.fresh or not domain.concepts.reads(goal):
+        return None
+    key = (domain.name, goal, count, root, seed)
+    if key not in _DRAWN:
+        try:
+            _DRAWN[key] = domain.source(root).draw(goal, count, FRESH_SEED + seed)
+        except Exception as error:  # whatever a domain's source raises: accuracy is known already
+            _LOG.warning("domain %s: no coverage of %r, of which nothing can be drawn: %r", domain.name, goal, error)
+            _DRAWN[key] = None
+    return _DRAWN[key]

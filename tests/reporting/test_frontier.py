@@ -1,0 +1,75 @@
+"""The file of accuracy over coverage, and its figure."""
+
+from pathlib import Path
+
+import pytest
+
+from ftl_lightning.cli import main
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
+from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.reporting.figures import frontier
+from ftl_lightning.reporting.frontier import read_frontier, write_frontier
+
+DOMAIN = load_domain("object_rearrangement")
+
+
+def row(method: str, temperature: float | None, accuracy: float, coverage: float | None, **changes: object) -> dict[str, object]:
+    what = {"domain": DOMAIN.name, "suite": "validation", "setting": "new concept", "task": "t", "variant": "", "seed": 0, "n": 9}
+    values = {"method": method, "temperature": temperature, "accuracy": accuracy, "novelty": None, "coverage": coverage}
+    return {**what, **values, **changes}
+
+
+ROWS = [
+    row("FTL-IGM", 1.0, 0.5, 1.0, variant="one"),
+    row("FTL-IGM", 0.1, 0.9, 2.0, variant="one"),
+    row("FTL-IGM", 0.1, 0.7, 2.2, variant="one", task="u"),
+    row("BC", None, 1.0, 3.0),
+    row(REPLAYED, None, 1.0, 2.5),
+    row(FRESH, None, 1.0, 0.5),
+]
+
+
+def test_measurements_are_added_and_the_same_are_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "frontier.json"
+    assert read_frontier(path).empty
+    write_frontier(path, ROWS)
+    write_frontier(path, [row("BC", None, 0.8, 3.1), row("BC", None, 0.7, 3.0, seed=1)])
+    found = read_frontier(tmp_path)
+    assert len(found) == 7
+    assert found.loc[found["method"] == "BC", "accuracy"].tolist() == [0.8, 0.7]
+    assert found["novelty"].isna().all()
+    assert found.loc[found["method"] == "FTL-IGM", "temperature"].tolist() == [1.0, 0.1, 0.1]
+
+
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "frontier.json").write_text('{"speed": 3}')
+    with pytest.raises(UserError, match=r"frontier.json: expected rows of domain, suite"):
+        read_frontier(tmp_path)
+
+
+def test_the_frontier_is_a_line_of_means_in_the_order_of_temperatures_with_both_reference_points(tmp_path: Path) -> None:
+    write_frontier(tmp_path / "frontier.json", ROWS)
+    figure = frontier(DOMAIN, read_frontier(tmp_path))
+    (axes,) = figure.axes
+    drawn = {str(line.get_label()): line.get_xydata().tolist() for line in axes.lines}  # type: ignore[union-attr]
+    assert drawn["FTL-IGM (one)"] == [pytest.approx([2.1, 0.8]), pytest.approx([1.0, 0.5])]
+    assert drawn["BC"] == [[3.0, 1.0]]
+    assert drawn[REPLAYED] == [[2.5, 1.0]]
+    assert drawn[FRESH] == [[0.5, 1.0]]
+    write_frontier(tmp_path / "frontier.json", [row("BC", None, 1.0, 3.0, suite="paper")])
+    titles = [axes.get_title() for axes in frontier(DOMAIN, read_frontier(tmp_path)).axes]
+    assert titles == ["new concept, validation", "new concept, paper"]
+
+
+def test_the_report_draws_it_where_the_file_is(tmp_path: Path) -> None:
+    values = {"domain": DOMAIN.name, "setting": "new concept", "task": "t", "method": "BC", "K": 1, "omega": "1.0", "seed": 0}
+    values |= {"demonstrations": 5, "n": 9, "metric": "accuracy", "value": 1.0, "model_hash": "m", "config_hash": "c"}
+    append_rows(tmp_path / "r" / "own.csv", [Row(**values)])  # type: ignore[arg-type]
+    picture = tmp_path / "out" / DOMAIN.name / "frontier.png"
+    assert main(["report", f"--results={tmp_path / 'r'}", f"--out={tmp_path / 'out'}"]) == 0
+    assert not picture.exists()
+    write_frontier(tmp_path / "r" / "frontier.json", ROWS)
+    assert main(["report", f"--results={tmp_path / 'r'}", f"--out={tmp_path / 'out'}"]) == 0
+    assert picture.stat().st_size > 1000
