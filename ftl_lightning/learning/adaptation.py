@@ -139,7 +139,7 @@ class Adaptation(pl.LightningModule, ABC):
         """
         if len(task.learned) == 1 and task.component is None and not (task.texts or task.without):
             found = self._found.get(task.learned[0])
-            return found and found.composition.to(self.device)
+            return None if found is None else found.composition.to(self.device)
         embeddings = [self.model.concept(text) for text in (*task.texts, *task.without)]
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
         for name in task.learned:

@@ -27,7 +27,7 @@ FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
 HELD_OUT = 64
 """Noised demonstrations whose loss decides when a run stops."""
-EXPLAINED = 0.35
+EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
 
 
@@ -204,6 +204,10 @@ class Inversion(nn.Module):
         composition = Composition(self.parametrised(embeddings), weights)
         return model.losses(states, seen, composition, draws, self.settings.loss)
 
+    def losses(self, samples: int, draw: torch.Generator, chosen: Tensor | None = None) -> Tensor:
+        """:meth:`_losses` of the embeddings and weights that are being learned."""
+        return self._losses(samples, draw, self.embeddings, self.weights, chosen)
+
     def step_losses(self, step: int) -> Tensor:
         """The losses of a training step ``(run, samples)``, of the runs that have not stopped.
 
@@ -214,7 +218,7 @@ class Inversion(nn.Module):
         if self.stopping is not None and step == 0:
             self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
         going = None if self.stopping is None else self.stopping.going
-        losses = self._losses(self.settings.samples, draw, self.embeddings, self.weights, going)
+        losses = self.losses(self.settings.samples, draw, going)
         mean = losses.detach().mean()
         if not mean.isfinite():
             raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.learning_rate")

@@ -194,7 +194,11 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
         seed: of the map.
     """
     training = model.config.training_concepts
-    learned = [(f"{concept.origin.name} [{part}]", own) for concept in concepts for part, (_, own) in concept.parts().items()]
+    learned = [
+        (f"{concept.origin.name} [{part.replace('component ', '')}]", own)
+        for concept in concepts
+        for part, (_, own) in concept.parts().items()
+    ]
     embeddings = torch.cat((model.training_embeddings.cpu(), *(own[None] for _, own in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)
     places = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())

@@ -148,7 +148,7 @@ def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
 def test_the_span_form_stays_in_the_span(tiny: Path, off_span: float, inside: bool) -> None:
     module = learn(tiny, off_span=off_span)
     training = module.model.training_embeddings
-    found = module.inversion.parametrised.detach().flatten(0, 1)
+    found = module.inversion.parametrised(module.inversion.embeddings).detach().flatten(0, 1)
     solution = torch.linalg.lstsq(training.T.double(), found.T.double()).solution
     outside = (training.T.double() @ solution - found.T).norm() / found.norm()
     assert (outside < 1e-3) == inside
