@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
-HELD_OUT = 64
+HELD_OUT = 32
 """Noised demonstrations whose loss decides when a run stops."""
 EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
@@ -50,7 +50,7 @@ class InversionSettings:
             otherwise beside it, from the same start, a set is learned from every demonstration (``'each'``), or from every
             n-th one for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes where one set explains the
             demonstrations at least :data:`EXPLAINED` as well as they do, and from single modes elsewhere.
-        tolerance: a run stops when each of two rounds of 25 steps lowers its loss on held-out noise by less than this share of
+        tolerance: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than this share of
             all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
             :class:`~ftl_lightning.learning.stopping.Stopping`. ``None`` for all steps, the rate decaying to 0.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,

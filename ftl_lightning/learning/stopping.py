@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-ROUND = 25
+ROUND = 10
 """Steps between two looks at the loss on held-out noise."""
 IDLE = 2
 """Rounds that gain too little before a run stops."""
