@@ -220,11 +220,12 @@ class Inversion(nn.Module):
         """
         if self.stopping is not None and step == 0:
             self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
-        draw = generator(self.embeddings.device, self.settings.seed, 1, step)
         found = []
         for samples, own in ((self.settings.samples, ~self._modes), (self.settings.mode_samples, self._modes)):
             chosen = own if self.stopping is None else own & self.stopping.going
             if chosen.any():
+                # Anew for the modes, which would otherwise depend on whether any other run goes on.
+                draw = generator(self.embeddings.device, self.settings.seed, 1, step)
                 found.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
         losses = torch.cat(found)
         mean = losses.detach().mean()

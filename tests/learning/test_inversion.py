@@ -88,6 +88,7 @@ def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, 
         ({"samples": 0}, r"model\.samples: expected 1 or more, found 0"),
         ({"off_span": 1.1}, r"model\.off_span: expected 0 \(span\) to 1 \(free\), found 1.1"),
         ({"timestep_power": 0.5}, r"model\.timestep_power: expected 1 or more, found 0.5"),
+        ({"mode_samples": 0}, r"model\.mode_samples: expected 1 or more, found 0"),
         ({"modes": 0}, r"model\.modes: expected 1 or more, 'each' or 'auto', found 0"),
         ({"modes": "some"}, r"model\.modes: expected a number, 'each' or 'auto', found 'some'"),
         ({"tolerance": 1}, r"model\.tolerance: expected null or a share from 0 up to 1, found 1"),
@@ -401,8 +402,17 @@ def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Pa
         assert of(**changes) == plain | {f"model/{key}": value}
 
 
-@pytest.mark.parametrize(
-    ("modes", "told"), [(1, "free"), (3, "free, 3 modes"), ("each", "free, modes each"), ("auto", "free, modes auto")]
-)
+@pytest.mark.parametrize(("modes", "told"), [(1, ""), (3, ", modes: 3"), ("each", ", modes: each"), ("auto", "")])
 def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told: str) -> None:
-    assert InversionModule(str(tiny), modes=modes).variant == told  # type: ignore[arg-type]
+    plain, module = InversionModule(str(tiny)), InversionModule(str(tiny), modes=modes)  # type: ignore[arg-type]
+    assert module.variant == plain.variant + told
+    assert (module.method == plain.method) == (modes == 1)
+
+
+@pytest.mark.parametrize("samples", [2, 8])
+def test_modes_learn_from_noised_demonstrations_of_a_number_of_their_own(tiny: Path, samples: int) -> None:
+    found, same = (from_few(tiny, shown(), modes=2, mode_samples=number) for number in (samples, 8))
+    assert found.modes is not None
+    assert same.modes is not None
+    assert alike(found.embeddings, same.embeddings)
+    assert alike(found.modes.embeddings, same.modes.embeddings) == (samples == 8)
