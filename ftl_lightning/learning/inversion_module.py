@@ -90,9 +90,19 @@ class InversionModule(Adaptation):
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
         return losses.sum()
 
-    def on_train_batch_end(self, outputs: Any, batch: int, batch_idx: int) -> None:
-        """Stop when no concept gains any more."""
-        if not self.inversion.stepped(self.global_step - 1):
+    def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
+        """Make no step where a checkpoint is resumed in which every concept had stopped."""
+        stopping = self.inversion.stopping
+        return None if stopping is None or stopping.going.any() else -1
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        """Take note of every step, and stop when no concept gains any more.
+
+        Here and not at the end of the batch, when a checkpoint may have been written that would not know of the step.
+        """
+        step = self.global_step
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if not self.inversion.stepped(step):
             self.trainer.should_stop = True
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
