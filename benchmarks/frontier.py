@@ -35,10 +35,10 @@ from ftl_lightning.progress import bar
 from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
 from ftl_lightning.shipped import shipped
 
-TEMPERATURES = (0.05, 0.1, 0.3, 0.6, 1.0, 1.5)
+TEMPERATURES = (0.1, 0.3, 0.6, 1.0, 1.5)
 NOISE = (0.1, 0.2, 0.4, 0.6, 0.8)
 """Standard deviations of the line *demonstrations with noise*, as shares of those of each column among the demonstrations."""
-SAMPLES = 200
+SAMPLES = 100
 """Plans of each task, and fresh samples that they are to cover."""
 
 
