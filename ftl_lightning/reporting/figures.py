@@ -1,7 +1,7 @@
 """Figures from results."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 import torch
@@ -17,6 +17,7 @@ from ftl_lightning.reporting.comparison import METHODS, compared, methods, refer
 from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.frontier import NOISY
 from ftl_lightning.reporting.shown import lookup, main_omega, settings
+from ftl_lightning.reporting.speed import Measured, reached
 from ftl_lightning.reporting.tables import labelled, main_rows, select, summarise
 
 PAPER_COLOUR = "#9a9a9a"
@@ -179,6 +180,22 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     figure.legend(list(found.values()), list(found), fontsize=8, loc="outside right upper")
     tempered = lines[lines["method"] != NOISY]
     figure.suptitle(f"{domain.name}: temperature from {_range(tempered)}", fontsize=10)
+    return figure
+
+
+def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
+    """Accuracy over the seconds of learning, a line for each curve; the dotted line is the accuracy that all of them reach.
+
+    Args:
+        curves: see :func:`ftl_lightning.reporting.speed.read_speed`.
+    """
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for colour, (name, own) in zip(COLOURS, curves.items(), strict=False):
+        axes.plot([one.seconds for one in own], [one.accuracy for one in own], "o-", color=colour, markersize=4, label=name)
+    axes.axhline(reached(curves), color=PAPER_COLOUR, linestyle="dotted")
+    axes.set(xscale="log", xlabel="seconds of learning", ylabel="accuracy", ylim=(-0.05, 1.05))
+    figure.legend(fontsize=8, loc="outside upper center", ncols=len(curves))
     return figure
 
 

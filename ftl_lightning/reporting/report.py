@@ -10,9 +10,10 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
 from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
-from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth
+from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time
 from ftl_lightning.reporting.frontier import frontier_table, read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
+from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.tables import Table, select, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
@@ -56,6 +57,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
             _save(frontier(domain, measured), out / name / "frontier.png")
             found.append(_written(frontier_table(domain, measured), out / name))
         everything += found
+    if curve_by_name := read_speed(results):
+        _save(learning_time(curve_by_name), out / "speed.png")
     if not comparison.empty:
         everything.append(_written(overview(comparison), out))
         headline = [short_overview(comparison)]

@@ -1,0 +1,111 @@
+"""The file of accuracy over seconds of learning, its figure, and the benchmark that writes it."""
+
+import json
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+from ftl_lightning.domains.data import InversionData
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.inversion import InversionSettings
+from ftl_lightning.reporting.figures import learning_time
+from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached, read_speed
+from ftl_lightning.seeding import generator
+from tests.conftest import ROOT
+
+CURVES = {
+    PUBLISHED: [Measured(PUBLISHED, 10, 1.0, 0.5), Measured(PUBLISHED, 1000, 100.0, 0.97), Measured(PUBLISHED, 5000, 500.0, 0.98)],
+    ONE: [Measured(ONE, 10, 0.1, 0.2), Measured(ONE, 20, 0.2, 0.96), Measured(ONE, 40, 0.5, 1.0)],
+    TEN: [Measured(TEN, 10, 1.0, 0.97), Measured(TEN, 40, 2.0, 0.97)],
+}
+
+
+def write(path: Path) -> None:
+    rows = [vars(point) for curve in CURVES.values() for point in curve]
+    path.write_text(json.dumps({"curves": rows}))
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> dict[str, Callable[..., Any]]:
+    return runpy.run_path(str(ROOT / "benchmarks" / "speed.py"))
+
+
+def test_curves_are_read_from_a_file_or_its_folder_and_there_are_none_without(tmp_path: Path) -> None:
+    assert read_speed(tmp_path) == {}
+    write(tmp_path / "speed.json")
+    assert read_speed(tmp_path) == read_speed(tmp_path / "speed.json") == CURVES
+
+
+@pytest.mark.parametrize("content", ["{}", "no JSON", '{"curves": [{"curve": "a", "steps": "many", "seconds": 1, "accuracy": 1}]}'])
+def test_a_file_of_something_else_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "speed.json").write_text(content)
+    with pytest.raises(UserError, match=r"speed.json: expected curves of steps, seconds and accuracy"):
+        read_speed(tmp_path)
+
+
+def test_what_all_curves_reach_is_a_little_below_the_least_final_accuracy() -> None:
+    assert reached(CURVES) == pytest.approx(0.95)
+
+
+def test_the_figure_has_a_line_for_each_curve_over_its_seconds() -> None:
+    (axes,) = learning_time(CURVES).axes
+    drawn = {str(line.get_label()): line.get_xydata().tolist() for line in axes.lines}  # type: ignore[union-attr]
+    assert drawn[ONE] == [[0.1, 0.2], [0.2, 0.96], [0.5, 1.0]]
+    assert drawn[TEN] == [[1.0, 0.97], [2.0, 0.97]]
+    assert set(CURVES) <= set(drawn)
+
+
+def test_the_report_draws_it_where_the_file_is(tmp_path: Path) -> None:
+    values: dict[str, Any] = {"domain": "object_rearrangement", "setting": "new concept", "task": "t", "method": "BC", "K": 1}
+    values |= {"omega": "1.0", "seed": 0, "demonstrations": 5, "n": 9, "metric": "accuracy", "value": 1.0}
+    append_rows(tmp_path / "r" / "own.csv", [Row(**values, model_hash="m", config_hash="c")])
+    for there in (False, True):
+        if there:
+            write(tmp_path / "r" / "speed.json")
+        assert main(["report", f"--results={tmp_path / 'r'}", f"--out={tmp_path / 'out'}"]) == 0
+        assert (tmp_path / "out" / "speed.png").exists() == there
+
+
+def test_ratios_are_of_the_ends_and_of_when_the_common_accuracy_is_first_reached(benchmark: dict[str, Callable[..., Any]]) -> None:
+    found = benchmark["ratios"](CURVES)
+    assert found["ratio"] == {
+        f"{ONE}, to the end": 1000.0,
+        f"{ONE}, to equal accuracy": 500.0,
+        f"{TEN}, to the end": 2500.0,
+        f"{TEN}, to equal accuracy": 1000.0,
+    }
+    assert found["to equal accuracy"][ONE] == {"steps": 20, "seconds": 0.2}
+
+
+def test_the_published_procedure_learns_the_same_of_many_concepts_in_a_batch(
+    benchmark: dict[str, Callable[..., Any]], tiny: Path
+) -> None:
+    model = GenerativeModel.load(tiny)
+    data = InversionData("object_rearrangement", suite="validation").demonstrations
+    states = [data.select(name).states for name in dict.fromkeys(data.concepts)][:3]
+    together = benchmark["published_together"](model, states, [generator("cpu", place) for place in range(3)], (1, 5))
+    assert list(together) == [1, 5]
+    for place, own in enumerate(states):
+        alone = benchmark["published"](model, own, 5, generator("cpu", place))
+        start = benchmark["published"](model, own, 0, generator("cpu", place))
+        moved = (alone.embeddings - start.embeddings).abs().max()
+        assert moved > 5e-4
+        torch.testing.assert_close(together[5][place].embeddings, alone.embeddings, rtol=0, atol=1e-5)
+
+
+def test_a_curve_of_ours_ends_where_every_run_has_stopped(benchmark: dict[str, Callable[..., Any]], tiny: Path) -> None:
+    model = GenerativeModel.load(tiny)
+    data = InversionData("object_rearrangement", suite="validation").demonstrations
+    names = tuple(dict.fromkeys(data.concepts))[:2]
+    judge = benchmark["Judge"](model, names)
+    settings = InversionSettings(samples=4, tolerance=0.9)  # stops as soon as it can
+    curve = benchmark["our_curve"]("ours", judge, [data.select(name) for name in names], settings, 400, 1)
+    assert [point.steps for point in curve] == [10, 20, 30]
+    assert all(point.seconds > 0 and 0 <= point.accuracy <= 1 for point in curve)
