@@ -9,32 +9,36 @@ gone on with: only what is missing is measured. `python -m ftl_lightning report`
 
 import argparse
 import importlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 
 from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
-from ftl_lightning.domains.paper import OURS
+from ftl_lightning.domains.paper import OURS, WITH_MODES
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.diversity import lines
+from ftl_lightning.evaluation.diversity import Real, lines
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_module import InversionModule
 from ftl_lightning.progress import bar
-from ftl_lightning.reporting.frontier import read_frontier, write_frontier
+from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
 from ftl_lightning.shipped import shipped
 
-TEMPERATURES = (0.05, 0.1, 0.3, 0.6, 1.0, 1.5)
-SAMPLES = 200
+TEMPERATURES = (0.1, 0.3, 0.6, 1.0, 1.5)
+NOISE = (0.1, 0.2, 0.4, 0.6, 0.8)
+"""Standard deviations of the line *demonstrations with noise*, as shares of those of each column among the demonstrations."""
+SAMPLES = 100
 """Plans of each task, and fresh samples that they are to cover."""
 
 
@@ -58,7 +62,8 @@ class Form:
 
 
 FORMS = {
-    "one": Form(OURS, "one embedding", "conf/invert/{domain}.yaml"),
+    "one": Form(OURS, "", "conf/invert/{domain}.yaml"),
+    "modes": Form(f"{OURS}{WITH_MODES}", "", "conf/invert/{domain}.yaml", {"modes": "auto"}),
     "BC": Form("BC", "", "conf/baseline/bc/invert/{domain}.yaml", tempered=False),
     "CVAE": Form("CVAE", "", "conf/baseline/cvae/invert/{domain}.yaml"),
     "in-context": Form("in-context", "", "conf/baseline/in_context/invert/{domain}.yaml"),
@@ -98,9 +103,22 @@ def row(one: Judged, domain: Domain, subject: Mapping[str, Any]) -> dict[str, An
     }
 
 
+def noisy(real: Sequence[Real], seed: int) -> list[tuple[float, Judged]]:
+    """Demonstrations in turn, each moved as a whole by normal noise, at every level of :data:`NOISE`."""
+    draw, found = torch.Generator().manual_seed(seed), []
+    for one, level in itertools.product(real, NOISE):
+        if one.demonstrations is not None and one.fresh is not None:
+            judged = one.replayed()
+            spread = judged.states.flatten(0, 1).std(dim=0)
+            noise = level * spread * torch.randn((len(judged.states), 1, len(spread)), generator=draw)
+            found.append((level, one.added(Judged.of(one.task, judged.states + noise, judged.starts, one.domain))))
+    return found
+
+
 def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out: Path, only: Sequence[str]) -> None:
     """Add what the file does not have of one method and seed."""
-    tasks = [task for task in domain.concepts.suites[suite].tasks if task.initial == "new" and (not only or task.name in only)]
+    tasks = [task for task in domain.concepts.suites[suite].tasks if task.initial == "new"]
+    tasks = [task for task in tasks if not only or task.name in only or task.setting in only]
     run = {"domain": domain.name, "suite": suite, "seed": seed}
     method = {"method": form.method, "variant": form.variant}
     known = read_frontier(out)
@@ -126,7 +144,10 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
         ours = [row(one, domain, {**run, **method, "temperature": temperature}) for one in found]
         reference = {"variant": "", "temperature": None}
         beside = [row(one, domain, {**run, **reference, "method": line}) for line, each in lines(real).items() for one in each]
-        write_frontier(out, ours + beside)
+        moved = [
+            row(one, domain, {**run, "method": NOISY, "variant": "", "temperature": level}) for level, one in noisy(real, seed)
+        ]
+        write_frontier(out, ours + beside + moved)
 
 
 def _alike(rows: pd.DataFrame, values: Mapping[str, Any]) -> pd.Series:
@@ -140,7 +161,7 @@ def main() -> None:
     parser.add_argument("--domain", default="object_rearrangement")
     parser.add_argument("--suite", default="validation")
     parser.add_argument("--forms", nargs="+", default=list(FORMS), choices=list(FORMS))
-    parser.add_argument("--tasks", nargs="+", default=[], help="names of tasks; all of the suite without")
+    parser.add_argument("--tasks", nargs="+", default=[], help="names of tasks or settings; all of the suite without")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--samples", type=int, default=SAMPLES)
     parser.add_argument("--out", type=Path, default=Path("results/frontier.json"))

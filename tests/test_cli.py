@@ -330,3 +330,70 @@ def test_a_verb_without_options_says_what_it_needs(verb: str, capsys: pytest.Cap
     assert told.startswith("error: ")
     assert "expected" in told or "required" in told
     assert "\n" not in told
+
+
+# Modes and the stopping rule
+
+
+def one_concept(invert: Callable[..., Path], *options: str) -> Path:
+    """The file of a new relation that is learned from five demonstrations."""
+    task = "circle right of square and square above triangle"
+    assert main(["generate", "object_rearrangement", f"--task={task}", "--count=5", "--out=five.safetensors"]) == 0
+    log = invert("--data.demonstrations=five.safetensors", *options)
+    (file,) = (log / "concepts").iterdir()
+    return file
+
+
+@pytest.mark.parametrize(("modes", "how"), [("each", "one of them"), ("auto", "")])
+def test_modes_are_learned_explained_and_sampled_from(
+    tiny: Path, invert: Callable[..., Path], capsys: pytest.CaptureFixture[str], modes: str, how: str
+) -> None:
+    file = one_concept(invert, f"--model.modes={modes}")
+    learned = Concept.load(file)
+    assert learned.modes is not None
+    assert len(learned.modes) == 5
+    capsys.readouterr()
+    assert main(["explain", f"--concept={file}", f"--pretrained={tiny}"]) == 0
+    told = capsys.readouterr().out
+    how = how or ("a random mixture of them" if learned.modes.mixed else "one of them")
+    assert f"alone it generates from {how}: 5 modes; composed, from the components that have no mode\n" in told
+    assert told.count("nearest: ") == 2 + 5 * 2 + 1  # the components, those of every mode, the weighted sum
+    assert "\nmode 5, component 2, weight 1.20: nearest: " in told
+    Concept(learned.embeddings, learned.weights, learned.origin).save("centre.safetensors")
+    options = [f"--pretrained={tiny}", "--count=6", "--steps=3", "--out=states.safetensors"]
+    states = []
+    for more in ([], ["--compose=circle above square"]):
+        for concept in (file, "centre.safetensors"):
+            assert main(["sample", *options, f"--concept={concept}", *more]) == 0
+            states.append(Demonstrations.load("states.safetensors").states)
+    assert not torch.equal(states[0], states[1])
+    assert torch.equal(states[2], states[3])
+
+
+def test_a_run_that_stops_by_itself_says_after_how_many_steps(
+    invert: Callable[..., Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--data.steps=150", "--model.tolerance=0.5", "--trainer.enable_progress_bar=true"]
+    one_concept(invert, *options)
+    told = capfd.readouterr().err
+    (steps,) = [int(line.split()[1]) for line in told.splitlines() if line.startswith("invert: ") and " steps, " in line]
+    assert 20 <= steps < 150
+    log = Path("logs/object_rearrangement/invert")
+    assert (log / "results.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ("--model.modes=0", "model.modes: expected 1 or more, 'each' or 'auto', found 0"),
+        ("--model.modes=some", "modes"),
+        ("--model.tolerance=1", "model.tolerance: expected null or a share from 0 up to 1, found 1.0"),
+        ("--model.tolerance=much", "tolerance"),
+    ],
+)
+def test_modes_and_tolerances_that_are_none_are_one_clear_line(
+    tiny: Path, option: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", option)
+    assert expected in told
+    assert not list(Path().rglob("concepts"))

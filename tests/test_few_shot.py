@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 import ftl_lightning
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -398,3 +399,56 @@ def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
     Path("invert.yaml").write_text("evaluation: {steps: 5}\n")
     again = FewShot.from_pretrained("mine", settings="invert.yaml")
     assert again.evaluate(examples.select("flat"), "flat")["nearest_demonstration"] == 1
+
+
+# Modes
+
+
+def test_a_concept_with_modes_is_learned_kept_and_told_of(scenes: FewShot, shown: Demonstrations) -> None:
+    learned = scenes.learn(shown, steps=3, modes="each")
+    assert learned.modes is not None
+    assert learned.modes.embeddings.shape == (5, 2, 384)
+    assert repr(learned).startswith(f"LearnedConcept('{NEW}', K = 2, 5 modes, loss 0.")
+    mixed = replace(learned.concept, modes=replace(learned.modes, mixed=True))
+    mixed.save("mixed.safetensors")
+    assert repr(scenes.load("mixed.safetensors")).startswith(f"LearnedConcept('{NEW}', K = 2, 5 modes, mixed, loss 0.")
+    learned.save("mine.safetensors")
+    again = scenes.load("mine.safetensors")
+    assert torch.equal(scenes.sample(again, 3, **QUICK).states, scenes.sample(learned, 3, **QUICK).states)
+    assert scenes.learn(shown, steps=1, modes=1).modes is None
+    assert "modes" not in repr(scenes.learn(shown, steps=1))
+
+
+def test_modes_generate_alone_and_the_centre_in_company(scenes: FewShot, shown: Demonstrations) -> None:
+    learned = scenes.learn(shown, steps=3, modes="each", learning_rate=1.0)
+    learned.save("mine.safetensors")
+    replace(learned.concept, modes=None).save("centre.safetensors")
+    centre = scenes.load("centre.safetensors")
+    assert centre.modes is None
+
+    def states(concept: Composition) -> torch.Tensor:
+        return scenes.sample(concept, 6, **QUICK).states
+
+    assert not torch.equal(states(learned), states(centre))
+    assert torch.equal(states(learned + scenes[KNOWN]), states(centre + scenes[KNOWN]))
+    assert torch.equal(states(scenes.compose("mine.safetensors:1.5")), states(1.5 * learned))
+    assert torch.equal(states(scenes.compose(f"mine.safetensors + {KNOWN}")), states(centre + scenes[KNOWN]))
+
+
+def test_a_learner_with_a_tolerance_stops_by_itself(
+    scenes: FewShot, shown: Demonstrations, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = scenes.learn(shown, steps=150, progress=True, tolerance=0.5, samples=8)
+    told = capsys.readouterr().err
+    assert f"learning '{NEW}'" in told
+    settings = replace(scenes.tuned.inversion, tolerance=0.5, samples=8)
+    losses: list[float] = []
+    expected = invert(scenes.model, shown, settings, 150, losses.append)[NEW]
+    assert 20 <= len(losses) < 150
+    assert torch.equal(found.embeddings, expected.embeddings)
+    for changes, message in (
+        ({"modes": "some"}, r"model\.modes: expected a number, 'each' or 'auto', found 'some'"),
+        ({"tolerance": 1}, r"model\.tolerance: expected null or a share from 0 up to 1, found 1"),
+    ):
+        with pytest.raises(UserError, match=message):
+            scenes.learn(shown, steps=1, **changes)

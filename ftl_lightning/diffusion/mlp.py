@@ -1,7 +1,5 @@
 """The MLP denoiser of the paper's object rearrangement domain."""
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -10,9 +8,6 @@ from ftl_lightning.concepts.composition import Context
 from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
-
-FEW = 4
-"""Rows from which on a matrix product gives the same bits for each row, however many there are."""
 
 
 class MLPDenoiser(nn.Module):
@@ -74,32 +69,15 @@ class MLPDenoiser(nn.Module):
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
             context: what :meth:`observe` read.
         """
-        films = self._films(t, concepts, index)
+        by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(2 * len(self.layers), dim=-1)
+        by_concept = self.concept_film(self.concept(concepts)).chunk(2 * len(self.layers), dim=-1)
         hidden = x.flatten(1)
         if self.initial is not None:
             hidden = torch.cat((hidden, self.initial.attend(context, concepts[index])), dim=-1)
         for depth, layer in enumerate(self.layers):
-            scale, shift = next(films), next(films)
+            # Summed layer by layer: all layers at once would not fit into the processor's cache.
+            scale, shift = (by_time[i] + by_concept[i][index] for i in (2 * depth, 2 * depth + 1))
             update = self.dropout(functional.silu(layer(hidden) * (1 + scale) + shift))
             hidden = hidden + update if depth else update
         out: Tensor = self.head(hidden)
         return out.unflatten(-1, x.shape[1:])
-
-    def _films(self, t: Tensor, concepts: Tensor, index: Tensor) -> Iterator[Tensor]:
-        """Scale and shift ``(batch, width)`` of each layer in turn; arguments as of :meth:`forward`.
-
-        One by one: all layers at once would not fit into the processor's cache.
-        """
-        parts, which = 2 * len(self.layers), None
-        if not torch.is_grad_enabled():  # the sum of gradients would depend on it, and so would what was learned before
-            distinct, own = t.unique(return_inverse=True)
-            if FEW <= len(t) >= len(distinct) * len(concepts):
-                # Of fewer rows a matrix product can have other bits.
-                t, which = torch.cat((distinct, distinct[:1].expand(FEW - 1))), own * len(concepts) + index
-        by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(parts, dim=-1)
-        by_concept = self.concept_film(self.concept(concepts)).chunk(parts, dim=-1)
-        for time, concept in zip(by_time, by_concept, strict=True):
-            if which is None:
-                yield time + concept[index]
-            else:
-                yield (time[:, None] + concept).flatten(0, 1)[which]

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 OURS = "FTL-IGM"
 """The name of the paper's method."""
+WITH_MODES = " with modes"
+"""Added to the name of a method whose concepts have modes, which the paper's have not."""
 
 
 @dataclass(frozen=True)

@@ -117,11 +117,16 @@ class Real:
         """
         found = {}
         if self.demonstrations is not None and (self.domain.metrics or self.fresh):
-            turns = torch.arange(self.count) % len(self.demonstrations)
-            found[REPLAYED] = self._judged(self.demonstrations.rows(turns.tolist()))
+            found[REPLAYED] = self.replayed()
         if self.fresh:
             found[FRESH] = self._judged(self.fresh[1])
         return found
+
+    def replayed(self) -> Judged:
+        """As many plans as are generated, which are the demonstrations in turn."""
+        assert self.demonstrations is not None
+        turns = torch.arange(self.count) % len(self.demonstrations)
+        return self._judged(self.demonstrations.rows(turns.tolist()))
 
     def _judged(self, behaviour: Demonstrations) -> Judged:
         starts = behaviour.initial_states if self.domain.observed else None

@@ -26,7 +26,7 @@ def check_signature(module: pl.LightningModule, checkpoint: dict[str, Any], more
     Raises:
         UserError: naming the first key that differs.
     """
-    signature = checkpoint.get(_KEY, {})
-    for key, expected in _signature(module, more).items():
-        if (found := signature.get(key)) != expected:
+    own, signature = _signature(module, more), checkpoint.get(_KEY, {})
+    for key in own | signature:  # a setting that one of them does not name is at its default there
+        if (found := signature.get(key)) != (expected := own.get(key)):
             raise UserError(f"ckpt_path: key {key!r}: expected {expected}, found {found}; it is the checkpoint of something else")

@@ -46,6 +46,7 @@ class InversionSettings:
         learning_rate: of the embeddings (Adam, cosine decay to 0).
         weight_learning_rate: of the weights; with the embeddings' rate they collapse.
         samples: noised demonstrations a step and run, spread over the run's demonstrations and timesteps.
+        mode_samples: the same of the run of a mode.
         modes: sets of embeddings of a concept, see :class:`~ftl_lightning.concepts.composition.Modes`. 1 is the paper's form;
             otherwise beside it, from the same start, a set is learned from every demonstration (``'each'``), or from every
             n-th one for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes where one set explains the
@@ -73,6 +74,7 @@ class InversionSettings:
     learning_rate: float = 0.1
     weight_learning_rate: float = 3e-3
     samples: int = 32
+    mode_samples: int = 8
     modes: int | Literal["each", "auto"] = 1
     tolerance: float | None = None
     loss: str = "epsilon"
@@ -80,7 +82,7 @@ class InversionSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("components", "restarts", "samples"):
+        for name in ("components", "restarts", "samples", "mode_samples"):
             if (value := getattr(self, name)) < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
         if isinstance(self.modes, int) and self.modes < 1:
@@ -129,6 +131,7 @@ class Inversion(nn.Module):
 
     basis: Tensor
     weights: Tensor
+    _modes: Tensor
 
     def __init__(self, model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> None:
         super().__init__()
@@ -141,6 +144,7 @@ class Inversion(nn.Module):
         basis = torch.linalg.svd(training, full_matrices=False).Vh[: max(len(training) - 1, 1)]
         self.register_buffer("basis", basis, persistent=False)
         self.runs = self._runs()
+        self.register_buffer("_modes", torch.tensor([run.mode > 0 for run in self.runs]), persistent=False)
         # A generator for each concept, so that its start does not depend on what is learned beside it. Its modes start alike.
         shape = (settings.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
@@ -209,16 +213,20 @@ class Inversion(nn.Module):
         return self._losses(samples, draw, self.embeddings, self.weights, chosen)
 
     def step_losses(self, step: int) -> Tensor:
-        """The losses of a training step ``(run, samples)``, of the runs that have not stopped.
+        """The mean losses of a training step ``(run,)``, of the runs that have not stopped.
 
         Raises:
             UserError: if they are not finite.
         """
-        draw = generator(self.embeddings.device, self.settings.seed, 1, step)
         if self.stopping is not None and step == 0:
             self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
-        going = None if self.stopping is None else self.stopping.going
-        losses = self.losses(self.settings.samples, draw, going)
+        draw = generator(self.embeddings.device, self.settings.seed, 1, step)
+        found = []
+        for samples, own in ((self.settings.samples, ~self._modes), (self.settings.mode_samples, self._modes)):
+            chosen = own if self.stopping is None else own & self.stopping.going
+            if chosen.any():
+                found.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
+        losses = torch.cat(found)
         mean = losses.detach().mean()
         if not mean.isfinite():
             raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.learning_rate")
@@ -345,7 +353,7 @@ def invert(
     for step in range(steps):
         losses = inversion.step_losses(step)
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
-        gradients = torch.autograd.grad(losses.mean(dim=1).sum(), [group.parameter for group in groups])
+        gradients = torch.autograd.grad(losses.sum(), [group.parameter for group in groups])
         for group, gradient in zip(groups, gradients, strict=True):
             group.step(gradient, None if settings.tolerance is not None else (step, steps))
         tell(losses.detach().mean().item())

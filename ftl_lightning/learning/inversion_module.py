@@ -8,6 +8,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.domains.paper import WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.baselines.additive import AdditiveModel
@@ -26,7 +27,7 @@ class InversionModule(Adaptation):
         pretrained: folder of the pretrained model.
         components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
         initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
-        modes, tolerance, loss, timestep_power, seed: likewise.
+        mode_samples, modes, tolerance, loss, timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -48,6 +49,7 @@ class InversionModule(Adaptation):
         learning_rate: float = 0.1,
         weight_learning_rate: float = 3e-3,
         samples: int = 32,
+        mode_samples: int = 8,
         modes: int | Literal["each", "auto"] = 1,
         tolerance: float | None = None,
         loss: str = "epsilon",
@@ -63,12 +65,17 @@ class InversionModule(Adaptation):
         self.inversion: Inversion
 
     @property
+    def method(self) -> str:
+        """The paper's form has one set of embeddings; what has modes stands beside it in tables."""
+        name = super().method
+        return name if self.settings.modes == 1 else f"{name}{WITH_MODES}"
+
+    @property
     def variant(self) -> str:
         off_span, weight = self.settings.off_span, self.hparams["training_omega"]
         form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
-        modes = self.settings.modes
-        several = [] if modes == 1 else [f"{modes} modes" if isinstance(modes, int) else f"modes {modes}"]
-        return ", ".join([*self.model.traits, form, *several, *([] if weight is None else [f"training weight {weight:g}"])])
+        modes = [] if self.settings.modes in (1, "auto") else [f"modes: {self.settings.modes}"]
+        return ", ".join([*self.model.traits, form, *modes, *([] if weight is None else [f"training weight {weight:g}"])])
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
@@ -81,11 +88,21 @@ class InversionModule(Adaptation):
         losses = self.inversion.step_losses(self.global_step)
         self.log("train/loss", losses.detach().mean(), prog_bar=True)
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
-        return losses.mean(dim=1).sum()
+        return losses.sum()
 
-    def on_train_batch_end(self, outputs: Any, batch: int, batch_idx: int) -> None:
-        """Stop when no concept gains any more."""
-        if not self.inversion.stepped(self.global_step - 1):
+    def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
+        """Make no step where a checkpoint is resumed in which every concept had stopped."""
+        stopping = self.inversion.stopping
+        return None if stopping is None or stopping.going.any() else -1
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        """Take note of every step, and stop when no concept gains any more.
+
+        Here and not at the end of the batch, when a checkpoint may have been written that would not know of the step.
+        """
+        step = self.global_step
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if not self.inversion.stepped(step):
             self.trainer.should_stop = True
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:

@@ -6,7 +6,7 @@ from itertools import zip_longest
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.domains.paper import OURS, WITH_MODES, Published
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, latest
 from ftl_lightning.reporting.paired import leads, least_certain, same_outcome, signed
 from ftl_lightning.reporting.shown import (
@@ -22,7 +22,7 @@ from ftl_lightning.reporting.shown import (
 from ftl_lightning.reporting.tables import MISSING, Number, Table, against, difference_to, make_table, paper, select, summarise
 
 LANGUAGE = "language"
-METHODS = (OURS, "BC", "CVAE", "in-context", LANGUAGE)
+METHODS = (OURS, f"{OURS}{WITH_MODES}", "BC", "CVAE", "in-context", LANGUAGE)
 """The order of methods in tables; others come after them."""
 ALIKE = 0.9
 """In this share of episodes, at least, a reference policy ends as ours does to be told."""
@@ -89,7 +89,7 @@ def beside(number: Number, theirs: Published | None) -> list[str]:
 def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[str]:
     """The baselines of a setting; of training concepts language is ours, the same model and the same words."""
     same = setting in training_settings(domain)
-    return [name for name in methods(rows) if name != OURS and not (name == LANGUAGE and same)]
+    return [name for name in methods(rows) if not name.startswith(OURS) and not (name == LANGUAGE and same)]
 
 
 def overview(results: pd.DataFrame) -> Table:

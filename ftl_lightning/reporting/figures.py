@@ -15,6 +15,7 @@ from ftl_lightning.evaluation.results import REFERENCE, latest
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
 from ftl_lightning.reporting.curves import AXES, points
+from ftl_lightning.reporting.frontier import NOISY
 from ftl_lightning.reporting.shown import lookup, main_omega, settings
 from ftl_lightning.reporting.speed import Measured, reached
 from ftl_lightning.reporting.tables import labelled, main_rows, select, summarise
@@ -177,7 +178,8 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     panels[0].set_ylabel(domain.main_metric)
     found = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(list(found.values()), list(found), fontsize=8, loc="outside right upper")
-    figure.suptitle(f"{domain.name}: temperature from {_range(lines)}", fontsize=10)
+    tempered = lines[lines["method"] != NOISY]
+    figure.suptitle(f"{domain.name}: temperature from {_range(tempered)}", fontsize=10)
     return figure
 
 

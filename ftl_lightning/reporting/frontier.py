@@ -8,13 +8,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError
+from ftl_lightning.reporting.tables import MISSING, Table, make_table
 from ftl_lightning.tensor_file import write_text
 
 FRONTIER = "frontier.json"
 """Name of the file in a folder of results."""
+NOISY = "demonstrations with noise"
+"""A line for which nothing is learned; its temperature is the noise, as a share of the demonstrations' standard deviation."""
 SUBJECT = ["domain", "suite", "setting", "task", "method", "variant", "temperature", "seed", "n"]
 """Columns that tell one measurement from another; ``temperature`` is missing for reference lines and for methods without one."""
 COLUMNS = [*SUBJECT, "accuracy", "novelty", "coverage"]
@@ -38,6 +44,45 @@ def read_frontier(path: str | Path) -> pd.DataFrame:
         raise UserError(f"{path}: expected rows of {', '.join(COLUMNS)}, found something else ({error!r})") from error
     numbers = ["temperature", "accuracy", "novelty", "coverage"]
     return table.astype(dict.fromkeys(numbers, float))
+
+
+def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
+    """The accuracy of a method at the temperature where its coverage is a given one, between the temperatures that were measured.
+
+    Args:
+        rows: of one method and suite; means over tasks and seeds are taken.
+        coverage: the distance.
+
+    Returns:
+        ``None`` where no temperature covers so much.
+    """
+    means = rows.groupby("temperature")[["coverage", "accuracy"]].mean().sort_values("coverage")
+    if means.empty or not means["coverage"].iloc[0] <= coverage <= means["coverage"].iloc[-1]:
+        return None
+    return float(np.interp(coverage, means["coverage"], means["accuracy"]))
+
+
+def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
+    """Of each method accuracy, novelty and coverage at every temperature, and its accuracy where it covers as much as ours does at
+    temperature 1 with one set of embeddings.
+
+    Args:
+        domain: the domain.
+        rows: see :func:`read_frontier`.
+    """
+    lines = []
+    rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])
+    for (suite, setting), own in rows.groupby(["suite", "setting"], sort=False):
+        reference = own[(own["method"] == OURS) & (own["temperature"] == 1.0)]["coverage"].mean()
+        for method, each in own.groupby("method", sort=False):
+            equal = accuracy_at(each, reference)
+            means = each.groupby("temperature", dropna=False)[["accuracy", "novelty", "coverage"]].mean().reset_index()
+            for values in means.to_numpy():
+                numbers = [*(f"{value:.2f}" for value in values[1:]), "" if equal is None else f"{equal:.2f}"]
+                cells = [suite, setting, method, f"{values[0]:g}", *numbers]
+                lines.append([MISSING if cell in ("nan", "") else str(cell) for cell in cells])
+    columns = ["suite", "setting", "method", "temperature", "accuracy", "novelty", "coverage", "accuracy at equal coverage"]
+    return make_table(domain, "frontier", f"{domain.name}: accuracy, novelty and coverage (less is better)", lines, columns)
 
 
 def write_frontier(path: str | Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -11,7 +11,7 @@ from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_ro
 from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time
-from ftl_lightning.reporting.frontier import read_frontier
+from ftl_lightning.reporting.frontier import frontier_table, read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.tables import Table, select, tables
@@ -55,6 +55,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
             _save(growth(domain, curves), out / name / "curves.png")
         if name in set(measured["domain"]):
             _save(frontier(domain, measured), out / name / "frontier.png")
+            found.append(_written(frontier_table(domain, measured), out / name))
         everything += found
     if curve_by_name := read_speed(results):
         _save(learning_time(curve_by_name), out / "speed.png")

@@ -8,14 +8,17 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.data import InversionData
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.learning.inversion import EXPLAINED, InversionSettings, explained, invert
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
@@ -85,6 +88,10 @@ def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, 
         ({"samples": 0}, r"model\.samples: expected 1 or more, found 0"),
         ({"off_span": 1.1}, r"model\.off_span: expected 0 \(span\) to 1 \(free\), found 1.1"),
         ({"timestep_power": 0.5}, r"model\.timestep_power: expected 1 or more, found 0.5"),
+        ({"modes": 0}, r"model\.modes: expected 1 or more, 'each' or 'auto', found 0"),
+        ({"modes": "some"}, r"model\.modes: expected a number, 'each' or 'auto', found 'some'"),
+        ({"tolerance": 1}, r"model\.tolerance: expected null or a share from 0 up to 1, found 1"),
+        ({"tolerance": -0.1}, r"model\.tolerance: expected null or a share from 0 up to 1, found -0.1"),
         ({"loss": "displacement"}, r"model\.loss: expected one of epsilon, v, clean, found 'displacement'"),
     ],
 )
@@ -236,3 +243,166 @@ def test_inverting_twice_gives_the_same_rows(invert: Callable[..., Path]) -> Non
     assert set(ours["variant"]) == {"free, training weight 0.8"}
     oracle = first[(first["method"] == "generator (oracle)")]
     assert (oracle["value"] == 1).all()
+
+
+# Modes
+
+
+RING = "circle, triangle and square in a circle of radius 1.25"
+
+
+def shown(count: int = 5, task: str = RING) -> Demonstrations:
+    return load_domain("object_rearrangement").source(None).draw(task, count, 1)
+
+
+def from_few(tiny: Path, own: Demonstrations, steps: int = 6, **changes: Any) -> Concept:
+    """The only concept of some demonstrations."""
+    (found,) = invert(load_model(tiny), own, InversionSettings(samples=8, **changes), steps).values()
+    return found
+
+
+def alike(one: torch.Tensor, other: torch.Tensor) -> bool:
+    """To the rounding of batches of different sizes."""
+    return torch.allclose(one, other, atol=2e-4)
+
+
+@pytest.mark.parametrize("modes", ["each", "auto", 3])
+def test_of_a_single_demonstration_there_is_one_set_of_embeddings_whatever_the_modes(tiny: Path, modes: int | str) -> None:
+    one, several = (from_few(tiny, shown(1), modes=own) for own in (1, modes))
+    assert several.modes is None
+    for name, concept in (("one", one), ("several", several)):
+        concept.save(f"{name}.safetensors")
+    assert file_hash("one.safetensors") == file_hash("several.safetensors")
+
+
+@pytest.mark.parametrize("modes", ["each", "auto", 2])
+def test_beside_modes_the_concept_is_what_it_is_without_them(tiny: Path, modes: int | str) -> None:
+    one, several = (from_few(tiny, shown(), modes=own) for own in (1, modes))
+    assert one.modes is None
+    assert several.modes is not None
+    assert alike(several.embeddings, one.embeddings)
+    assert torch.equal(several.weights, one.weights)
+    assert several.origin.loss == pytest.approx(one.origin.loss, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("modes", "parts"), [("each", [[0], [1], [2], [3], [4]]), (2, [[0, 2, 4], [1, 3]]), (9, [[0], [1]])], ids=str
+)
+def test_a_mode_is_what_its_demonstrations_alone_teach(tiny: Path, modes: int | str, parts: list[list[int]]) -> None:
+    own = shown(2 if modes == 9 else 5)
+    found = from_few(tiny, own, modes=modes, omega="learned").modes
+    assert found is not None
+    assert len(found) == len(parts)
+    for number, rows in enumerate(parts):
+        alone = from_few(tiny, own.rows(rows), omega="learned")
+        assert alike(found.embeddings[number], alone.embeddings)
+        assert alike(found.weights[number], alone.weights)
+    assert not alike(found.embeddings[0], found.embeddings[1])
+
+
+def test_of_every_mode_the_best_restart_is_kept(tiny: Path) -> None:
+    own = shown()
+    several = from_few(tiny, own, modes="each", restarts=3, initial_spread=1.0)
+    assert several.modes is not None
+    for row in range(5):
+        alone = from_few(tiny, own.rows([row]), restarts=3, initial_spread=1.0)
+        assert alike(several.modes.embeddings[row], alone.embeddings)
+
+
+def test_modes_are_more_likely_than_one_set_of_embeddings(tiny: Path) -> None:
+    own = shown()
+    several = from_few(tiny, own, steps=80, modes="each")
+    assert several.modes is not None
+    each = [from_few(tiny, own.rows([row]), steps=80).origin.loss for row in range(5)]
+    assert sum(each) / 5 < several.origin.loss
+
+
+def test_what_one_set_explains_is_its_share_of_the_modes_gain() -> None:
+    empty, one, modes = torch.tensor([0.2, 0.2, 0.2]), torch.tensor([0.1, 0.2, 0.18]), torch.tensor([0.1, 0.1, 0.15])
+    assert explained(empty, one, modes).tolist() == pytest.approx([1.0, 0.0, 0.4])
+    assert EXPLAINED == 0.4
+
+
+@pytest.mark.parametrize(("least", "mixed"), [(-10.0, True), (10.0, False)])
+def test_auto_mixes_the_modes_where_one_set_explains_enough(
+    tiny: Path, least: float, mixed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftl_lightning.learning.inversion.EXPLAINED", least)
+    auto, each = (from_few(tiny, shown(), modes=modes).modes for modes in ("auto", "each"))
+    assert auto is not None
+    assert each is not None
+    assert auto.mixed is mixed
+    assert not each.mixed  # it is told to draw them
+    assert torch.equal(auto.embeddings, each.embeddings)
+
+
+def test_auto_asks_how_much_of_what_the_modes_gain_one_set_gains(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[float]] = []
+
+    def spy(*losses: torch.Tensor) -> torch.Tensor:
+        asked.append([loss.item() for loss in losses])
+        return explained(*losses)
+
+    monkeypatch.setattr("ftl_lightning.learning.inversion.explained", spy)
+    own = shown()
+    several = from_few(tiny, own, steps=80, modes="auto")
+    ((empty, one, modes),) = asked
+    assert one == pytest.approx(several.origin.loss, abs=1e-6)
+    assert modes == pytest.approx(sum(from_few(tiny, own.rows([row]), steps=80).origin.loss for row in range(5)) / 5, abs=1e-4)
+    assert modes < one < empty
+    assert several.modes is not None
+    assert several.modes.mixed is ((empty - one) / (empty - modes) >= EXPLAINED)
+
+
+def test_alone_a_task_is_generated_from_modes_and_composed_or_in_part_from_the_centre(tiny: Path) -> None:
+    module = learn(tiny, modes="each")
+    module.on_validation_start()
+    name, other, *_ = module.concepts
+    concept, text = module.learned()[name], module.model.config.training_concepts[0]
+    alone = module.composition(EvaluationTask("s", "g", learned=(name,)))
+    assert alone is not None
+    assert alone.modes is not None
+    assert concept.modes is not None
+    assert torch.equal(alone.modes.embeddings, concept.modes.embeddings)
+    for task in (
+        EvaluationTask("s", "g", learned=(name,), texts=(text,)),
+        EvaluationTask("s", "g", learned=(name,), without=(text,)),
+        EvaluationTask("s", "g", learned=(name, other)),
+        EvaluationTask("s", "g", learned=(name,), component=2),
+    ):
+        found = module.composition(task)
+        assert found is not None
+        assert found.modes is None
+        assert any(torch.equal(concept.embeddings[1], row) for row in found.embeddings)
+
+
+def test_the_projector_names_the_components_of_every_mode(tiny: Path) -> None:
+    for modes, count in ((1, 0), (2, 2)):
+        module = learn(tiny, modes=modes)
+        module.on_validation_start()
+        name = module.concepts[0]
+        own = [key for key in module.concept_embeddings() if key.startswith(name + " [")]
+        parts = ["", *(f"mode {mode}, " for mode in range(1, count + 1))]
+        assert own == [f"{name} [{part}component {number}]" for part in parts for number in (1, 2)]
+
+
+def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Path) -> None:
+    data = InversionData("object_rearrangement", suite="validation", steps=6)
+
+    def of(**options: Any) -> dict[str, Any]:
+        return configuration(InversionModule(str(tiny), **options), data, {})
+
+    plain = of()
+    assert plain["model/components"] == 2
+    assert not {"model/modes", "model/tolerance"} & plain.keys()
+    assert of(modes=1, tolerance=None) == plain
+    for changes in ({"modes": 2}, {"modes": "auto"}, {"tolerance": 0.0}, {"tolerance": 0.01}):
+        (key, value), *_ = changes.items()
+        assert of(**changes) == plain | {f"model/{key}": value}
+
+
+@pytest.mark.parametrize(
+    ("modes", "told"), [(1, "free"), (3, "free, 3 modes"), ("each", "free, modes each"), ("auto", "free, modes auto")]
+)
+def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told: str) -> None:
+    assert InversionModule(str(tiny), modes=modes).variant == told  # type: ignore[arg-type]
