@@ -205,7 +205,7 @@ def our_curve(
     with bar(name, len(at)) as advance:
         for steps in at:
             learned, made, seconds = ours(judge.model, groups, settings, steps, repeats)
-            if curve and made == curve[-1].steps:  # all have stopped before
+            if curve and round(made, 1) == curve[-1].steps:  # all have stopped before
                 break
             curve.append(Measured(name, round(made, 1), round(seconds, 4), round(judge.accuracy(learned), 4)))
             advance(1, f"{steps} steps")
