@@ -137,8 +137,7 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
     sampling = {key: config["evaluation"][key] for key in ("sampler", "steps") if key in config["evaluation"]}
     for temperature in missing:
         evaluator = Evaluator([suite], samples, temperature=temperature or 0.0, seed=seed, **sampling)
-        evaluator.asked = (suite,)
-        judged = [one for one in evaluator.evaluate(module) if one.task in tasks]
+        judged = evaluator.evaluate(module, tasks=tasks)
         real = evaluator.real(module, judged)
         found = [own.added(one) for own, one in zip(real, judged, strict=True)]
         ours = [row(one, domain, {**run, **method, "temperature": temperature}) for one in found]

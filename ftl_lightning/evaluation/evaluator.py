@@ -144,15 +144,17 @@ class Evaluator(pl.Callback):
         return domain.source(self.root).starts(task.goal, self.samples, EVALUATION_SEED + self.seed)
 
     @torch.no_grad()
-    def evaluate(self, module: Evaluable, execute: bool = False) -> list[Judged]:
+    def evaluate(self, module: Evaluable, execute: bool = False, tasks: Sequence[EvaluationTask] | None = None) -> list[Judged]:
         """Generate and judge every task, those with equally many samples in one batch of the network.
 
         Args:
             module: what generates.
             execute: also execute plans in the domain's environment.
+            tasks: ``None`` for all of the suites.
         """
         model, domain = module.model, module.domain
-        composed = {task: composition for task in self._tasks(domain, module.concepts) if (composition := module.composition(task))}
+        asked = self._tasks(domain, module.concepts) if tasks is None else tasks
+        composed = {task: composition for task in asked if (composition := module.composition(task))}
         starts = {task: self._start(task, module, domain) for task in composed}
         counts = {task: self.samples if start is None else len(start) for task, start in starts.items()}
         judged: dict[EvaluationTask, Judged] = {}
