@@ -43,7 +43,7 @@ class InversionSettings:
             them in the span, between the two the part off the span is scaled, which slows its learning down.
         initial_spread: embeddings start at the mean of the training embeddings plus so much normal noise a column.
         restarts: independent starts of each concept; the one with the lowest loss on common noise is kept.
-        learning_rate: of the embeddings (Adam, cosine decay to 0).
+        learning_rate: of the embeddings (Adam).
         weight_learning_rate: of the weights; with the embeddings' rate they collapse.
         samples: noised demonstrations a step and run, spread over the run's demonstrations and timesteps.
         mode_samples: the same of the run of a mode.
@@ -53,7 +53,8 @@ class InversionSettings:
             demonstrations at least :data:`EXPLAINED` as well as they do, and from single modes elsewhere.
         tolerance: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than this share of
             all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
-            :class:`~ftl_lightning.learning.stopping.Stopping`. ``None`` for all steps, the rate decaying to 0.
+            :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not count. ``None`` for all
+            steps, the rate decaying to 0.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
