@@ -174,7 +174,8 @@ def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], 
     assert "8 of 9 cells cannot run, none was started" in told
     for part in (
         "nowhere/config.json: expected a pretrained model",
-        "evaluation.suites: expected some of training, paper, components, validation, compositions (domain object_rearrangement), found exam",
+        "evaluation.suites: expected some of training, paper, components, validation, compositions "
+        "(domain object_rearrangement), found exam",
         "tempo",
         "expected a model of driving (diffusion or bc or cvae), found one of object_rearrangement (diffusion)",
         "agent.yaml: expected the configuration of an adaptation (invert), found that of a pretraining (fit)",

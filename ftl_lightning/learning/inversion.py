@@ -53,7 +53,8 @@ class InversionSettings:
             demonstrations at least :data:`EXPLAINED` as well as they do, and from single modes elsewhere.
         tolerance: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than this share of
             all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
-            :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not count. ``None`` for all
+            :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not
+            count; of fewer steps than a round has, the last one does. ``None`` for all
             steps, the rate decaying to 0.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
@@ -265,7 +266,9 @@ class Inversion(nn.Module):
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
         """The concepts by name: of each run, the restart with the lowest loss on common noise."""
-        restarts, source = self.settings.restarts, self.stopping or self
+        restarts = self.settings.restarts
+        # Where there were fewer steps than a round has, there is no best one yet.
+        source = self if self.stopping is None or not self.stopping.rounds else self.stopping
         raw, weights = source.embeddings.detach(), source.weights.detach()
         losses = self._final(raw, weights)
         best = torch.arange(0, len(losses), restarts, device=losses.device) + losses.unflatten(0, (-1, restarts)).argmin(dim=1)

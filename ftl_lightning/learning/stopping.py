@@ -26,12 +26,14 @@ class Stopping(nn.Module):
         going: the runs ``(run,)`` that have not stopped.
         embeddings, weights: the best of every run so far.
         least: their held-out losses ``(run,)``.
+        rounds: how many have ended.
     """
 
     going: Tensor
     embeddings: Tensor
     weights: Tensor
     least: Tensor
+    rounds: Tensor
     _first: Tensor
     _idle: Tensor
     _sums: Tensor
@@ -45,6 +47,7 @@ class Stopping(nn.Module):
         self.register_buffer("weights", weights.detach().clone())
         self.register_buffer("least", torch.full_like(self.weights[:, 0], torch.inf))
         self.register_buffer("_first", self.least.clone())
+        self.register_buffer("rounds", torch.zeros((), dtype=torch.int64, device=weights.device))
         self.register_buffer("_idle", torch.zeros(len(weights), dtype=torch.int64, device=weights.device))
         self.register_buffer("_sums", torch.zeros_like(self.embeddings))
         self.register_buffer("_weight_sums", torch.zeros_like(self.weights))
@@ -70,6 +73,7 @@ class Stopping(nn.Module):
         self._weight_sums += weights
         if (step + 1) % ROUND:
             return True
+        self.rounds += 1
         mean, weight_mean = self._sums / ROUND, self._weight_sums / ROUND
         losses = torch.full_like(self.least, torch.inf)
         losses[self.going] = held_out(mean, weight_mean, self.going)

@@ -161,6 +161,14 @@ def test_without_a_tolerance_all_steps_are_made_and_the_last_embeddings_are_lear
     assert torch.equal(inversion.learned()[RING].embeddings, inversion.embeddings[0].detach())
 
 
+def test_fewer_steps_than_a_round_has_are_not_lost(model: ConceptModel) -> None:
+    few = InversionSettings(samples=8, tolerance=0.05)
+    at_all = [invert(model, shown(RING), few, steps)[RING].embeddings for steps in (1, ROUND - 1)]
+    start = Inversion(model, shown(RING), few).embeddings[0]
+    assert not torch.equal(at_all[0], start)
+    assert not torch.equal(at_all[0], at_all[1])
+
+
 def test_a_tolerance_ends_learning_early_at_the_best_round(model: ConceptModel) -> None:
     inversion, steps = learn(model, RING, tolerance=0.3)
     assert ROUND * IDLE <= steps < 200
