@@ -236,7 +236,8 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         print(f"alone it generates from {how}: {len(learned.modes)} modes; composed, from the components that have no mode")
     parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
     if len(learned.weights) > 1:
-        parts.append(("weighted sum", learned.weights @ learned.embeddings))
+        whole = learned.at_knots(learned.weights @ learned.embeddings)
+        parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]
     for name, embedding in parts:
         print(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
 

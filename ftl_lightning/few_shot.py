@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -50,11 +50,14 @@ class LearnedConcept(Composition):
 
     def __repr__(self) -> str:
         modes = "" if self.modes is None else f", {len(self.modes)} modes{', mixed' if self.modes.mixed else ''}"
-        return f"LearnedConcept({self.concept.origin.name!r}, K = {len(self.weights)}{modes}, loss {self.concept.origin.loss:.3f})"
+        knots = "" if self.knots == 1 else f", {self.knots} knots"
+        adapter = "" if self.concept.adapter is None else ", an adapter"
+        kind = f"K = {len(self.weights)}{knots}{modes}{adapter}"
+        return f"LearnedConcept({self.concept.origin.name!r}, {kind}, loss {self.concept.origin.loss:.3f})"
 
     def explain(self, nearest: int = 3) -> Explanation:
-        """What its weighted sum is made of, in words of the training concepts."""
-        embedding = self.concept.weights @ self.concept.embeddings
+        """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""
+        embedding = (self.concept.weights @ self.concept.embeddings).unflatten(0, (self.knots, -1)).mean(dim=0)
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
 
     def save(self, path: str | Path) -> None:
@@ -147,7 +150,8 @@ class FewShot:
     def _learned(self, concept: Concept) -> LearnedConcept:
         device = self.model.device
         own = concept.composition.to(device)
-        return LearnedConcept(own.embeddings, own.weights, concept, self.model, modes=own.modes)
+        parts = {field.name: getattr(own, field.name) for field in fields(Composition)}
+        return LearnedConcept(**parts, concept=concept, model=self.model)
 
     def demonstrations(
         self,

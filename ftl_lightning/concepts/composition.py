@@ -1,8 +1,9 @@
 """Compositions of concepts, and the composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +13,10 @@ from ftl_lightning.errors import UserError
 Context = tuple[Tensor, ...]
 """What a condition encoder read from the observed features, each ``(batch, ...)``; empty where nothing is observed."""
 Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Context], Tensor]
-"""``(x (batch, horizon, state), t (batch,), concepts (concept, n), index (batch,), context) -> noise like x``, where ``index`` is
-each sample's row of ``concepts``."""
+"""``(x (batch, horizon, state), t (batch,), concepts (concept, knots * n), index (batch,), context) -> noise like x``, where
+``index`` is each sample's row of ``concepts``."""
+Adapter = Callable[[Denoiser], Denoiser]
+"""Changes a denoiser for the branches of its own concept, see :mod:`ftl_lightning.concepts.adapter`."""
 
 
 STRETCH = 1.5
@@ -25,7 +28,7 @@ class Modes:
     """Several sets of embeddings of one concept: behaviours that are right in different ways.
 
     Attributes:
-        embeddings: ``(mode, K, n)``.
+        embeddings: ``(mode, K, knots * n)``.
         weights: ``(mode, K)``, omega.
         mixed: whether a sample is generated from a random mixture of the modes, which suits concepts of which one set of embeddings
             says enough, or from one mode, drawn at random.
@@ -45,19 +48,20 @@ class Modes:
         """The same on a device."""
         return replace(self, embeddings=self.embeddings.to(device), weights=self.weights.to(device))
 
-    def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
-        """What ``count`` samples are generated from: a composition ``(row, K, n)``, and each sample's row ``(count,)``.
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """What ``count`` samples are generated from: embeddings ``(row, K, knots * n)``, weights ``(row, K)``, and each sample's
+        row ``(count,)``.
 
         A mixture is ``mean + STRETCH * sum_m share_m (mode_m - mean)``, the shares even on the simplex (Dirichlet(1)).
         """
         if not self.mixed:
             chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)
-            return Composition(self.embeddings, self.weights), chosen.to(self.weights.device)
+            return self.embeddings, self.weights, chosen.to(self.weights.device)
         even = torch.empty(count, len(self), device=generator.device).exponential_(generator=generator)
         shares = (even / even.sum(dim=1, keepdim=True)).to(self.weights.device)
         shares = STRETCH * shares + (1 - STRETCH) / len(self)
-        mixture = Composition(torch.einsum("sm,mkn->skn", shares, self.embeddings), shares @ self.weights)
-        return mixture, torch.arange(count, device=self.weights.device)
+        embeddings = torch.einsum("sm,mkn->skn", shares, self.embeddings)
+        return embeddings, shares @ self.weights, torch.arange(count, device=self.weights.device)
 
 
 @dataclass(frozen=True)
@@ -66,20 +70,44 @@ class Composition:
     compositions too.
 
     Attributes:
-        embeddings: ``(..., K, n)``.
+        embeddings: ``(..., K, knots * n)``: of every concept one embedding or, one after another, several at even times of the
+            plan, between which the denoiser interpolates.
         weights: ``(..., K)``, omega.
         modes: what samples are generated from where a learned concept stands alone; its embeddings are used where it is composed.
+        knots: embeddings of each concept.
+        columns: share of its weight that a concept has on each column of a state ``(..., K, state)``, usually 0 or 1; ``None`` for
+            all of it on every column.
+        adapters: changes of the denoiser, each for the concepts that ``adapter`` says.
+        adapter: ``(..., K)`` int64, the number from 1 of each concept's adapter, 0 for the denoiser as it is; ``None`` for zeros.
     """
 
     embeddings: Tensor
     weights: Tensor
     modes: Modes | None = field(default=None, kw_only=True)
+    knots: int = field(default=1, kw_only=True)
+    columns: Tensor | None = field(default=None, kw_only=True)
+    adapters: tuple[Adapter, ...] = field(default=(), kw_only=True)
+    adapter: Tensor | None = field(default=None, kw_only=True)
 
     def __add__(self, other: "Composition") -> "Composition":
-        return Composition(torch.cat((self.embeddings, other.embeddings), dim=-2), torch.cat((self.weights, other.weights), dim=-1))
+        """Both; concepts that do not vary over the plan are said at every knot of those that do.
+
+        Raises:
+            UserError: for concepts of different numbers of knots, neither of which is 1.
+        """
+        knots, state = _common([self.knots, other.knots]), _columns_of((self, other))
+        parts = [part._filled(knots, state, len(self.adapters) * first) for first, part in enumerate((self, other))]
+        return Composition(
+            torch.cat([part.embeddings for part in parts], dim=-2),
+            torch.cat([part.weights for part in parts], dim=-1),
+            knots=knots,
+            columns=None if state is None else torch.cat([_given(part.columns) for part in parts], dim=-2),
+            adapters=(*self.adapters, *other.adapters),
+            adapter=torch.cat([_given(part.adapter) for part in parts], dim=-1) if self.adapters or other.adapters else None,
+        )
 
     def __mul__(self, factor: float) -> "Composition":
-        return Composition(self.embeddings, factor * self.weights, modes=self.modes and self.modes * factor)
+        return self._with(weights=factor * self.weights, modes=self.modes and self.modes * factor)
 
     __rmul__ = __mul__
 
@@ -89,49 +117,119 @@ class Composition:
     def __sub__(self, other: "Composition") -> "Composition":
         return self + -other
 
+    def on(self, columns: Sequence[int], state: int) -> "Composition":
+        """The same with weight on some columns of a state alone, of ``state`` columns."""
+        chosen = torch.zeros(state, device=self.weights.device)
+        chosen[list(columns)] = 1
+        before = _given(self._filled(self.knots, state).columns)
+        return self._with(columns=before * chosen)
+
+    def _with(self, **changes: Any) -> "Composition":
+        """A composition, of whatever class this one is, with some fields changed."""
+        return Composition(**({field.name: getattr(self, field.name) for field in fields(Composition)} | changes))
+
+    def _filled(self, knots: int, state: int | None, first: int = 0) -> "Composition":
+        """The same with so many knots, with columns of a state of that size, and with adapters' numbers after ``first`` others."""
+        shape = self.weights.shape
+        embeddings = self.embeddings if self.knots == knots else self.embeddings.repeat(*(1,) * len(shape), knots)
+        columns = self.columns if self.columns is not None or state is None else self.weights.new_ones((*shape, state))
+        number = self.weights.new_zeros(shape, dtype=torch.int64) if self.adapter is None else self.adapter
+        return self._with(
+            embeddings=embeddings, knots=knots, columns=columns, adapter=torch.where(number > 0, number + first, number), modes=None
+        )
+
     def to(self, device: torch.device) -> "Composition":
-        """The same on a device."""
-        return Composition(self.embeddings.to(device), self.weights.to(device), modes=self.modes and self.modes.to(device))
+        """The same on a device; adapters follow the denoiser that they change."""
+        return self._with(
+            embeddings=self.embeddings.to(device),
+            weights=self.weights.to(device),
+            modes=self.modes and self.modes.to(device),
+            columns=None if self.columns is None else self.columns.to(device),
+            adapter=None if self.adapter is None else self.adapter.to(device),
+        )
 
     def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
-        """What ``count`` samples are generated from: a composition ``(row, K, n)``, and each sample's row ``(count,)``.
+        """What ``count`` samples are generated from: a composition ``(row, K, ...)``, and each sample's row ``(count,)``.
 
         Nothing is drawn from the generator where there are no modes.
         """
-        if self.modes is not None:
-            return self.modes.draw(count, generator)
-        return Composition(self.embeddings[None], self.weights[None]), torch.zeros(
-            count, dtype=torch.int64, device=self.weights.device
-        )
+        if self.modes is None:
+            embeddings, weights = self.embeddings[None], self.weights[None]
+            own = torch.zeros(count, dtype=torch.int64, device=self.weights.device)
+        else:
+            embeddings, weights, own = self.modes.draw(count, generator)
+        rows = len(weights)
+        columns = None if self.columns is None else self.columns.expand(rows, *self.columns.shape)
+        adapter = None if self.adapter is None else self.adapter.expand(rows, *self.adapter.shape)
+        return self._with(embeddings=embeddings, weights=weights, modes=None, columns=columns, adapter=adapter), own
 
     def drawn(self, generator: torch.Generator) -> "Composition":
-        """The composition ``(K, n)`` of a single sample, without modes."""
+        """The composition ``(K, ...)`` of a single sample, without modes."""
         if self.modes is None:
             return self
         rows, row = self.draw(1, generator)
-        return Composition(rows.embeddings[row[0]], rows.weights[row[0]])
+        return self._with(embeddings=rows.embeddings[row[0]], weights=rows.weights[row[0]], modes=None)
+
+
+def _given(values: Tensor | None) -> Tensor:
+    assert values is not None
+    return values
+
+
+def _common(knots: Sequence[int]) -> int:
+    """The number of knots of concepts that are composed.
+
+    Raises:
+        UserError: where two of them differ and neither is 1.
+    """
+    if len(several := sorted(set(knots) - {1})) > 1:
+        raise UserError(f"compose: expected concepts of one number of knots (or of one knot), found {several[0]} and {several[1]}")
+    return max(knots, default=1)
+
+
+def _columns_of(compositions: Sequence[Composition]) -> int | None:
+    """Columns of a state, where any composition says so."""
+    return next((one.columns.shape[-1] for one in compositions if one.columns is not None), None)
 
 
 def batched(compositions: Sequence[Composition], count: int, generators: Sequence[torch.Generator]) -> tuple[Composition, Tensor]:
     """Everything that is generated together.
 
     Args:
-        compositions: ``(K, n)`` each, of maybe different K.
+        compositions: ``(K, ...)`` each, of maybe different K.
         count: samples of each.
         generators: of each composition's draws of modes.
 
     Returns:
-        One composition ``(row, most K, n)``, padded with weights of zero, and each sample's row ``(composition * count,)``.
+        One composition ``(row, most K, ...)``, padded with weights of zero, and each sample's row ``(composition * count,)``.
+
+    Raises:
+        UserError: for concepts of different numbers of knots, neither of which is 1.
     """
-    embeddings, weights, rows, first = [], [], [], 0
+    knots, state = _common([one.knots for one in compositions]), _columns_of(compositions)
+    # Episodes that are run side by side ask for one composition many times: it has its adapters once.
+    adapters = tuple(dict.fromkeys(adapter for one in compositions for adapter in one.adapters))
+    drawn, rows, first = [], [], 0
     for composition, draw in zip(compositions, generators, strict=True):
         own, index = composition.draw(count, draw)
-        embeddings += list(own.embeddings)
-        weights += list(own.weights)
+        own = own._filled(knots, state)
+        numbers = torch.tensor([0, *(1 + adapters.index(adapter) for adapter in composition.adapters)], device=own.weights.device)
+        drawn.append(replace(own, adapter=numbers[_given(own.adapter)]))
         rows.append(first + index)
         first += len(own.weights)
-    pad = nn.utils.rnn.pad_sequence
-    return Composition(pad(embeddings, batch_first=True), pad(weights, batch_first=True)), torch.cat(rows)
+
+    def padded(each: Iterable[Tensor]) -> Tensor:
+        return nn.utils.rnn.pad_sequence([row for part in each for row in part], batch_first=True)
+
+    together = Composition(
+        padded(one.embeddings for one in drawn),
+        padded(one.weights for one in drawn),
+        knots=knots,
+        columns=None if state is None else padded(_given(one.columns) for one in drawn),
+        adapters=adapters,
+        adapter=padded(_given(one.adapter) for one in drawn) if adapters else None,
+    )
+    return together, torch.cat(rows)
 
 
 def composed_epsilon(
@@ -143,15 +241,17 @@ def composed_epsilon(
     context: Context = (),
     own: Tensor | None = None,
 ) -> Tensor:
-    """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, all branches in one call of the network.
+    """``eps(x, empty) + sum_k w_k (eps_k(x, c_k) - eps(x, empty))``, all branches in one call of the network.
 
-    While learning, the empty branch, which depends on no concept, is evaluated apart, without gradient.
+    ``eps_k`` is the denoiser or, where a concept has an adapter, what the adapter makes of it, which is called for those branches
+    alone. A weight may differ between the columns of a state. While learning, the empty branch, which depends on no concept, is
+    evaluated apart, without gradient.
 
     Args:
         denoiser: estimates noise for one concept a sample.
         x: noisy plans ``(batch, horizon, state)``.
         t: timesteps ``(batch,)``.
-        composition: ``(composition, K, n)``; K may be 0.
+        composition: ``(composition, K, ...)``; K may be 0.
         empty: the empty concept ``(n,)``.
         context: of each sample.
         own: each sample's composition ``(batch,)`` int64; ``None`` for equally many samples of each, one after another.
@@ -164,22 +264,51 @@ def composed_epsilon(
     if own is None:
         own = torch.arange(compositions, device=x.device).repeat_interleave(len(x) // compositions)
 
-    def evaluate(concepts: Tensor, index: Tensor) -> Tensor:
-        """Noise ``(branch, batch, horizon, state)`` for ``index (branch, batch)`` into ``concepts``."""
+    def evaluate(denoiser: Denoiser, concepts: Tensor, index: Tensor, samples: Tensor | None = None) -> Tensor:
+        """Noise of all samples for ``index (branch, batch)`` into ``concepts``, or of some ``samples`` for ``index`` like them."""
+        if samples is not None:
+            return denoiser(x[samples], t[samples], concepts, index, tuple(part[samples] for part in context))
         k = len(index)
         every = tuple(part.repeat(k, *(1,) * (part.dim() - 1)) for part in context)
         return denoiser(x.repeat(k, 1, 1), t.repeat(k), concepts, index.flatten(), every).unflatten(0, (k, len(x)))
 
     nothing = torch.zeros_like(own)[None]
     rows = own * count + torch.arange(count, device=x.device)[:, None]  # (K, batch), into the flattened concepts
-    if torch.is_grad_enabled() and count:
+    silent = empty.repeat(composition.knots)[None]
+    if composition.adapters or (torch.is_grad_enabled() and count):
         with torch.no_grad():
-            unconditional = evaluate(empty[None], nothing)[0]
-        conditional = evaluate(concepts.flatten(0, 1), rows)
+            unconditional = evaluate(denoiser, silent, nothing)[0]
+        if composition.adapters:
+            conditional = _adapted(denoiser, composition, own, rows, evaluate, unconditional)
+        else:
+            conditional = evaluate(denoiser, concepts.flatten(0, 1), rows)
     else:
-        branches = evaluate(torch.cat((empty[None], concepts.flatten(0, 1))), torch.cat((nothing, rows + 1)))
+        branches = evaluate(denoiser, torch.cat((silent, concepts.flatten(0, 1))), torch.cat((nothing, rows + 1)))
         unconditional, conditional = branches[0], branches[1:]
-    return unconditional + torch.einsum("bk,kbhs->bhs", weights[own], conditional - unconditional)
+    if composition.columns is None:
+        return unconditional + torch.einsum("bk,kbhs->bhs", weights[own], conditional - unconditional)
+    by_column = weights[..., None] * composition.columns
+    return unconditional + torch.einsum("bks,kbhs->bhs", by_column[own], conditional - unconditional)
+
+
+def _adapted(
+    denoiser: Denoiser,
+    composition: Composition,
+    own: Tensor,
+    rows: Tensor,
+    evaluate: Callable[[Denoiser, Tensor, Tensor, Tensor], Tensor],
+    like: Tensor,
+) -> Tensor:
+    """Noise of the concepts' branches ``(K, batch, horizon, state)``, those of each adapter by the denoiser that it makes."""
+    number = _given(composition.adapter)[own].T  # (K, batch)
+    concepts = composition.embeddings.flatten(0, 1)
+    noise = like.expand(len(rows), *like.shape)
+    for this, adapter in enumerate((None, *composition.adapters)):
+        branch, sample = (number == this).nonzero(as_tuple=True)
+        if len(branch):
+            changed = denoiser if adapter is None else adapter(denoiser)
+            noise = noise.index_put((branch, sample), evaluate(changed, concepts, rows[branch, sample], sample))
+    return noise
 
 
 def parse_composition(text: str) -> list[tuple[str, float]]:

@@ -1,21 +1,26 @@
 """A learned concept and its file."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Self
 
+import torch
 from torch import Tensor
 
+from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import FORMAT, load_tensors, save_tensors
 
 KIND = "concept"
-VERSION = 2
-"""Of the file's form, where a concept has modes. Form 1 has none; a concept without modes is still written in it."""
-AXES = "mode component n"
-"""What the dimensions of the modes' embeddings are. A file names them, so that a later form may add one, such as time."""
+VERSIONS = (FORMAT, 2, 3)
+"""Of the file's form: 3 for a concept with knots or an adapter, 2 for one with modes, 1 for the paper's. Each is written in the
+first form that can hold it."""
+AXES = {2: "mode component n", 3: "mode component knot n"}
+"""What the dimensions of the modes' embeddings are in each form; those of a concept lack the first."""
+ADAPTER = "adapter/"
+"""Names of an adapter's tensors begin so."""
 
 
 @dataclass(frozen=True)
@@ -48,45 +53,69 @@ class Concept:
     """K embeddings and their guidance weights.
 
     Attributes:
-        embeddings: ``(K, n)`` float32 in the concept space of the pretrained model.
+        embeddings: ``(K, knots * n)`` float32 in the concept space of the pretrained model.
         weights: ``(K,)`` float32, omega.
         origin: where it comes from.
         modes: several sets of embeddings, which samples are generated from where the concept stands alone; ``None`` for the paper's
             form. Composing uses ``embeddings``.
+        knots: embeddings of a component, one after another, at even times of the plan; 1 is the paper's form.
+        adapter: what it changes of the denoiser; ``None`` for the paper's form.
     """
 
     embeddings: Tensor
     weights: Tensor
     origin: Origin
     modes: Modes | None = None
+    knots: int = 1
+    adapter: LowRank | None = None
 
     @property
     def composition(self) -> Composition:
         """What it is generated from, alone or composed with others."""
-        return Composition(self.embeddings, self.weights, modes=self.modes)
+        whole = Composition(self.embeddings, self.weights, modes=self.modes, knots=self.knots)
+        if self.adapter is None:
+            return whole
+        return replace(whole, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
+
+    def component(self, number: int) -> Composition:
+        """One of its components alone, by its number from 1."""
+        chosen = slice(number - 1, number)
+        return replace(self, embeddings=self.embeddings[chosen], weights=self.weights[chosen], modes=None).composition
 
     def parts(self) -> dict[str, tuple[float, Tensor]]:
-        """Weight and embedding ``(n,)`` of every component, and of those of every mode, by names such as 'mode 2, component 1'."""
+        """Weight and embedding ``(n,)`` of every knot of every component, and of those of every mode, by names such as
+        'component 1', 'mode 2, component 1' or 'component 1, knot 3'.
+        """
         sets = {"": (self.weights, self.embeddings)}
         if self.modes is not None:
             each = zip(self.modes.weights, self.modes.embeddings, strict=True)
             sets |= {f"mode {number}, ": own for number, own in enumerate(each, start=1)}
         return {
-            f"{name}component {number}": (weight, embedding)
+            f"{name}component {number}{knot}": (weight, embedding)
             for name, (weights, embeddings) in sets.items()
-            for number, (weight, embedding) in enumerate(zip(weights.tolist(), embeddings, strict=True), start=1)
+            for number, (weight, component) in enumerate(zip(weights.tolist(), embeddings, strict=True), start=1)
+            for knot, embedding in self.at_knots(component).items()
         }
+
+    def at_knots(self, component: Tensor) -> dict[str, Tensor]:
+        """The embeddings ``(n,)`` of a component ``(knots * n,)`` by the end of a name: empty of a single one, else ', knot 3'."""
+        each = component.unflatten(0, (self.knots, -1))
+        return {"" if self.knots == 1 else f", knot {knot}": own for knot, own in enumerate(each, start=1)}
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header."""
         tensors = {"embeddings": self.embeddings, "weights": self.weights}
         header = {**asdict(self.origin), "components": len(self.weights)}
-        if self.modes is None:
-            save_tensors(path, KIND, tensors, header)
-        else:
+        form = 3 if self.knots > 1 or self.adapter is not None else FORMAT if self.modes is None else 2
+        if self.modes is not None:
             tensors |= {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
-            header |= {"axes": AXES, "mixed": self.modes.mixed}
-            save_tensors(path, KIND, tensors, header, VERSION)
+            header |= {"mixed": self.modes.mixed}
+        if form in AXES:
+            header |= {"axes": AXES[form]}
+        if form == 3:
+            each = {name: values.unflatten(-1, (self.knots, -1)) for name, values in tensors.items() if "embeddings" in name}
+            tensors |= each | {f"{ADAPTER}{name}": own for name, own in (self.adapter.tensors() if self.adapter else {}).items()}
+        save_tensors(path, KIND, {name: own.contiguous() for name, own in tensors.items()}, header, form)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -95,18 +124,27 @@ class Concept:
         Raises:
             UserError: for a file that is missing, damaged or not a concept.
         """
-        tensors, header = load_tensors(path, KIND, (FORMAT, VERSION))
-        several = header["format"] == VERSION
-        keys = [*(field.name for field in fields(Origin)), *(("axes", "mixed") if several else ())]
+        tensors, header = load_tensors(path, KIND, VERSIONS)
+        form = header["format"]
+        several = form == 2 or "mixed" in header
+        keys = [*(field.name for field in fields(Origin)), *(("axes",) if form in AXES else ()), *(("mixed",) if several else ())]
         names = ["embeddings", "weights", *(("mode_embeddings", "mode_weights") if several else ())]
         missing = [key for key in keys if key not in header] + [name for name in names if name not in tensors]
         if missing:
             raise UserError(f"{path}: expected the keys of a concept, found none of {', '.join(missing)}")
-        if several and header["axes"] != AXES:
-            raise UserError(f"{path}: key 'axes': expected {AXES!r}, found {header['axes']!r}; a newer version may read it")
+        if form in AXES and header["axes"] != AXES[form]:
+            raise UserError(f"{path}: key 'axes': expected {AXES[form]!r}, found {header['axes']!r}; a newer version may read it")
+        knots, adapter = 1, None
+        if form == 3:
+            if (found := tensors["embeddings"]).dim() != 3:
+                raise UserError(f"{path}: key 'embeddings': expected shape (component, knot, n), found {tuple(found.shape)}")
+            knots = tensors["embeddings"].shape[1]
+            tensors |= {name: tensors[name].flatten(-2) for name in names if "embeddings" in name}
+            own = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
+            adapter = LowRank.from_tensors(own) if own else None
         modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], header["mixed"]) if several else None
         origin = Origin(**{field.name: header[field.name] for field in fields(Origin)})
-        return cls(tensors["embeddings"], tensors["weights"], origin, modes)
+        return cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)
 
 
 def load_concepts(paths: Iterable[str | Path]) -> list[Concept]:

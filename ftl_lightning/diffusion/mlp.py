@@ -27,6 +27,8 @@ class MLPDenoiser(nn.Module):
         initial_dim: features of what is observed.
     """
 
+    over_time = False
+
     def __init__(
         self,
         sizes: Sizes,

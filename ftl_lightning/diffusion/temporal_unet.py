@@ -20,6 +20,22 @@ def _convolution(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv1d(inputs, outputs, KERNEL, padding=KERNEL // 2), nn.GroupNorm(GROUPS, outputs), nn.Mish())
 
 
+def over_time(knots: Tensor, times: int) -> Tensor:
+    """Values at all times, linear between knots that are evenly spread from the first time to the last.
+
+    Args:
+        knots: ``(batch, knot, columns)``.
+        times: how many.
+
+    Returns:
+        ``(batch, columns, times)``, or ``(batch, columns, 1)`` of a single knot.
+    """
+    values = knots.transpose(1, 2)
+    if values.shape[2] == 1:
+        return values
+    return functional.interpolate(values, size=times, mode="linear", align_corners=True)
+
+
 class ResidualBlock(nn.Module):
     """Two convolutions over time; the condition acts between them.
 
@@ -37,8 +53,8 @@ class ResidualBlock(nn.Module):
         self.skip = nn.Conv1d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """``x (batch, inputs, time)`` and ``condition (batch, condition)`` to ``(batch, outputs, time)``."""
-        hidden, own = self.first(x), self.condition(condition)[..., None]
+        """``x (batch, inputs, time)`` and ``condition (batch, knot, condition)`` to ``(batch, outputs, time)``."""
+        hidden, own = self.first(x), over_time(self.condition(condition), x.shape[2])
         if self.film:
             scale, shift = own.chunk(2, dim=1)
             hidden = hidden * (1 + scale) + shift
@@ -47,6 +63,11 @@ class ResidualBlock(nn.Module):
         hidden = self.second(hidden)
         out: Tensor = hidden + self.skip(x)
         return out
+
+
+def _bias(layer: nn.Conv1d) -> Tensor:
+    assert layer.bias is not None
+    return layer.bias
 
 
 class Level(nn.Module):
@@ -75,11 +96,14 @@ class TemporalUNet(nn.Module):
         broadcast: the features of what is observed are also channels of the input at every time; false for the paper's form.
         clock: channels that tell a state's place in the plan, in addition to the states; even, 0 for the paper's form, whose
             convolutions see it by the padding at the ends alone.
+        skip: what the first level makes of the input also goes to the output directly, at full resolution; false for the paper's
+            form, all of which goes through the middle.
 
     Raises:
         UserError: for a horizon that cannot be halved once a level.
     """
 
+    over_time = True
     clock: Tensor
 
     def __init__(
@@ -91,6 +115,7 @@ class TemporalUNet(nn.Module):
         film: bool = False,
         broadcast: bool = False,
         clock: int = 0,
+        skip: bool = False,
     ) -> None:
         super().__init__()
         factor = 2 ** (len(multipliers) - 1)
@@ -103,7 +128,7 @@ class TemporalUNet(nn.Module):
             raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
         if clock % 2:
             raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
-        self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
+        self.width, self.broadcast, self.concept_dim = width, broadcast and sizes.vector_dim > 0, sizes.concept_dim
         angle = torch.linspace(0, math.pi, sizes.horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
@@ -122,6 +147,10 @@ class TemporalUNet(nn.Module):
         )
         self.grow = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, stride=2, padding=1) for width in channels[-2::-1])
         self.out = nn.Sequential(_convolution(width, width), nn.Conv1d(width, sizes.state_dim, 1))
+        self.skip = nn.Conv1d(width, width, 1) if skip else None
+        if self.skip is not None:
+            nn.init.zeros_(self.skip.weight)
+            nn.init.zeros_(_bias(self.skip))
 
     def observe(self, vector: Tensor | None) -> Context:
         """What is read once a plan of the observed vectors ``(batch, m)``, normalised; nothing where there are none."""
@@ -133,17 +162,21 @@ class TemporalUNet(nn.Module):
         Args:
             x: noisy plan ``(batch, horizon, state)``, normalised.
             t: ``(batch,)`` int64.
-            concepts: ``(concept, n)``, the different concepts in the batch, in the model's concept space.
+            concepts: ``(concept, knots * n)``, the different concepts in the batch, in the model's concept space. What a concept
+                adds to a layer is computed at each knot and linear between them.
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
             context: what :meth:`observe` read.
         """
-        parts = [self.time(sinusoidal_embedding(t, self.width)), self.concept(concepts)[index]]
+        each = concepts.unflatten(-1, (-1, self.concept_dim))  # (concept, knot, n)
+        knots, times = each.shape[1], x.shape[1]
+        parts = [self.time(sinusoidal_embedding(t, self.width))[:, None].expand(-1, knots, -1), self.concept(each)[index]]
         if self.initial is not None:
-            parts.append(self.initial.attend(context, concepts[index]))
+            every = context if knots == 1 else tuple(part.repeat_interleave(knots, dim=0) for part in context)
+            parts.append(self.initial.attend(every, each[index].flatten(0, 1)).unflatten(0, (-1, knots)))
         condition = functional.mish(torch.cat(parts, dim=-1))
         inputs = [x.transpose(1, 2), self.clock.expand(len(x), -1, -1)]
         if self.broadcast:
-            inputs.append(parts[-1][..., None].expand(-1, -1, x.shape[1]))
+            inputs.append(over_time(parts[-1], times).expand(-1, -1, times))
         hidden = torch.cat(inputs, dim=1)
         kept = []
         for level, shrink in zip(self.down, [*self.shrink, nn.Identity()], strict=True):
@@ -152,5 +185,7 @@ class TemporalUNet(nn.Module):
         hidden = self.middle(hidden, condition)
         for level, grow, across in zip(self.up, self.grow, kept[:0:-1], strict=True):
             hidden = grow(level(torch.cat((hidden, across), dim=1), condition))
+        if self.skip is not None:
+            hidden = hidden + self.skip(kept[0])
         out: Tensor = self.out(hidden).transpose(1, 2)
         return out

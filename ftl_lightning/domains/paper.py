@@ -5,7 +5,9 @@ from dataclasses import dataclass
 OURS = "FTL-IGM"
 """The name of the paper's method."""
 WITH_MODES = " with modes"
-"""Added to the name of a method whose concepts have modes, which the paper's have not."""
+WITH_KNOTS = " over time"
+WITH_ADAPTER = " with adapter"
+"""Added to the name of a method whose concepts have modes, several knots or an adapter, which the paper's have not."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,14 @@ from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row
 from ftl_lightning.tensor_file import content_hash, file_hash
 from ftl_lightning.version import __version__
 
-LATER = (("modes", 1), ("mode_samples", 8), ("tolerance", None))
+LATER = (
+    ("modes", 1),
+    ("mode_samples", 8),
+    ("tolerance", None),
+    ("knots", 1),
+    ("adapter", 0),
+    ("adapter_learning_rate", 1e-3),
+)
 """Settings that came later, at the values under which everything is as before: they are left out, so that hashes stay."""
 
 

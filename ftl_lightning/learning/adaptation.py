@@ -1,10 +1,11 @@
 """Adapting a frozen pretrained model to new concepts from a few demonstrations, whatever the method."""
 
+import functools
+import operator
 from abc import ABC, abstractmethod
 from pathlib import Path
 
 import lightning.pytorch as pl
-import torch
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
@@ -140,16 +141,15 @@ class Adaptation(pl.LightningModule, ABC):
         if len(task.learned) == 1 and task.component is None and not (task.texts or task.without):
             found = self._found.get(task.learned[0])
             return None if found is None else found.composition.to(self.device)
-        embeddings = [self.model.concept(text) for text in (*task.texts, *task.without)]
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
+        embeddings = [self.model.concept(text)[None] for text in (*task.texts, *task.without)]
+        parts = [Composition(text, text.new_tensor([weight])) for text, weight in zip(embeddings, weights, strict=True)]
         for name in task.learned:
             concept = self._found.get(name)
             if concept is None or (task.component or 0) > len(concept.weights):
                 return None
-            chosen = slice(None) if task.component is None else slice(task.component - 1, task.component)
-            embeddings += concept.embeddings[chosen].to(self.device)
-            weights += concept.weights[chosen].tolist()
-        return Composition(torch.stack(embeddings), torch.tensor(weights, device=self.device))
+            parts.append((concept.composition if task.component is None else concept.component(task.component)).to(self.device))
+        return functools.reduce(operator.add, parts)
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
         """What a concept was learned from."""

@@ -213,6 +213,11 @@ class ConceptModel(nn.Module, ABC):
         return (self.config.view,) if self.config.view else ()
 
     @property
+    def over_time(self) -> bool:
+        """Whether a concept may vary over a plan, with several knots."""
+        return False
+
+    @property
     def window(self) -> int:
         """States of a demonstration that are learned from together."""
         return self.config.horizon

@@ -69,6 +69,7 @@ class GenerativeModel(TextConceptModel):
     name = OURS
     Config = DiffusionConfig
     config: DiffusionConfig
+    denoiser: nn.Module
     alpha_bar: Tensor
 
     def __init__(
@@ -87,6 +88,11 @@ class GenerativeModel(TextConceptModel):
     def traits(self) -> tuple[str, ...]:
         encoder = self.config.denoiser_args.get("initial_encoder")
         return (*super().traits, *([encoder] if encoder else []))
+
+    @property
+    def over_time(self) -> bool:
+        found: bool = getattr(diffusion, self.config.denoiser).over_time
+        return found
 
     @property
     def max_steps(self) -> int:

@@ -4,13 +4,14 @@ import logging
 import math
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
+from ftl_lightning.concepts.adapter import LowRank, adaptable
 from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -18,6 +19,7 @@ from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
+from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.stopping import Stopping
 from ftl_lightning.seeding import generator
 
@@ -56,6 +58,11 @@ class InversionSettings:
             :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not
             count; of fewer steps than a round has, the last one does. ``None`` for all
             steps, the rate decaying to 0.
+        knots: embeddings of a component at even times of the plan, between which the denoiser interpolates; 1 is the paper's form.
+            For denoisers that see time, such as the temporal U-Net.
+        adapter: rank of a low-rank change of the denoiser in the concept's own branches (LoRA), learned beside the embeddings; 0,
+            the paper's form, for none.
+        adapter_learning_rate: of that.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
@@ -79,12 +86,15 @@ class InversionSettings:
     mode_samples: int = 8
     modes: int | Literal["each", "auto"] = 1
     tolerance: float | None = None
+    knots: int = 1
+    adapter: int = 0
+    adapter_learning_rate: float = 1e-3
     loss: str = "epsilon"
     timestep_power: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("components", "restarts", "samples", "mode_samples"):
+        for name in ("components", "restarts", "samples", "mode_samples", "knots"):
             if (value := getattr(self, name)) < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
         if isinstance(self.modes, int) and self.modes < 1:
@@ -93,6 +103,10 @@ class InversionSettings:
             raise UserError(f"model.modes: expected a number, 'each' or 'auto', found {self.modes!r}")
         if self.tolerance is not None and not 0 <= self.tolerance < 1:
             raise UserError(f"model.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
+        if self.adapter < 0:
+            raise UserError(f"model.adapter: expected 0 (none) or a rank, found {self.adapter}")
+        if self.adapter and (self.modes != 1 or self.tolerance is not None):
+            raise UserError("model.adapter: expected model.modes 1 and model.tolerance null beside it, found others")
         if not 0 <= self.off_span <= 1:
             raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {self.off_span}")
         if self.timestep_power < 1:
@@ -119,8 +133,8 @@ class _Run:
 class Inversion(nn.Module):
     """K embeddings and their weights for every concept of some demonstrations, all in one batch.
 
-    Its only parameters are ``embeddings (run, K, n)`` and, unless omega is fixed, ``weights (run, K)``. A run is a concept, or a
-    mode of one, and a restart. The model is frozen and no part of it.
+    Its only parameters are ``embeddings (run, K, knots * n)`` and, unless omega is fixed, ``weights (run, K)``; with an adapter,
+    its factors for each run too. A run is a concept, or a mode of one, and a restart. The model is frozen and no part of it.
 
     Args:
         model: that concepts are learned through.
@@ -151,13 +165,21 @@ class Inversion(nn.Module):
         shape = (settings.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
         starts = [torch.randn(shape, generator=draw) for draw in draws]
-        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.restarts]])
+        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.restarts]]).repeat(1, 1, settings.knots)
         self.embeddings = nn.Parameter(settings.initial_spread * start)
         runs = (len(start), settings.components)
         if settings.omega == "learned":
             self.weights = nn.Parameter(torch.full(runs, float(settings.initial_omega)))
         else:
             self.register_buffer("weights", torch.full(runs, float(settings.omega)), persistent=False)
+        # Factors of an adapter for every run: of each weight ``up (run, outputs, rank)``, which starts at zero, and ``down``.
+        self.factors = nn.ParameterList()
+        sizes = adaptable(model.denoiser) if settings.adapter and isinstance(model, GenerativeModel) else {}
+        self._names = list(sizes)
+        for outputs, inputs in sizes.values():
+            down = torch.stack([torch.randn(settings.adapter, inputs, generator=draws[run.concept]) for run in self.runs])
+            self.factors.append(torch.zeros(len(self.runs), outputs, settings.adapter))
+            self.factors.append(down / inputs**0.5)
         self.stopping: Stopping | None = None
         if settings.tolerance is not None:
             self.stopping = Stopping(self.embeddings, self.weights, settings.tolerance)
@@ -178,11 +200,17 @@ class Inversion(nn.Module):
         return self._model[0]
 
     def parametrised(self, embeddings: Tensor) -> Tensor:
-        """Embeddings ``(run, K, n)`` after their part off the span is scaled."""
+        """Embeddings ``(run, K, knots * n)`` after their part off the span is scaled."""
         if self.settings.off_span == 1:
             return embeddings
-        inside = embeddings @ self.basis.T @ self.basis
-        return inside + self.settings.off_span * (embeddings - inside)
+        each = embeddings.unflatten(-1, (self.settings.knots, -1))
+        inside = each @ self.basis.T @ self.basis
+        return (inside + self.settings.off_span * (each - inside)).flatten(-2)
+
+    def adapter(self, run: int) -> LowRank | None:
+        """A run's adapter; ``None`` where there are none."""
+        factors = [factor[run] for factor in self.factors]
+        return LowRank(dict(zip(self._names, zip(factors[::2], factors[1::2], strict=True), strict=True))) if factors else None
 
     def _losses(self, samples: int, draw: torch.Generator, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
         """The model's loss (ours is Eq. 2) for every sample ``(run, samples)``. Runs share what is random in it and, as a share of
@@ -191,7 +219,7 @@ class Inversion(nn.Module):
         Args:
             samples: noised demonstrations of each run, evenly spread over its own.
             draw: of noise, timesteps and windows.
-            embeddings: of every run ``(run, K, n)``.
+            embeddings: of every run ``(run, K, knots * n)``.
             weights: of every run ``(run, K)``.
             chosen: which runs ``(run,)`` of bool; ``None`` for all.
         """
@@ -207,7 +235,12 @@ class Inversion(nn.Module):
         starts = self.demonstrations.starts(rows, share, model.domain.plans.exponent(window), window)
         states, observed = self.demonstrations.windows(rows, starts, window)
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
-        composition = Composition(self.parametrised(embeddings), weights)
+        composition = Composition(self.parametrised(embeddings), weights, knots=self.settings.knots)
+        if self.factors:
+            own = torch.arange(len(self.runs), device=device) if chosen is None else chosen.nonzero()[:, 0]
+            adapters = tuple(adapter for run in own.tolist() if (adapter := self.adapter(run)))
+            number = torch.arange(1, len(own) + 1, device=device)[:, None].expand_as(weights)
+            composition = replace(composition, adapters=adapters, adapter=number)
         return model.losses(states, seen, composition, draws, self.settings.loss)
 
     def losses(self, samples: int, draw: torch.Generator, chosen: Tensor | None = None) -> Tensor:
@@ -254,7 +287,8 @@ class Inversion(nn.Module):
         """Each parameter with its learning rate."""
         learned = isinstance(self.weights, nn.Parameter)
         weights = [(self.weights, self.settings.weight_learning_rate)] if learned else []
-        return [(self.embeddings, self.settings.learning_rate), *weights]  # type: ignore[list-item]
+        factors = [(factor, self.settings.adapter_learning_rate) for factor in self.factors]
+        return [(self.embeddings, self.settings.learning_rate), *weights, *factors]
 
     def optimizer(self, steps: int) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Adam, weights with a rate of their own, and its cosine decay over so many steps, or no decay where runs are stopped."""
@@ -285,6 +319,8 @@ class Inversion(nn.Module):
                 weights[whole].cpu(),
                 origin(self.model, self.demonstrations, name, kind, losses[whole].item()),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
+                self.settings.knots,
+                adapter.copied() if (adapter := self.adapter(whole)) else None,
             )
         return found
 
@@ -309,6 +345,10 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
         raise UserError(
             f"model.off_span: expected 1 (free) for {model.name}, whose concepts are no texts, found {settings.off_span}"
         )
+    if settings.knots > 1 and not model.over_time:
+        raise UserError(f"model.knots: expected 1 for this model, whose concepts do not vary over a plan, found {settings.knots}")
+    if settings.adapter and not isinstance(model, GenerativeModel):
+        raise UserError(f"model.adapter: expected 0 (none) for {model.name}, found {settings.adapter}")
     pretrained = model.config.training.get("model", {}).get("loss", settings.loss)
     if pretrained != settings.loss:
         _LOG.warning("model.loss: the model was pretrained with %r; with %r concepts are learned worse", pretrained, settings.loss)

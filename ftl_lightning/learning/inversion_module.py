@@ -8,7 +8,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.domains.paper import WITH_MODES
+from ftl_lightning.domains.paper import WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.baselines.additive import AdditiveModel
@@ -27,7 +27,7 @@ class InversionModule(Adaptation):
         pretrained: folder of the pretrained model.
         components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
         initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
-        mode_samples, modes, tolerance, loss, timestep_power, seed: likewise.
+        mode_samples, modes, tolerance, knots, adapter, adapter_learning_rate, loss, timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -52,6 +52,9 @@ class InversionModule(Adaptation):
         mode_samples: int = 8,
         modes: int | Literal["each", "auto"] = 1,
         tolerance: float | None = None,
+        knots: int = 1,
+        adapter: int = 0,
+        adapter_learning_rate: float = 1e-3,
         loss: str = "epsilon",
         timestep_power: float = 1.0,
         training_omega: float | None = None,
@@ -66,16 +69,21 @@ class InversionModule(Adaptation):
 
     @property
     def method(self) -> str:
-        """The paper's form has one set of embeddings; what has modes stands beside it in tables."""
-        name = super().method
-        return name if self.settings.modes == 1 else f"{name}{WITH_MODES}"
+        """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
+        modes, knots, adapter = (self.settings.modes != 1, self.settings.knots > 1, self.settings.adapter > 0)
+        forms = [name for name, has in ((WITH_MODES, modes), (WITH_KNOTS, knots), (WITH_ADAPTER, adapter)) if has]
+        return "".join((super().method, *forms))
 
     @property
     def variant(self) -> str:
         off_span, weight = self.settings.off_span, self.hparams["training_omega"]
         form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
         modes = [] if self.settings.modes in (1, "auto") else [f"modes: {self.settings.modes}"]
-        return ", ".join([*self.model.traits, form, *modes, *([] if weight is None else [f"training weight {weight:g}"])])
+        knots = [f"{self.settings.knots} knots"] if self.settings.knots > 1 else []
+        adapter = [f"rank {self.settings.adapter}"] if self.settings.adapter else []
+        return ", ".join(
+            [*self.model.traits, form, *modes, *knots, *adapter, *([] if weight is None else [f"training weight {weight:g}"])]
+        )
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""
@@ -129,6 +137,8 @@ class InversionModule(Adaptation):
             "components": self.settings.components,
             "restarts": self.settings.restarts,
             **({} if self.settings.modes == 1 else {"modes": self.settings.modes}),
+            **({} if self.settings.knots == 1 else {"knots": self.settings.knots}),
+            **({} if self.settings.adapter == 0 else {"adapter": self.settings.adapter}),
             **({} if self.settings.tolerance is None else {"tolerance": self.settings.tolerance}),
             "omega": self.settings.omega,
         }

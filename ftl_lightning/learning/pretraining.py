@@ -2,9 +2,10 @@
 
 import copy
 import math
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -266,6 +267,48 @@ def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
             )
 
 
+@dataclass(frozen=True)
+class Codes:
+    """Rough codes of behaviour, which are added to the texts of some samples in pretraining.
+
+    A code is a random linear projection of how far the plan has come from its first state, at each of several knots, with noise. It
+    is as long as a text's embedding on average, and half of the samples with a code have no text.
+
+    Attributes:
+        share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept.
+        knots: times.
+        size: numbers of a code at a knot.
+        noise: standard deviation of what is added to the numbers, which have unit variance.
+    """
+
+    share: float
+    knots: int
+    size: int
+    noise: float
+
+    def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
+        """Concepts ``(batch, knots * n)``.
+
+        Args:
+            texts: ``(batch, n)``, the empty one where it was removed.
+            removed: where it was ``(batch,)``.
+            clean: plans ``(batch, horizon, state)``, normalised.
+            draw: of what is random.
+        """
+        count, width, device = *texts.shape, clean.device
+        times = torch.linspace(0, clean.shape[1] - 1, self.knots, device=device).round().long()
+        fixed = generator("cpu", zlib.crc32(b"codes"))
+        mixing = torch.randn(clean.shape[2], self.size, generator=fixed).to(device)
+        directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
+        way = (clean[:, times] - clean[:, :1]) @ mixing  # (batch, knot, size)
+        numbers = way / way.square().mean().sqrt().clamp(min=1e-6)
+        numbers = numbers + self.noise * torch.randn(numbers.shape, generator=draw, device=device)
+        told = (torch.rand(count, generator=draw, device=device) < self.share) & ~removed
+        alone = told & (torch.rand(count, generator=draw, device=device) < 0.5)
+        text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
+        return (text[:, None] + told[:, None, None] * (numbers @ directions)).flatten(1)
+
+
 class PretrainingModule(Pretraining):
     """Trains a denoiser on a domain's pairs of behaviour and concept.
 
@@ -281,6 +324,9 @@ class PretrainingModule(Pretraining):
             which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
             weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        code_share: of the samples are also told a rough code of their own behaviour, which varies over the window, see
+            :class:`Codes`: so the network has seen concepts that do, and concepts that no text names. 0 is the paper's form.
+        code_knots, code_size, code_noise: see :class:`Codes`.
         compile: compile the denoiser for training (worth it on GPUs).
     """
 
@@ -302,6 +348,10 @@ class PretrainingModule(Pretraining):
         loss: str = "epsilon",
         view: str = "",
         perturb: bool = False,
+        code_share: float = 0.0,
+        code_knots: int = 8,
+        code_size: int = 16,
+        code_noise: float = 0.3,
         compile: bool = False,
         output: str | None = None,
         seed: int = 0,
@@ -309,6 +359,9 @@ class PretrainingModule(Pretraining):
         super().__init__(learning_rate, warmup_steps, weight_decay, ema_decay, guidance, view, perturb, output, seed)
         self.save_hyperparameters()
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
+        if not 0 <= code_share <= 1:
+            raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
+        self.codes = Codes(code_share, code_knots, code_size, code_noise) if code_share else None
 
     def build(
         self,
@@ -338,6 +391,8 @@ class PretrainingModule(Pretraining):
         removed = torch.rand(count, generator=draw, device=self.device) < dropout
         concepts = torch.cat((model.empty[None], model.training_embeddings))
         index = torch.where(removed, 0, batch.concepts + 1)
+        if self.codes is not None and model.training:
+            concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
         t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
         noise = torch.randn(clean.shape, generator=draw, device=self.device)
         losses = denoising_loss(lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar)

@@ -74,7 +74,7 @@ def written(form: int, without: str = "", **changes: object) -> str:
     assert own.modes is not None
     tensors = {"embeddings": own.embeddings, "weights": own.weights}
     tensors |= {"mode_embeddings": own.modes.embeddings, "mode_weights": own.modes.weights}
-    told = {**ORIGIN.__dict__, "axes": AXES, "mixed": False, **changes}
+    told = {**ORIGIN.__dict__, "axes": AXES[2], "mixed": False, **changes}
     kept = {name: tensor for name, tensor in tensors.items() if name != without}
     save_tensors("c.safetensors", KIND, kept, {key: value for key, value in told.items() if key != without}, form)
     return "c.safetensors"
@@ -87,7 +87,7 @@ def written(form: int, without: str = "", **changes: object) -> str:
             {"form": 2, "axes": "mode time component n"},
             "key 'axes': expected 'mode component n', found 'mode time component n'; a newer version may read it",
         ),
-        ({"form": 3}, "key 'format': expected 1 or 2, found 3; it is of another version"),
+        ({"form": 4}, "key 'format': expected 1 or 2 or 3, found 4; it is of another version"),
         ({"form": 2, "without": "axes"}, "expected the keys of a concept, found none of axes"),
         ({"form": 2, "without": "mode_weights"}, "expected the keys of a concept, found none of mode_weights"),
         ({"form": 1, "without": "embeddings"}, "expected the keys of a concept, found none of embeddings"),

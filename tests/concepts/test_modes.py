@@ -29,8 +29,8 @@ def concept(own: Modes) -> Composition:
 
 def samples(own: Modes, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Embeddings ``(count, 2, 3)`` and weights ``(count, 2)`` of every sample."""
-    rows, row = own.draw(count, torch.Generator().manual_seed(seed))
-    return rows.embeddings[row], rows.weights[row]
+    embeddings, weights, row = own.draw(count, torch.Generator().manual_seed(seed))
+    return embeddings[row], weights[row]
 
 
 def test_a_drawn_sample_is_generated_from_one_of_the_modes_with_its_own_weights() -> None:
