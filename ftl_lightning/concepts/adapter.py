@@ -1,0 +1,60 @@
+"""Low-rank adapters (LoRA, Hu et al., 2022): what a concept changes of the denoiser, in its own branch of the formula alone."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.concepts.composition import Denoiser
+
+
+@dataclass(frozen=True, eq=False)
+class LowRank:
+    """Adds ``up @ down`` to some weights of a network.
+
+    Attributes:
+        factors: ``up (outputs, rank)`` and ``down (rank, everything else)`` of each weight, by the parameter's name.
+    """
+
+    factors: Mapping[str, tuple[Tensor, Tensor]]
+
+    def __call__(self, denoiser: Denoiser) -> Denoiser:
+        """The network with changed weights; its own stay as they are, and gradients reach the factors."""
+        assert isinstance(denoiser, nn.Module)
+        changed = {name: self.changed(name, denoiser.get_parameter(name)) for name in self.factors}
+        return lambda *inputs: torch.func.functional_call(denoiser, changed, inputs)
+
+    def changed(self, name: str, weight: Tensor) -> Tensor:
+        """A weight with what is added to it."""
+        up, down = (factor.to(weight.device) for factor in self.factors[name])
+        return weight + (up @ down).reshape(weight.shape)
+
+    def __len__(self) -> int:
+        """How many numbers it holds."""
+        return sum(up.numel() + down.numel() for up, down in self.factors.values())
+
+    def copied(self) -> "LowRank":
+        """The same on the processor, apart from what is being learned."""
+        return LowRank(
+            {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
+        )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a file, by name."""
+        return {f"{name}/{kind}": factor for name, both in self.factors.items() for kind, factor in zip(KINDS, both, strict=True)}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "LowRank":
+        """The inverse of :meth:`tensors`."""
+        names = dict.fromkeys(name.rpartition("/")[0] for name in tensors)
+        return cls({name: (tensors[f"{name}/{KINDS[0]}"], tensors[f"{name}/{KINDS[1]}"]) for name in names})
+
+
+KINDS = ("up", "down")
+
+
+def adaptable(network: nn.Module) -> dict[str, tuple[int, int]]:
+    """The weights that an adapter changes, all matrices and convolutions, with the sizes ``(outputs, everything else)`` of each."""
+    weights = {name: weight for name, weight in network.named_parameters() if weight.dim() > 1}
+    return {name: (len(weight), weight[0].numel()) for name, weight in weights.items()}
