@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ftl_lightning.demonstrations.container import Demonstrations, padded
 from ftl_lightning.demonstrations.features import Feature, InitialStates
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.recordings import Recordings, read_folder
+from ftl_lightning.domains.mocap.recordings import WHERE, Recordings, read_folder
 from ftl_lightning.domains.mocap.segments import Segment
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints, mirrored
 from ftl_lightning.domains.mocap.standing import standing_poses
@@ -75,8 +76,6 @@ class Recorded:
 
     @property
     def _folder(self) -> tuple[Recordings, tuple[Segment, ...]]:
-        from ftl_lightning.domains.mocap.recordings import WHERE
-
         if self.root is None:
             raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
         return read_folder(self.root)
@@ -84,9 +83,9 @@ class Recorded:
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All pieces of trials of the training concepts, and in ``'train'`` their mirror images.
 
-        How many there are is the recordings' matter, and so ``count`` and ``seed`` do not matter. Of a concept with three trials or
-        more, the last one, the eleventh last and so on are for validation, whole. A mirror image is of the description with left and
-        right exchanged; where that is no training concept there is none.
+        How many there are is the recordings' matter, and so ``count`` and ``seed`` do not matter. Of a concept with three trials
+        or more, the last one, the eleventh last and so on are for validation, whole. A mirror image is of the description with left
+        and right exchanged; where that is no training concept there is none.
 
         Raises:
             UserError: if the folder has no trial for it.
@@ -144,7 +143,6 @@ class Recorded:
             UserError: if there is none.
         """
         subjects = self.recordings.subject
-        held_out = [piece.states for piece in self._pieces if piece.trial in self._validation]
         held_out = [
             piece.states for piece in self._pieces if piece.trial in self._validation and subjects[piece.trial] not in DEMONSTRATORS
         ]
@@ -208,11 +206,8 @@ class Recorded:
 
 def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[Tensor]:
     """Stretches of a trial ``(frame, 42)`` without glitches, of at least a window each; longer ones in parts that overlap."""
-    joints = states.reshape(len(states), -1, 3)
-    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1, initial=0) * FPS
-    ends = [0, *(np.flatnonzero(speed > MAX_SPEED) + 1).tolist(), len(states)]
     found = []
-    for start, stop in zip(ends, ends[1:], strict=False):
+    for start, stop in pairwise((0, *glitches(states), len(states))):
         if stop - start < HORIZON:
             continue
         step = stop - start if longest is None else longest - HORIZON + 1
@@ -220,6 +215,13 @@ def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[T
             last = stop if longest is None else min(first + longest, stop)
             found.append(torch.from_numpy(states[first:last].copy()))
     return found
+
+
+def glitches(states: NDArray[np.float32]) -> list[int]:
+    """Frames of a trial ``(frame, 42)`` that a joint reaches faster than :data:`MAX_SPEED`."""
+    joints = states.reshape(len(states), -1, 3)
+    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1, initial=0) * FPS
+    return (np.flatnonzero(speed > MAX_SPEED) + 1).tolist()
 
 
 def hang_down(poses: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, HEAD, JOINTS, L_ANKLE, L_HIP, NECK, R_ANKLE, R_HIP
+from ftl_lightning.domains.mocap.skeleton import COLUMNS
 
 _RIGHT_SIDE = (
     (0.09, 0.0, 0.0),
