@@ -25,9 +25,10 @@ COMMANDS = {
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
+    "prepare": "read your own copy of a domain's recordings, which do not ship",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"generate", "encode"}
+POSITIONAL = {"generate", "encode", "prepare"}
 """Commands whose required arguments are given by position."""
 
 

@@ -1,0 +1,25 @@
+"""The domain object: what the rest of the package knows of human motion."""
+
+from pathlib import Path
+
+from ftl_lightning.domains.domain import Concepts, Domain, Plans, deferred
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, HORIZON
+from ftl_lightning.domains.mocap.source import NAME, OBSERVED, Recorded
+from ftl_lightning.domains.mocap.tasks import SUITES, TRAINING_CONCEPTS, reads
+
+DOMAIN = Domain(
+    name=NAME,
+    plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False),
+    concepts=Concepts(
+        training=TRAINING_CONCEPTS,
+        suites=SUITES,
+        reads=reads,
+        table=Path(__file__).parent / "embeddings.safetensors",
+    ),
+    source=Recorded,
+    observed=OBSERVED,
+    # metrics: of the judge.
+    # show: films of stick figures.
+    prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
+    fresh=False,  # there is no more behaviour than what was recorded
+)

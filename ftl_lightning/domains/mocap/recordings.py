@@ -1,0 +1,138 @@
+"""The file of recordings that a domain folder holds, and where the actions in them are.
+
+``recordings.npz`` is what ``prepare`` writes. A folder that holds ``cmu14_trials.npz``, of the same content, will do as well.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segments, shipped_segments
+from ftl_lightning.domains.mocap.skeleton import JOINTS
+from ftl_lightning.domains.mocap.tasks import cleaned
+from ftl_lightning.errors import UserError
+from ftl_lightning.tensor_file import atomic
+
+FILE = "recordings.npz"
+FILES = (FILE, "cmu14_trials.npz")
+"""Names that a file of recordings may have, the first one found is read."""
+WHERE = (
+    "get the CMU motion capture database (mocap.cs.cmu.edu, the files of allasfamc.zip) and run: "
+    "python -m ftl_lightning prepare mocap --root FOLDER"
+)
+THANKS = (
+    "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."
+)
+"""What the database asks those who use it to say."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Trials, one after another.
+
+    Attributes:
+        positions: ``(frame, 14, 3)`` float32, metres, see :mod:`ftl_lightning.domains.mocap.skeleton`.
+        root: ``(frame, 4)`` float32: where the middle of the hips was (x, y, z in metres) and its yaw in radians.
+        offsets: ``(trial + 1,)`` int64: trial i is the frames ``offsets[i]:offsets[i + 1]``.
+        trial_id: such as ``13_29``.
+        label: description of each, cleaned.
+        kind: how each was made, such as ``asf_amc``.
+        subject: who moves, such as ``13``.
+    """
+
+    positions: NDArray[np.float32]
+    root: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    trial_id: tuple[str, ...]
+    label: tuple[str, ...]
+    kind: tuple[str, ...]
+    subject: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.trial_id)
+
+    def trial(self, number: int) -> NDArray[np.float32]:
+        """States ``(frame, 42)`` of one."""
+        return self.positions[self.offsets[number] : self.offsets[number + 1]].reshape(-1, 3 * len(JOINTS))
+
+    def save(self, path: Path) -> None:
+        """Write them, whole or not at all."""
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(
+                file,
+                positions=self.positions,
+                root=self.root,
+                offsets=self.offsets,
+                trial_id=np.array(self.trial_id),
+                label=np.array(self.label),
+                kind=np.array(self.kind),
+                subject=np.array(self.subject),
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read them.
+
+        Raises:
+            UserError: naming file and key, where it is damaged or of another content.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                found = {name: archive[name] for name in archive.files if name in _KEYS}
+        except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+            raise UserError(f"{path}: expected recordings, found a damaged or foreign file ({error}); {WHERE}") from error
+        found.setdefault("subject", np.array([str(trial).split("_")[0] for trial in found.get("trial_id", ())]))
+        _check(path, found)
+        texts = {key: tuple(map(str, found[key])) for key in _TEXTS}
+        return cls(
+            np.ascontiguousarray(found["positions"], dtype=np.float32),
+            np.ascontiguousarray(found["root"], dtype=np.float32),
+            found["offsets"].astype(np.int64),
+            **texts | {"label": tuple(map(cleaned, texts["label"]))},
+        )
+
+
+_TEXTS = ("trial_id", "label", "kind", "subject")
+_KEYS = ("positions", "root", "offsets", *_TEXTS)
+
+
+def _check(path: Path, found: Mapping[str, Any]) -> None:
+    if missing := [key for key in _KEYS if key not in found]:
+        raise UserError(f"{path}: key {missing[0]!r}: expected it in a file of recordings, found none; {WHERE}")
+    trials = len(found["trial_id"])
+    frames = len(found["positions"])
+    shapes = {"positions": (frames, len(JOINTS), 3), "root": (frames, 4), "offsets": (trials + 1,)}
+    for key, expected in (shapes | dict.fromkeys(_TEXTS, (trials,))).items():
+        if found[key].shape != expected:
+            raise UserError(f"{path}: key {key!r}: expected shape {expected}, found {found[key].shape}")
+    offsets = found["offsets"]
+    if not trials or offsets[0] != 0 or offsets[-1] != frames or (np.diff(offsets) < 1).any():
+        raise UserError(f"{path}: key 'offsets': expected ends of one trial or more, growing from 0 to {frames}, found others")
+    for key in ("positions", "root"):
+        if found[key].dtype.kind != "f" or not np.isfinite(found[key]).all():
+            raise UserError(f"{path}: key {key!r}: expected finite numbers, found others")
+
+
+@cache
+def read_folder(root: Path) -> tuple[Recordings, tuple[Segment, ...]]:
+    """Recordings of a folder, and the segments of single actions in them: the user's own ``segments.csv``, else the shipped ones.
+
+    Raises:
+        UserError: where there is no folder, no recordings in it, or damaged ones.
+    """
+    if not root.is_dir():
+        raise UserError(
+            f"data.root: expected a folder of recordings, found {'a file' if root.exists() else 'nothing'} at {root}; {WHERE}"
+        )
+    path = next((root / name for name in FILES if (root / name).is_file()), None)
+    if path is None:
+        raise UserError(f"{root}: expected {FILE}, found {'other files' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")
+    own = root / SEGMENTS
+    return Recordings.load(path), read_segments(own) if own.is_file() else shipped_segments()

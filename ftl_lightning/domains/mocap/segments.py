@@ -1,0 +1,71 @@
+"""Where single actions are in trials that show several: boundaries that people set by hand.
+
+The shipped ones are those of M. C. Hughes (mocap6dataset, ``truelabels``: one label a tenth of a second; subjects 13 and 14) and of
+F. Zhou (aca, ``moc``: the middle value; subject 86), in frames at 30 a second. A folder's own ``segments.csv`` takes their place.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from ftl_lightning.errors import UserError
+
+SEGMENTS = "segments.csv"
+HEADER = ("trial_id", "label", "start30", "stop30")
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of a trial that shows one action.
+
+    Attributes:
+        trial_id: such as ``13_29``.
+        label: the action.
+        start, stop: frames at 30 a second, the last one excluded; ``stop`` is ``None`` for the trial's end.
+    """
+
+    trial_id: str
+    label: str
+    start: int
+    stop: int | None
+
+
+WHOLE = tuple(
+    Segment(trial, label, 0, None)
+    for label, trials in (("chop wood", ("79_01", "80_71")), ("breaststroke", ("126_03", "126_04", "126_05")))
+    for trial in trials
+)
+"""Trials that show one of the new actions from start to end."""
+
+
+def shipped_segments() -> tuple[Segment, ...]:
+    """Those of the package."""
+    return read_segments(Path(__file__).parent / SEGMENTS)
+
+
+def read_segments(path: Path) -> tuple[Segment, ...]:
+    """Those of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE`.
+
+    Raises:
+        UserError: naming file and line.
+    """
+    try:
+        lines = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: expected a table of segments (CSV), found a file that cannot be read ({error})") from error
+    if not lines or tuple(lines[0]) != HEADER:
+        raise UserError(f"{path}: line 1: expected {','.join(HEADER)}, found {','.join(lines[0]) if lines else 'nothing'}")
+    found = []
+    for number, fields in enumerate(lines[1:], start=2):
+        if not fields:
+            continue
+        if (
+            len(fields) != len(HEADER)
+            or not all(field.strip().isdigit() for field in fields[2:])
+            or int(fields[2]) >= int(fields[3])
+        ):
+            told = ",".join(fields)
+            raise UserError(f"{path}: line {number}: expected a trial, a label, a first frame and a later one, found {told!r}")
+        found.append(Segment(fields[0].strip(), fields[1].strip(), int(fields[2]), int(fields[3])))
+    own = {segment.label for segment in found}
+    return (*found, *(segment for segment in WHOLE if segment.label not in own))
