@@ -1,0 +1,236 @@
+"""Forms of a concept beyond the paper's: over time (knots), on some columns of a state, with an adapter in its own branch."""
+
+import functools
+import operator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.adapter import LowRank, adaptable
+from ftl_lightning.concepts.composition import Composition, Modes, batched, composed_epsilon
+from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.demonstrations.normalization import Normalization
+from ftl_lightning.diffusion import TemporalUNet
+from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.diffusion.temporal_unet import over_time
+from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.errors import UserError
+from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.tuned import Tuned
+from tests.strokes import strokes
+
+SIZES = Sizes(horizon=8, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})
+ORIGIN = Origin("new", "own", "e", "p", "d", 5, "fixed", 0.15)
+
+
+@pytest.fixture(scope="module")
+def network() -> TemporalUNet:
+    torch.manual_seed(0)
+    return (
+        TemporalUNet(SIZES, width=8, multipliers=(1, 2), film=True, broadcast=True, clock=2, skip=True).eval().requires_grad_(False)
+    )
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+X, T, EMPTY = normal(3, 8, 3), torch.tensor([0, 40, 90]), normal(4, seed=1)
+PLACE = normal(3, 5, seed=2)
+
+
+def noise(network: TemporalUNet, composition: Composition) -> Tensor:
+    """Of the three plans, each by the same composition ``(K, ...)``."""
+    together, own = batched([composition], 3, [torch.Generator()])
+    return composed_epsilon(network, X, T, together, EMPTY, network.observe(PLACE), own)
+
+
+def adapter(network: TemporalUNet, seed: int = 3, size: float = 0.3) -> LowRank:
+    sizes = adaptable(network)
+    factors = {
+        name: (size * normal(outputs, 2, seed=seed), normal(2, inputs, seed=seed + 1)) for name, (outputs, inputs) in sizes.items()
+    }
+    return LowRank(factors)
+
+
+def adapted(own: Composition, change: LowRank) -> Composition:
+    return replace(own, adapters=(change,), adapter=torch.ones(len(own.weights), dtype=torch.int64))
+
+
+def test_a_concept_said_alike_at_every_knot_is_the_one_that_does_not_vary(network: TemporalUNet) -> None:
+    still = Composition(normal(2, 4), torch.tensor([1.2, 0.6]))
+    said = Composition(still.embeddings.repeat(1, 5), still.weights, knots=5)
+    assert torch.allclose(noise(network, still), noise(network, said), atol=1e-5)
+
+
+def test_what_knots_say_is_linear_between_them_and_their_order_matters(network: TemporalUNet) -> None:
+    values = over_time(torch.tensor([[[0.0], [1.0], [3.0]]]), 5)
+    assert torch.allclose(values, torch.tensor([[[0.0, 0.5, 1.0, 2.0, 3.0]]]))
+    moving = Composition(normal(1, 8), torch.ones(1), knots=2)
+    turned = replace(moving, embeddings=moving.embeddings.unflatten(1, (2, 4)).flip(1).flatten(1))
+    assert (noise(network, moving) - noise(network, turned)).abs().max() > 0.01
+
+
+def test_concepts_of_one_knot_compose_with_those_of_several_and_others_are_refused(network: TemporalUNet) -> None:
+    still, moving = Composition(normal(1, 4), torch.ones(1)), Composition(normal(1, 12, seed=1), torch.ones(1), knots=3)
+    both = still + moving
+    assert both.knots == 3
+    assert torch.equal(both.embeddings[0], still.embeddings[0].repeat(3))
+    other = noise(network, Composition(still.embeddings.repeat(1, 3), still.weights, knots=3) + moving)
+    assert torch.equal(noise(network, both), other)
+    four = Composition(normal(1, 16), torch.ones(1), knots=4)
+    with pytest.raises(UserError, match="expected concepts of one number of knots \\(or of one knot\\), found 3 and 4"):
+        moving + four
+    together, own = batched([still, moving], 2, [torch.Generator(), torch.Generator()])
+    assert together.embeddings.shape == (2, 1, 12)
+    assert own.tolist() == [0, 0, 1, 1]
+
+
+def test_a_weight_on_some_columns_changes_those_alone(network: TemporalUNet) -> None:
+    walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
+    nothing = noise(network, 0.0 * walk)
+    both = noise(network, walk.on((0, 2), 3) + wave.on((1,), 3))
+    assert torch.allclose(both[..., [0, 2]], noise(network, walk)[..., [0, 2]], atol=1e-5)
+    assert torch.allclose(both[..., 1], noise(network, wave)[..., 1], atol=1e-5)
+    legs = noise(network, walk.on((0,), 3))
+    assert torch.allclose(legs[..., 1:], nothing[..., 1:], atol=1e-5)
+    assert torch.allclose(noise(network, walk.on((0,), 3) + wave)[..., 1:], noise(network, wave)[..., 1:], atol=1e-5)
+
+
+def test_an_adapter_that_adds_nothing_changes_nothing(network: TemporalUNet) -> None:
+    own = Composition(normal(2, 4), torch.tensor([1.2, 0.6]))
+    assert torch.allclose(noise(network, own), noise(network, adapted(own, adapter(network, size=0.0))), atol=1e-5)
+
+
+def test_an_adapter_changes_its_own_branch_and_no_other(network: TemporalUNet) -> None:
+    walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
+    change, nothing = adapter(network), noise(network, Composition(torch.zeros(0, 4), torch.zeros(0)))
+    waved = noise(network, adapted(wave, change)) - nothing
+    assert (waved - (noise(network, wave) - nothing)).abs().max() > 0.01
+    expected = nothing + (noise(network, walk) - nothing) + waved
+    for both in (walk + adapted(wave, change), adapted(wave, change) + walk):
+        assert torch.allclose(noise(network, both), expected, atol=1e-4)
+    two = adapted(wave, change) + adapted(walk, adapter(network, seed=9))
+    assert len(two.adapters) == 2
+    assert two.adapter is not None
+    assert two.adapter.tolist() == [1, 1, 2]
+    # Side by side with one that has none, and twice with the same one, each as alone.
+    draws = [torch.Generator() for _ in range(3)]
+    three = [walk, adapted(wave, change), walk + adapted(wave, change)]
+    together, own = batched(three, 1, draws)
+    assert together.adapters == (change,)
+    each = composed_epsilon(network, X, T, together, EMPTY, network.observe(PLACE), own)
+    alone = torch.cat([noise(network, one)[row][None] for row, one in enumerate(three)])
+    assert torch.allclose(each, alone, atol=1e-4)
+
+
+@pytest.mark.parametrize("modes", [False, True])
+@pytest.mark.parametrize(("knots", "adapters"), [(3, False), (1, True), (3, True)])
+def test_every_form_comes_back_from_its_file(network: TemporalUNet, knots: int, adapters: bool, modes: bool) -> None:
+    several = Modes(normal(2, 2, 4 * knots), torch.ones(2, 2), mixed=True) if modes else None
+    own = Concept(normal(2, 4 * knots), torch.tensor([1.2, 0.6]), ORIGIN, several, knots, adapter(network) if adapters else None)
+    own.save("c.safetensors")
+    found = Concept.load("c.safetensors")
+    assert found.knots == knots
+    assert torch.equal(found.embeddings, own.embeddings)
+    assert (found.adapter is not None) == adapters
+    assert torch.equal(noise(network, replace(found, modes=None).composition), noise(network, replace(own, modes=None).composition))
+    assert (found.modes is not None) == modes
+    before = Path("c.safetensors").read_bytes()
+    found.save("c.safetensors")
+    assert Path("c.safetensors").read_bytes() == before
+    assert ("component 1, knot 3" in found.parts()) == (knots == 3)
+    assert {len(embedding) for _, embedding in found.parts().values()} == {4}
+
+
+@pytest.fixture(scope="module")
+def model() -> GenerativeModel:
+    """Of strokes, untrained."""
+    states = torch.from_numpy(strokes("square", 4, 0))
+    examples = Demonstrations(
+        states=states,
+        lengths=torch.full((4,), 40),
+        domain=OWN,
+        state_names=("x", "y"),
+        state_units=("cm", "cm"),
+        concepts=("one", "one", "two", "two"),
+    )
+    domain = own_domain(examples, ("one", "two"), 40, {})
+    arguments = {"width": 8, "multipliers": [1, 2], "film": True}
+    torch.manual_seed(0)
+    config = DiffusionConfig(
+        horizon=40,
+        state_dim=2,
+        concept_dim=6,
+        domain=OWN,
+        training_concepts=("one", "two"),
+        encoder="none",
+        denoiser="TemporalUNet",
+        denoiser_args=arguments,
+    )
+    found = GenerativeModel(config, domain, Normalization.fit(states), normal(3, 6))
+    found.examples = examples
+    return found.requires_grad_(False).eval()
+
+
+@pytest.mark.parametrize("options", [{"knots": 4}, {"adapter": 2}, {"knots": 4, "adapter": 2, "omega": "learned"}], ids=str)
+def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeModel, options: dict[str, object]) -> None:
+    learner = FewShot(model, Tuned(InversionSettings(samples=8), 40, Sampling(steps=2), 1))
+    before = {name: parameter.clone() for name, parameter in model.named_parameters()}
+    demonstrations = learner.demonstrations(strokes("heart", 3, 0), name="heart")
+    short, long = (learner.learn(demonstrations, name="heart", steps=steps, **options) for steps in (1, 40))
+    assert long.concept.origin.loss < short.concept.origin.loss
+    assert long.knots == options.get("knots", 1)
+    assert (long.concept.adapter is None) == ("adapter" not in options)
+    assert all(torch.equal(before[name], parameter) for name, parameter in model.named_parameters())
+    both = functools.reduce(operator.add, (long, learner["one"]))
+    for own in (long, both):
+        assert learner.sample(own, 2).states.isfinite().all()
+    long.save("heart.safetensors")
+    again = learner.load("heart.safetensors")
+    assert torch.equal(learner.sample(again, 2).states, learner.sample(long, 2).states)
+    assert long.explain().nearest
+
+
+def test_what_is_learned_with_an_adapter_does_not_depend_on_what_is_learned_beside_it(model: GenerativeModel) -> None:
+    learner = FewShot(model, Tuned(InversionSettings(samples=8), 40, Sampling(steps=2), 1))
+    one = learner.demonstrations(strokes("heart", 3, 0), name="heart")
+    other = learner.demonstrations(strokes("square", 3, 0), name="square")
+    from ftl_lightning.demonstrations.container import concatenate
+
+    settings = InversionSettings(samples=8, adapter=2)
+    alone, beside = invert(model, one, settings, 5), invert(model, concatenate([other, one]), settings, 5)
+    assert torch.allclose(alone["heart"].embeddings, beside["heart"].embeddings, atol=1e-5)
+    first, second = alone["heart"].adapter, beside["heart"].adapter
+    assert first is not None
+    assert second is not None
+    for name, factors in first.factors.items():
+        assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(factors, second.factors[name], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"knots": 0}, "model.knots: expected 1 or more, found 0"),
+        ({"adapter": -1}, "model.adapter: expected 0 \\(none\\) or a rank, found -1"),
+        ({"adapter": 2, "tolerance": 0.1}, "model.adapter: expected model.modes 1 and model.tolerance null beside it"),
+    ],
+)
+def test_settings_that_are_none_are_told(options: dict[str, int], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        InversionSettings(**options)  # type: ignore[arg-type]
+
+
+def test_knots_are_refused_where_a_plan_is_a_single_state(shipped: Path) -> None:
+    learner = FewShot.from_pretrained(shipped)
+    scene = learner.domain.source(None).draw("circle right of square", 1, 0)
+    with pytest.raises(UserError, match=r"model\.knots: expected 1 for this model"):
+        learner.learn(scene, steps=1, knots=4)
