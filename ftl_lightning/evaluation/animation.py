@@ -71,8 +71,8 @@ def side_by_side(films: Mapping[str, Sequence[NDArray[np.uint8]]]) -> list[NDArr
     """Films beside one another, each above its name.
 
     Args:
-        films: frames ``(height, width, 3)`` by name, such as the demonstration, ours and the baselines. Shorter films keep their last
-            frame, lower ones stand at the top.
+        films: frames ``(height, width, 3)`` by name, such as the demonstration, ours and the baselines. Shorter films keep
+            their last frame, lower ones stand at the top.
 
     Returns:
         Frames ``(height, width, 3)``, as many as the longest film has.

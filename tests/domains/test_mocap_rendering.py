@@ -59,8 +59,8 @@ def test_a_picture_has_a_strip_of_eight_poses_for_each_sample_marked_right_or_wr
     for axes in figure.axes:
         assert len(axes.collections) == 8
         assert axes.get_aspect() == 1
-        assert [text.get_text() for text in axes.texts][0] == "0 s"
-        assert [text.get_text() for text in axes.texts][-1] == "1.03 s"
+        times = [text.get_text() for text in axes.texts]
+        assert (times[0], times[-1]) == ("0 s", "1.03 s")
     assert set(frames_of(picture(states, None, "", None))) == {"#8a8a8a"}
 
 
