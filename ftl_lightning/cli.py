@@ -26,11 +26,12 @@ COMMANDS = {
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
+    "prepare": "read your own copy of a domain's recordings, which do not ship",
     "study": "make a web page in which people rate films of generated behaviour",
     "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"generate", "encode", "study"}
+POSITIONAL = {"generate", "encode", "prepare", "study"}
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""

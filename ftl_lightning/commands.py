@@ -82,6 +82,23 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
     print(path)
 
 
+def prepare(domain: str, root: str = "", out: str = "") -> None:
+    """Read your own copy of a domain's recordings, which do not ship, into the file that everything else reads.
+
+    Args:
+        domain: name of a domain.
+        root: folder of your copy; nothing is downloaded.
+        out: folder to write; empty for the same.
+    """
+    from ftl_lightning.domains.registry import load_domain
+    from ftl_lightning.errors import UserError
+
+    found = load_domain(domain)
+    if found.prepare is None:
+        raise UserError(f"domain: expected one whose recordings are prepared, found {domain!r}, which needs nothing of the kind")
+    print(found.prepare(Path(root) if root else None, Path(out) if out else None))
+
+
 @dataclass(frozen=True)
 class SampleOptions:
     """Generate behaviour from a learned concept, composed with training concepts.

@@ -124,7 +124,7 @@ class Demonstrations:
             scenes=None if self.scenes is None else self.scenes[chosen],
         )
 
-    def starts(self, rows: Tensor, share: Tensor, exponent: float, horizon: int) -> Tensor:
+    def starts(self, rows: Tensor, share: Tensor, exponent: float, horizon: int, at_rest: bool = True) -> Tensor:
         """Times at which windows start ``(window,)`` int64.
 
         Where features are observed at every time, a plan can start at any; 0 where one is known for the first time alone. Where
@@ -136,10 +136,12 @@ class Demonstrations:
             share: ``(window,)``, evenly spread over [0, 1).
             exponent: u of ``start = length * share^u``; 1 is uniform, with 3 half of the windows start in the first eighth.
             horizon: length of the windows.
+            at_rest: whether windows may reach past the end; else they stay within demonstrations that are long enough.
         """
         if set(self.observed) - set(self.per_step):
             return torch.zeros_like(rows)
-        room = self.lengths[rows] if self.observed else (self.lengths[rows] - horizon + 1).clamp(min=1)
+        past = bool(self.observed) and at_rest
+        room = self.lengths[rows] if past else (self.lengths[rows] - horizon + 1).clamp(min=1)
         return (share**exponent * room).long()
 
     def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, dict[str, Tensor]]:

@@ -70,6 +70,8 @@ class PretrainingData(pl.LightningDataModule):
         horizon: states in a window; ``None`` for the domain's plans.
         start_exponent: exponent u of the windows' starts, ``start = length * share^u``: 1 is uniform, with 3 half of the windows
             start in the first eighth of a demonstration. ``None`` for the domain's where windows are as long as plans, else 1.
+        balance: exponent with which concepts are drawn by their number of states: 1 draws every state alike, 0 every concept, 0.5
+            by the square root; of a concept, demonstrations are drawn by their length. ``None`` to draw demonstrations alike.
 
     Raises:
         UserError: for a value that is none.
@@ -91,9 +93,10 @@ class PretrainingData(pl.LightningDataModule):
         revision: str = "main",
         horizon: int | None = None,
         start_exponent: float | None = None,
+        balance: float | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        self.save_hyperparameters(ignore=["balance"] if balance is None else None)
         if self.own_domain and domain not in ("", self.own_domain):
             raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
         self.domain_name, self.domain = self._domain(self.own_domain or domain)
@@ -113,6 +116,9 @@ class PretrainingData(pl.LightningDataModule):
         for name, value in counts.items():
             if value < 1:
                 raise UserError(f"data.{name}: expected 1 or more, found {value}")
+        if balance is not None and not 0 <= balance <= 1:
+            raise UserError(f"data.balance: expected a number from 0 to 1, found {balance}")
+        self.balance = balance
         self.root = None if root is None else Path(root)
         self.samples_per_concept = samples_per_concept
         self.validation_per_concept = validation_per_concept
@@ -129,6 +135,8 @@ class PretrainingData(pl.LightningDataModule):
         source = self.domain.source(self.root)
         self.training = source.split("train", self.samples_per_concept, self.seed).fitted(self.domain.observed)
         self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
+        if self.balance is not None:
+            self._shares = shares(self.training, self.balance)
         # Evaluation draws initial states: a mistake in them is told before training, not after.
         starts = source.starts(self.domain.concepts.training[0], 1, self.seed) if self.domain.observed else None
         if starts is not None:
@@ -142,12 +150,15 @@ class PretrainingData(pl.LightningDataModule):
     def batch(self, step: int) -> Batch:
         """The batch of a step: demonstrations drawn with replacement, and of each a window."""
         draw = generator("cpu", self.seed, step)
-        rows = torch.randint(len(self.training), (self.batch_size,), generator=draw)
+        if self.balance is None:
+            rows = torch.randint(len(self.training), (self.batch_size,), generator=draw)
+        else:
+            rows = torch.multinomial(self._shares, self.batch_size, replacement=True, generator=draw)
         return self._windows(self.training, rows, draw)
 
     def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
         share = torch.rand(len(rows), generator=draw)
-        starts = demonstrations.starts(rows, share, self.start_exponent, self.horizon)
+        starts = demonstrations.starts(rows, share, self.start_exponent, self.horizon, self.domain.plans.at_rest)
         states, observed = demonstrations.windows(rows, starts, self.horizon)
         return Batch(states, self._concepts(demonstrations, rows), observed)
 
@@ -158,6 +169,8 @@ class PretrainingData(pl.LightningDataModule):
     def every_window(self) -> Batch:
         """One window from each time of each demonstration."""
         lengths = self.training.lengths
+        if not self.domain.plans.at_rest:
+            lengths = (lengths - self.horizon + 1).clamp(min=1)
         rows = torch.arange(len(lengths)).repeat_interleave(lengths)
         starts = torch.cat([torch.arange(length) for length in lengths.tolist()])
         states, observed = self.training.windows(rows, starts, self.horizon)
@@ -296,6 +309,16 @@ class InversionData(pl.LightningDataModule):
         return DataLoader(range(1), batch_size=None)  # type: ignore[arg-type]
 
     val_dataloader = test_dataloader
+
+
+def shares(demonstrations: Demonstrations, balance: float) -> Tensor:
+    """How often each demonstration is drawn ``(demo,)``, see ``balance`` of :class:`PretrainingData`; they sum to 1."""
+    lengths = demonstrations.lengths.double()
+    texts = {text: number for number, text in enumerate(dict.fromkeys(demonstrations.concepts))}
+    concepts = torch.tensor([texts[text] for text in demonstrations.concepts])
+    states = torch.zeros(len(texts), dtype=torch.double).index_add(0, concepts, lengths)
+    found = lengths * states[concepts] ** (balance - 1)
+    return found / found.sum()
 
 
 def read_demonstrations(path: str, domain: Domain) -> Demonstrations:

@@ -52,6 +52,8 @@ class Plans:
         start_exponent: exponent u of the windows' starts in a demonstration, ``start = length * share^u``, for windows as long as a
             plan: 1 is uniform; 3 where a plan reaches over the whole behaviour, so that the first window matters most. Shorter
             windows start anywhere: all times are alike to them.
+        at_rest: whether behaviour is at rest where a demonstration ends, so that windows may reach past the end, where the last
+            state stays. Without it they stay within demonstrations, of those that are long enough.
         resolution: columns of states and observed vectors that vary by less, in their units, hold a simulator's rounding alone.
     """
 
@@ -60,6 +62,7 @@ class Plans:
     units: tuple[str, ...]
     start_exponent: float = 1.0
     resolution: float = 0.0
+    at_rest: bool = True
 
     def exponent(self, window: int) -> float:
         """That of windows of this length."""
@@ -255,6 +258,8 @@ class Domain:
         fresh: whether the source can draw behaviour of any goal quickly enough to do so in every evaluation; without it there is no
             coverage.
         paper: the paper's numbers, if it has any.
+        prepare: ``(folder of a user's own copy of the data, folder to write or None for the same) -> what to print``, where
+            recordings are read once before they are used; see ``python -m ftl_lightning prepare``.
     """
 
     name: str
@@ -271,6 +276,7 @@ class Domain:
     distance: Distance | None = None
     fresh: bool = True
     paper: Paper | None = None
+    prepare: Callable[[Path | None, Path | None], str] | None = None
 
     def __post_init__(self) -> None:
         if self.show is _UNSAID:

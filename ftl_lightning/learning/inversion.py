@@ -204,7 +204,8 @@ class Inversion(nn.Module):
         draws = model.draws(samples, self.settings.timestep_power, draw)
         rows = torch.tensor([run.rows[sample % len(run.rows)] for run in runs for sample in range(samples)])
         share = torch.rand(samples, generator=draw, device=device).cpu().repeat(len(runs))
-        starts = self.demonstrations.starts(rows, share, model.domain.plans.exponent(window), window)
+        plans = model.domain.plans
+        starts = self.demonstrations.starts(rows, share, plans.exponent(window), window, plans.at_rest)
         states, observed = self.demonstrations.windows(rows, starts, window)
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
         composition = Composition(self.parametrised(embeddings), weights)

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.mocap.segments import Segment, shipped_segments
+from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.tasks import cleaned
 from ftl_lightning.errors import UserError
@@ -127,8 +127,6 @@ def read_folder(root: Path) -> tuple[Recordings, tuple[Segment, ...]]:
     Raises:
         UserError: where there is no folder, no recordings in it, or damaged ones.
     """
-    from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments
-
     if not root.is_dir():
         raise UserError(
             f"data.root: expected a folder of recordings, found {'a file' if root.exists() else 'nothing'} at {root}; {WHERE}"

@@ -1,7 +1,7 @@
 """The body: 14 joints, its bones, its mirror image.
 
-Joints are those of the paper's renderer (jutanke/mocap), the last two the lower neck's end and the head's. In every frame the middle
-of the hips is the origin, z is up, +y is where the hips face and +x the person's right.
+Joints are those of the paper's renderer (jutanke/mocap), the last two the lower neck's end and the head's. In every frame the
+middle of the hips is the origin, z is up, +y is where the hips face and +x the person's right.
 """
 
 import torch

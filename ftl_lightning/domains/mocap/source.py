@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ftl_lightning.demonstrations.container import Demonstrations, padded
 from ftl_lightning.demonstrations.features import Feature, InitialStates
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.recordings import Recordings, read_folder
+from ftl_lightning.domains.mocap.recordings import WHERE, Recordings, read_folder
 from ftl_lightning.domains.mocap.segments import Segment
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints, mirrored
 from ftl_lightning.domains.mocap.standing import standing_poses
@@ -75,8 +76,6 @@ class Recorded:
 
     @property
     def _folder(self) -> tuple[Recordings, tuple[Segment, ...]]:
-        from ftl_lightning.domains.mocap.recordings import WHERE
-
         if self.root is None:
             raise UserError(f"data.root: expected a folder of recordings, found none; {WHERE}")
         return read_folder(self.root)
@@ -84,9 +83,9 @@ class Recorded:
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All pieces of trials of the training concepts, and in ``'train'`` their mirror images.
 
-        How many there are is the recordings' matter, and so ``count`` and ``seed`` do not matter. Of a concept with three trials or
-        more, the last one, the eleventh last and so on are for validation, whole. A mirror image is of the description with left and
-        right exchanged; where that is no training concept there is none.
+        How many there are is the recordings' matter, and so ``count`` and ``seed`` do not matter. Of a concept with three trials
+        or more, the last one, the eleventh last and so on are for validation, whole. A mirror image is of the description with left
+        and right exchanged; where that is no training concept there is none.
 
         Raises:
             UserError: if the folder has no trial for it.
@@ -127,32 +126,32 @@ class Recorded:
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Poses of people who stand or walk with their arms down, in trials that are in no training split.
 
-        Nobody who demonstrates a new concept is among them. Without a folder they are made by rule, see
+        Trials are drawn alike; nobody who demonstrates a new concept is among them. Without a folder they are made by rule, see
         :mod:`ftl_lightning.domains.mocap.standing`.
         """
         draw = generator("cpu", seed, task_key(task))
         if self.root is None:
             return InitialStates({POSE: standing_poses(count, draw)})
-        known = self.arms_down
-        return InitialStates({POSE: known[torch.randint(len(known), (count,), generator=draw)]})
+        trials = self.arms_down
+        which = torch.randint(len(trials), (count,), generator=draw).tolist()
+        share = torch.rand(count, generator=draw).tolist()
+        found = [trials[trial][int(part * len(trials[trial]))] for trial, part in zip(which, share, strict=True)]
+        return InitialStates({POSE: torch.stack(found)})
 
     @cached_property
-    def arms_down(self) -> Tensor:
-        """What :meth:`starts` draws from ``(pose, 42)``.
+    def arms_down(self) -> tuple[Tensor, ...]:
+        """What :meth:`starts` draws from: of each trial with such poses, all of them ``(pose, 42)``.
 
         Raises:
             UserError: if there is none.
         """
         subjects = self.recordings.subject
-        held_out = [piece.states for piece in self._pieces if piece.trial in self._validation]
-        held_out = [
-            piece.states for piece in self._pieces if piece.trial in self._validation and subjects[piece.trial] not in DEMONSTRATORS
-        ]
-        poses = torch.cat(held_out) if held_out else torch.empty(0, len(COLUMNS))
-        poses = poses[hang_down(poses)]
-        if not len(poses):
+        trials = {trial: self.recordings.trial(trial) for trial in sorted(self._validation)}
+        poses = [torch.from_numpy(trials[trial]) for trial in trials if subjects[trial] not in DEMONSTRATORS]
+        found = tuple(down for one in poses if len(down := one[hang_down(one)]))
+        if not found:
             raise UserError(f"{self.root}: expected held-out trials in which someone stands with arms down, found none")
-        return poses
+        return found
 
     @cached_property
     def _pieces(self) -> list[Piece]:
@@ -208,11 +207,8 @@ class Recorded:
 
 def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[Tensor]:
     """Stretches of a trial ``(frame, 42)`` without glitches, of at least a window each; longer ones in parts that overlap."""
-    joints = states.reshape(len(states), -1, 3)
-    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1, initial=0) * FPS
-    ends = [0, *(np.flatnonzero(speed > MAX_SPEED) + 1).tolist(), len(states)]
     found = []
-    for start, stop in zip(ends, ends[1:], strict=False):
+    for start, stop in pairwise((0, *glitches(states), len(states))):
         if stop - start < HORIZON:
             continue
         step = stop - start if longest is None else longest - HORIZON + 1
@@ -220,6 +216,13 @@ def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[T
             last = stop if longest is None else min(first + longest, stop)
             found.append(torch.from_numpy(states[first:last].copy()))
     return found
+
+
+def glitches(states: NDArray[np.float32]) -> list[int]:
+    """Frames of a trial ``(frame, 42)`` that a joint reaches faster than :data:`MAX_SPEED`."""
+    joints = states.reshape(len(states), -1, 3)
+    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1, initial=0) * FPS
+    return (np.flatnonzero(speed > MAX_SPEED) + 1).tolist()
 
 
 def hang_down(poses: Tensor) -> Tensor:

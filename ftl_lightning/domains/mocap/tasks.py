@@ -1,7 +1,7 @@
 """Descriptions: what is pretrained on, what is learned from a few demonstrations, what is held out.
 
-Training concepts are descriptions of trials by the database (``cmu-mocap-index.csv``, compiled by B. Hahne from mocap.cs.cmu.edu), as
-:func:`cleaned`. Of the others no trial is pretrained on.
+Training concepts are descriptions of trials by the database (``cmu-mocap-index.csv``, compiled by B. Hahne from mocap.cs.cmu.edu),
+as :func:`cleaned`. Of the others no trial is pretrained on.
 """
 
 import re

@@ -1,0 +1,274 @@
+"""Skeletons (ASF) and their motion (AMC) in the Acclaim format, by forward kinematics.
+
+A bone of length l and direction d turns by ``R = parent R * C * M * C^-1``, where C is its ``axis`` and M its degrees of freedom
+of a frame, and ends ``l * R d`` from where its parent ends (M. Lander, Working with motion capture file formats, 1998). Rotations
+named XYZ are applied x first: ``Rz Ry Rx``.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftl_lightning.errors import UserError
+
+INCH = 0.0254
+"""Metres. Lengths of the database are inches once they are divided by the ``length`` of the skeleton's ``units``."""
+ROOT = "root"
+JOINT_BONES = (
+    "rhipjoint", "rfemur", "rtibia", "lhipjoint", "lfemur", "ltibia", "rclavicle", "rhumerus", "rradius", "lclavicle", "lhumerus",
+    "lradius", "lowerneck", "head",
+)  # fmt: skip
+"""Bones whose ends are the joints, in their order."""
+THORAX = "thorax"
+_NUMBERS = {"direction": 3, "length": 1, "axis": 3}
+"""How many a bone's lines hold."""
+_CHANNELS = {"TX", "TY", "TZ", "RX", "RY", "RZ"}
+
+
+@dataclass(frozen=True)
+class Bone:
+    """One bone.
+
+    Attributes:
+        parent: name of the bone that it hangs on, or ``'root'``.
+        reach: ``(3,)`` from its start to its end in the rest pose, in the file's units.
+        axis: the turn of its own axes against the world's in the rest pose.
+        dof: its degrees of freedom in the order of the motion's numbers, such as ``('rx', 'rz')``.
+    """
+
+    parent: str
+    reach: NDArray[np.float64]
+    axis: Rotation
+    dof: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A subject's body.
+
+    Attributes:
+        metres: of one unit of the file.
+        order: of the root's numbers, such as ``('TX', 'TY', 'TZ', 'RX', 'RY', 'RZ')``.
+        position: ``(3,)`` of the root in the rest pose, in the file's units.
+        orientation: of the root in the rest pose.
+        bones: by name, each after its parent.
+    """
+
+    metres: float
+    order: tuple[str, ...]
+    position: NDArray[np.float64]
+    orientation: Rotation
+    bones: dict[str, Bone]
+
+    def joints(self, motion: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Where the joints are ``(frame, 14, 3)`` in metres, y up.
+
+        Args:
+            motion: of the root ``(frame, 6)`` and of each bone that moves ``(frame, dof)``, in degrees; others stay at rest.
+        """
+        frames = len(motion[ROOT])
+        channels = [name.lower() for name in self.order]
+        moved = np.stack([motion[ROOT][:, channels.index(name)] for name in ("tx", "ty", "tz")], axis=1)
+        turned = _turns(motion[ROOT], channels, "".join(name[1] for name in channels if name[0] == "r"))
+        ends = {ROOT: self.position + moved}
+        turns = {ROOT: turned * self.orientation}
+        for name, bone in self.bones.items():
+            turn = turns[bone.parent]
+            if bone.dof and name in motion:
+                turn = turn * bone.axis * _turns(motion[name], bone.dof) * bone.axis.inv()
+            turns[name] = turn
+            ends[name] = ends[bone.parent] + np.broadcast_to(turn.apply(bone.reach), (frames, 3))
+        return np.stack([ends[name] for name in JOINT_BONES], axis=1) * self.metres
+
+
+def _turns(values: NDArray[np.float64], channels: Sequence[str], order: str = "xyz") -> Rotation:
+    """Turns ``(frame,)`` about the axes of ``order``, the first one first, of degrees ``(frame, channel)``."""
+    zero = np.zeros(len(values))
+    angles = [values[:, list(channels).index(f"r{axis}")] if f"r{axis}" in channels else zero for axis in order]
+    return Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
+
+
+def read_asf(path: Path) -> Skeleton:
+    """A skeleton.
+
+    Raises:
+        UserError: naming file and line, where it is malformed or not the database's.
+    """
+    lines = _Lines(path)
+    length, degrees = 1.0, True
+    order: tuple[str, ...] = ("TX", "TY", "TZ", "RX", "RY", "RZ")
+    position, angles, root_order = np.zeros(3), np.zeros(3), "XYZ"
+    bones: dict[str, Bone] = {}
+    parents: dict[str, str] = {}
+    section = ""
+    bone: dict[str, list[str]] = {}
+    for words in lines:
+        key = words[0].lower()
+        if key.startswith(":"):
+            section = key
+        elif section == ":units" and key == "length":
+            length = lines.number(words, 1)
+        elif section == ":units" and key == "angle":
+            degrees = lines.word(words, 1).lower().startswith("deg")
+        elif section == ":root" and key == "order":
+            order = tuple(word.upper() for word in words[1:])
+            if set(order) != _CHANNELS or len(order) != 6:
+                raise lines.error("TX TY TZ RX RY RZ in some order", words)
+        elif section == ":root" and key == "axis":
+            root_order = lines.word(words, 1)
+        elif section == ":root" and key == "position":
+            position = lines.numbers(words[1:], 3)
+        elif section == ":root" and key == "orientation":
+            angles = lines.numbers(words[1:], 3)
+        elif section == ":bonedata":
+            if key == "end":
+                name, made = _bone(lines, bone, degrees)
+                bones[name] = made
+            elif key in _NUMBERS:
+                lines.numbers(words[1 : 1 + _NUMBERS[key]], _NUMBERS[key])
+            bone = {} if key in ("begin", "end") else bone | {key: words[1:]}
+        elif section == ":hierarchy" and key not in ("begin", "end"):
+            parents |= dict.fromkeys(words[1:], words[0])
+    if length <= 0:
+        raise UserError(f"{path}: key 'length': expected a positive number, found {length:g}")
+    if missing := [name for name in JOINT_BONES if name not in bones]:
+        raise UserError(f"{path}: expected a skeleton of the CMU database, found one without the bone {missing[0]!r}")
+    orientation = _rest(lines, angles, root_order, degrees)
+    return Skeleton(INCH / length, order, position, orientation, _ordered(path, bones, parents))
+
+
+def _bone(lines: "_Lines", found: dict[str, list[str]], degrees: bool) -> tuple[str, Bone]:
+    for key in ("name", "direction", "length", "axis"):
+        if key not in found:
+            raise lines.error(f"a bone with name, direction, length and axis (no {key!r} here)", ["end"])
+    direction = lines.numbers(found["direction"], 3)
+    norm = float(np.linalg.norm(direction))
+    turn = _rest(lines, lines.numbers(found["axis"][:3], 3), lines.word(found["axis"], 3), degrees)
+    dof = tuple(word.lower() for word in found.get("dof", ()))
+    if unknown := set(dof) - {"rx", "ry", "rz"}:
+        raise lines.error("degrees of freedom rx, ry or rz", sorted(unknown))
+    reach = direction * (lines.number(found["length"], 0) / norm if norm > 0 else 0.0)
+    return lines.word(found["name"], 0), Bone(ROOT, reach, turn, dof)
+
+
+def _rest(lines: "_Lines", angles: NDArray[np.float64], order: str, degrees: bool) -> Rotation:
+    if sorted(order.lower()) != ["x", "y", "z"]:
+        raise lines.error("an order of axes such as XYZ", [order])
+    by_axis = dict(zip("xyz", angles, strict=True))
+    return Rotation.from_euler(order.lower(), [by_axis[letter] for letter in order.lower()], degrees=degrees)
+
+
+def _ordered(path: Path, bones: dict[str, Bone], parents: dict[str, str]) -> dict[str, Bone]:
+    """Bones with their parents, each after its parent."""
+    found: dict[str, Bone] = {}
+    while len(found) < len(bones):
+        ready = [name for name in bones if name not in found and (parents.get(name) == ROOT or parents.get(name) in found)]
+        if not ready:
+            lost = next(name for name in bones if name not in found)
+            raise UserError(f"{path}: section ':hierarchy': expected what {lost!r} hangs on, up to the root, found no such bones")
+        for name in ready:
+            one = bones[name]
+            found[name] = Bone(parents[name], one.reach, one.axis, one.dof)
+    return found
+
+
+def read_amc(path: Path, skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
+    """A motion: of the root ``(frame, 6)`` and of each bone ``(frame, dof)``, in degrees.
+
+    Raises:
+        UserError: naming file and line, where it is malformed, of another skeleton, or without frames.
+    """
+    lines = _Lines(path)
+    expected = {ROOT: len(skeleton.order)} | {name: len(bone.dof) for name, bone in skeleton.bones.items()}
+    values: dict[str, list[list[float]]] = {}
+    frames, scale = 0, 1.0
+    for words in lines:
+        name = words[0]
+        if name.startswith(":"):
+            scale = math.degrees(1.0) if name.upper() == ":RADIANS" else scale
+            continue
+        if len(words) == 1 and name.isdigit():
+            _complete(lines, values, frames)
+            frames += 1
+            continue
+        if name not in expected:
+            raise lines.error("a bone of the skeleton", [name], "is it of another subject?")
+        if len(words) - 1 != expected[name]:
+            raise lines.error(f"{expected[name]} numbers for {name!r}", words, "is it of another subject?")
+        rows = values.setdefault(name, [])
+        if len(rows) != frames - 1:
+            raise lines.error("a frame's number before its bones, and each bone once", words)
+        try:
+            rows.append([float(word) for word in words[1:]])
+        except ValueError:
+            raise lines.error("numbers", words) from None
+    _complete(lines, values, frames)
+    if not frames:
+        raise UserError(f"{path}: expected frames of motion, found none")
+    found = {name: np.array(rows) for name, rows in values.items()}
+    for name, array in found.items():
+        if not np.isfinite(array).all():
+            frame = int((~np.isfinite(array)).any(axis=1).argmax()) + 1
+            raise UserError(f"{path}: frame {frame}: expected finite numbers of {name!r}, found others")
+    if ROOT not in found:
+        raise UserError(f"{path}: expected the root's motion, found none")
+    if scale != 1.0:
+        rotations = [place for place, channel in enumerate(skeleton.order) if channel.startswith("R")]
+        for name, array in found.items():
+            array[:, rotations if name == ROOT else slice(None)] *= scale
+    return found
+
+
+def _complete(lines: "_Lines", values: dict[str, list[list[float]]], frames: int) -> None:
+    for name, rows in values.items():
+        if len(rows) != frames:
+            raise lines.error(f"{name!r} in every frame", [f"frame {frames} without it"])
+
+
+class _Lines:
+    """The words of a text file's lines, without comments and empty ones."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.line = path, 0
+        try:
+            self.lines = path.read_text(encoding="latin-1").splitlines()
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+    def __iter__(self) -> Iterator[list[str]]:
+        for number, text in enumerate(self.lines, start=1):
+            self.line = number
+            words = (text.split("#")[0] if "#" in text else text).split()
+            if words:
+                yield words
+
+    def error(self, expected: str, words: Sequence[str], what: str = "") -> UserError:
+        """A mistake in the line that was read last."""
+        told = " ".join(words)
+        hint = f"; {what}" if what else ""
+        return UserError(f"{self.path}: line {self.line}: expected {expected}, found {told[:60]!r}{hint}")
+
+    def word(self, words: Sequence[str], place: int) -> str:
+        """One of the words."""
+        if len(words) <= place:
+            raise self.error("more words", words)
+        return words[place]
+
+    def number(self, words: Sequence[str], place: int) -> float:
+        """One of the words as a number."""
+        return float(self.numbers([self.word(words, place)], 1)[0])
+
+    def numbers(self, words: Sequence[str], count: int) -> NDArray[np.float64]:
+        """Words as that many finite numbers."""
+        try:
+            found = np.array([float(word) for word in words])
+        except ValueError:
+            raise self.error("numbers", words) from None
+        if len(found) != count or not np.isfinite(found).all():
+            raise self.error(f"{count} finite numbers", words)
+        return found
