@@ -1,6 +1,7 @@
 """The verbs of the command line. Imports are lazy, so that verbs without a trainer start at once."""
 
 import importlib
+import json
 import os
 import re
 import sys
@@ -26,10 +27,14 @@ COMMANDS = {
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
     "prepare": "read your own copy of a domain's recordings, which do not ship",
+    "study": "make a web page in which people rate films of generated behaviour",
+    "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"generate", "encode", "prepare"}
+POSITIONAL = {"generate", "encode", "prepare", "study"}
 """Commands whose required arguments are given by position."""
+SEVERAL = {"study-report": "answers"}
+"""Commands that take any number of files by position, with the option that a list of them is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -86,9 +91,11 @@ def _dispatch(arguments: list[str]) -> None:
         from jsonargparse import auto_cli
 
         commands = importlib.import_module("ftl_lightning.commands")
-        function, kind = getattr(commands, verb), getattr(commands, f"{verb.capitalize()}Options", None)
+        name = verb.replace("-", "_")
+        function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
-        found = auto_cli(kind or function, args=expanded(arguments[1:]), exit_on_error=False, **options)
+        given = _gathered(arguments[1:], SEVERAL[verb]) if verb in SEVERAL else arguments[1:]
+        found = auto_cli(kind or function, args=expanded(given), exit_on_error=False, **options)
         if kind:  # options in a class of their own
             function(found)
     elif verb in TRAINER_VERBS:
@@ -98,6 +105,12 @@ def _dispatch(arguments: list[str]) -> None:
         run(arguments)
     else:
         raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
+
+
+def _gathered(arguments: list[str], option: str) -> list[str]:
+    """The arguments with those at the front that belong to no option as a list in one."""
+    count = next((index for index, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
+    return [f"--{option}={json.dumps(arguments[:count])}", *arguments[count:]] if count else arguments
 
 
 def _overview() -> str:

@@ -292,3 +292,69 @@ def report(results: str = "results", out: str = "results/report", readme: str = 
 
     print(write_report(Path(results), Path(out), Path(readme) if readme else None))
     print(f"written to {out}")
+
+
+def study(
+    domain: str,
+    films: str = "films",
+    out: str = "study",
+    scenarios: int = 1,
+    repeats: int = 2,
+    still: int = 1,
+    seed: int = 0,
+    title: str = "",
+    consent: str = "",
+) -> None:
+    """Make a web page in which people rate films of generated behaviour.
+
+    Args:
+        domain: name of a domain whose plans are filmed.
+        films: folder with files METHOD/CONCEPT.safetensors that "sample --out" wrote, or with films.json, a list of
+            {"concept", "method", "file"} and, if wanted, "scenario", "setting" and "row".
+        out: folder for study.html, which goes to the raters, and key.json, which stays.
+        scenarios: of each concept, drawn from the samples that all methods' files have.
+        repeats: attention checks: questions that are asked twice.
+        still: attention checks: films that stand still and so depict no motion.
+        seed: deals out the films' numbers and draws what is shown and repeated.
+        title: of the page.
+        consent: text file that raters agree to, in place of the page's own words.
+    """
+    from ftl_lightning.domains.registry import load_domain
+    from ftl_lightning.errors import UserError
+    from ftl_lightning.study.page import make_study
+
+    for name, value, least in (("scenarios", scenarios, 1), ("repeats", repeats, 0), ("still", still, 0), ("seed", seed, 0)):
+        if value < least:
+            raise UserError(f"{name}: expected {least} or more, found {value}")
+    try:
+        words = Path(consent).read_text(encoding="utf-8") if consent else ""
+    except (OSError, ValueError) as error:
+        raise UserError(f"consent: expected a text file, found {consent} ({error})") from error
+    made = make_study(load_domain(domain), Path(films), Path(out), scenarios, repeats, still, seed, title, words)
+    print(f"{made.page}: {made.films} films, {made.questions} questions, {made.size / 1000:.0f} kB; it goes to the raters")
+    print(f"{made.key}: says which film is whose; it stays with you")
+
+
+def study_report(answers: list[str] = [], key: str = "", all_raters: bool = False) -> None:  # noqa: B006 (never changed)
+    """The table of what raters answered in a study: study-report study/answers*.json.
+
+    Args:
+        answers: files that raters saved, or folders of files answers*.json.
+        key: the study's key; empty for key.json beside the first file.
+        all_raters: also count raters who failed attention checks.
+    """
+    import sys
+
+    from ftl_lightning.errors import UserError
+    from ftl_lightning.evaluation.summary import show
+    from ftl_lightning.study.report import NOTES, study_table
+
+    if not answers:
+        raise UserError("answers: expected files that raters saved, found none; run: study-report study/answers*.json")
+    first = Path(answers[0])
+    beside = (first if first.is_dir() else first.parent) / "key.json"
+    found = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)
+    for line in (*(f"refused: {line}" for line in found.refused), *found.dropped):
+        print(line, file=sys.stderr)
+    show(found.table())
+    print("\n".join(NOTES))

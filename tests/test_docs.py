@@ -25,7 +25,7 @@ FOLDERS = (ROOT, *ROOT.glob("examples/*"))
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 INCLUDED = re.compile(r"^`{3,}\{include\} (\S+)", re.MULTILINE)
 CODE = re.compile(r"^(`{3,})(?!\{include\}).*?^\1`*$", re.MULTILINE | re.DOTALL)
-COMMAND = re.compile(r"python -m ftl_lightning ([a-z]+)((?:[^\n`\\]|\\\n)*)")
+COMMAND = re.compile(r"python -m ftl_lightning ([a-z]+(?:-[a-z]+)*)((?:[^\n`\\]|\\\n)*)")
 CONFIG = re.compile(r"--config[ =]([\w./-]+)")
 PLACEHOLDER = re.compile(r"[A-Z]{2,}")
 """A word in capitals stands for any name, as in conf/DOMAIN.yaml."""

@@ -28,6 +28,8 @@ from ftl_lightning.errors import UserError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ftl_lightning.domains.wireframe import Wireframe
+
 ACCURACY = "accuracy"
 SUCCESS = "success"
 NOVELTY, COVERAGE = "novelty", "coverage"
@@ -153,10 +155,13 @@ class Show:
         picture: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title, initial states or
             None) -> figure``.
         film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is no motion.
+        wireframe: ``states (horizon, state) -> points and lines that move``, from which a web page draws the same film in a
+            twentieth of its size; ``None`` where a plan is nothing of the kind.
     """
 
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
+    wireframe: Callable[[Tensor], "Wireframe"] | None = None
 
 
 def line_drawings(plans: Plans) -> Show:

@@ -67,6 +67,30 @@ def captioned(pictures: Sequence[NDArray[np.uint8]], text: str) -> list[NDArray[
     return [np.concatenate((picture, below)) for picture in pictures]
 
 
+def side_by_side(films: Mapping[str, Sequence[NDArray[np.uint8]]]) -> list[NDArray[np.uint8]]:
+    """Films beside one another, each above its name.
+
+    Args:
+        films: frames ``(height, width, 3)`` by name, such as the demonstration, ours and the baselines. Shorter films keep
+            their last frame, lower ones stand at the top.
+
+    Returns:
+        Frames ``(height, width, 3)``, as many as the longest film has.
+    """
+    rows = [captioned(film, name) for name, film in films.items() if len(film)]
+    height = max((row[0].shape[0] for row in rows), default=0)
+    length = max(map(len, rows), default=0)
+    pictures = []
+    for time in range(length):
+        parts = []
+        for row in rows:
+            picture = row[min(time, len(row) - 1)]
+            below = np.full((height - picture.shape[0], picture.shape[1], 3), PAPER, dtype=np.uint8)
+            parts.append(np.concatenate((picture, below)))
+        pictures.append(np.concatenate(parts, axis=1))
+    return pictures
+
+
 def outcome_text(goal: str, outcomes: Mapping[str, Tensor], episode: int = 0) -> str:
     """A caption: what was asked and how an episode ended.
 

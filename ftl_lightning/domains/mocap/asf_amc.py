@@ -25,6 +25,8 @@ JOINT_BONES = (
 )  # fmt: skip
 """Bones whose ends are the joints, in their order."""
 THORAX = "thorax"
+_NUMBERS = {"direction": 3, "length": 1, "axis": 3}
+"""How many a bone's lines hold."""
 _CHANNELS = {"TX", "TY", "TZ", "RX", "RY", "RZ"}
 
 
@@ -53,14 +55,13 @@ class Skeleton:
         metres: of one unit of the file.
         order: of the root's numbers, such as ``('TX', 'TY', 'TZ', 'RX', 'RY', 'RZ')``.
         position: ``(3,)`` of the root in the rest pose, in the file's units.
-        axis, orientation: of the root in the rest pose.
+        orientation: of the root in the rest pose.
         bones: by name, each after its parent.
     """
 
     metres: float
     order: tuple[str, ...]
     position: NDArray[np.float64]
-    axis: Rotation
     orientation: Rotation
     bones: dict[str, Bone]
 
@@ -75,7 +76,7 @@ class Skeleton:
         moved = np.stack([motion[ROOT][:, channels.index(name)] for name in ("tx", "ty", "tz")], axis=1)
         turned = _turns(motion[ROOT], channels, "".join(name[1] for name in channels if name[0] == "r"))
         ends = {ROOT: self.position + moved}
-        turns = {ROOT: self.axis * turned * self.axis.inv() * self.orientation}
+        turns = {ROOT: turned * self.orientation}
         for name, bone in self.bones.items():
             turn = turns[bone.parent]
             if bone.dof and name in motion:
@@ -101,11 +102,11 @@ def read_asf(path: Path) -> Skeleton:
     lines = _Lines(path)
     length, degrees = 1.0, True
     order: tuple[str, ...] = ("TX", "TY", "TZ", "RX", "RY", "RZ")
-    position, axis, orientation = np.zeros(3), Rotation.identity(), Rotation.identity()
-    root_order, angles = "XYZ", np.zeros(3)
+    position, angles, root_order = np.zeros(3), np.zeros(3), "XYZ"
     bones: dict[str, Bone] = {}
     parents: dict[str, str] = {}
-    section, bone = "", {}
+    section = ""
+    bone: dict[str, list[str]] = {}
     for words in lines:
         key = words[0].lower()
         if key.startswith(":"):
@@ -128,6 +129,8 @@ def read_asf(path: Path) -> Skeleton:
             if key == "end":
                 name, made = _bone(lines, bone, degrees)
                 bones[name] = made
+            elif key in _NUMBERS:
+                lines.numbers(words[1 : 1 + _NUMBERS[key]], _NUMBERS[key])
             bone = {} if key in ("begin", "end") else bone | {key: words[1:]}
         elif section == ":hierarchy" and key not in ("begin", "end"):
             parents |= dict.fromkeys(words[1:], words[0])
@@ -136,7 +139,7 @@ def read_asf(path: Path) -> Skeleton:
     if missing := [name for name in JOINT_BONES if name not in bones]:
         raise UserError(f"{path}: expected a skeleton of the CMU database, found one without the bone {missing[0]!r}")
     orientation = _rest(lines, angles, root_order, degrees)
-    return Skeleton(INCH / length, order, position, axis, orientation, _ordered(path, bones, parents))
+    return Skeleton(INCH / length, order, position, orientation, _ordered(path, bones, parents))
 
 
 def _bone(lines: "_Lines", found: dict[str, list[str]], degrees: bool) -> tuple[str, Bone]:
@@ -167,9 +170,7 @@ def _ordered(path: Path, bones: dict[str, Bone], parents: dict[str, str]) -> dic
         ready = [name for name in bones if name not in found and (parents.get(name) == ROOT or parents.get(name) in found)]
         if not ready:
             lost = next(name for name in bones if name not in found)
-            raise UserError(
-                f"{path}: section ':hierarchy': expected what {lost!r} hangs on, up to the root, found no such bones"
-            )
+            raise UserError(f"{path}: section ':hierarchy': expected what {lost!r} hangs on, up to the root, found no such bones")
         for name in ready:
             one = bones[name]
             found[name] = Bone(parents[name], one.reach, one.axis, one.dof)

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
-from ftl_lightning.domains.domain import Concepts, Domain, Plans, deferred
+from ftl_lightning.domains.domain import Concepts, Domain, Plans, Show, deferred
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, HORIZON
 from ftl_lightning.domains.mocap.source import NAME, OBSERVED, Recorded
 from ftl_lightning.domains.mocap.tasks import SUITES, TRAINING_CONCEPTS, reads
+
+_DRAWING = "ftl_lightning.domains.mocap.rendering"
 
 DOMAIN = Domain(
     name=NAME,
@@ -19,7 +21,7 @@ DOMAIN = Domain(
     source=Recorded,
     observed=OBSERVED,
     # metrics: of the judge.
-    # show: films of stick figures.
+    show=Show(*(deferred(f"{_DRAWING}:{name}") for name in ("picture", "film", "wireframe"))),
     prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
     fresh=False,  # there is no more behaviour than what was recorded
 )

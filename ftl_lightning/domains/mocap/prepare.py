@@ -41,16 +41,19 @@ EXAMPLES = 3
 """Of each reason that are printed; the report has all."""
 
 
+class _Dropped(Exception):
+    """A trial is left out, for a reason that it may share with others; ``told`` is of this trial alone."""
+
+    def __init__(self, reason: str, told: str = "") -> None:
+        self.reason, self.told = reason, told
+
+
 @dataclass
 class _Report:
     """What became of each file."""
 
     kept: dict[str, dict[str, str | int]] = field(default_factory=dict)
     dropped: dict[str, dict[str, str]] = field(default_factory=dict)
-
-    def drop(self, name: str, reason: str, told: str = "") -> None:
-        """Leave a trial out for a reason, which it may share with others; ``told`` is of this trial alone."""
-        self.dropped[name] = {"reason": reason, "told": told}
 
     def lines(self) -> Iterable[str]:
         frames = sum(int(one["frames"]) for one in self.kept.values())
@@ -114,19 +117,22 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
     found: dict[str, tuple[Poses, str]] = {}
     with bar("reading trials", len(motions)) as advance:
         for path in sorted(motions, key=lambda path: path.suffix.lower()):  # AMC before BVH of the same trial
-            name = _TRIAL.match(path.name)
-            if name is None:
-                report.drop(path.name, "file not named after a trial, such as 13_29.amc")
-            elif name[1] not in found:
-                trial = name[1]
-                if (poses := _trial(path, trial, descriptions.get(trial, ""), skeletons, report)) is not None:
-                    report.dropped.pop(trial, None)
-                    found[trial] = poses
+            named = _TRIAL.match(path.name)
+            trial = named[1] if named else path.name
+            if trial not in found:
+                report.dropped.pop(trial, None)
+                try:
+                    if named is None:
+                        raise _Dropped("file not named after a trial, such as 13_29.amc")
+                    found[trial] = _trial(path, trial, descriptions.get(trial, ""), skeletons)
+                    report.kept[trial] = _told(descriptions[trial], found[trial][1], path.name, _states(found[trial][0]))
+                except _Dropped as dropped:
+                    report.dropped[trial] = {"reason": dropped.reason, "told": dropped.told}
             advance()
     if not found:
         name, first = next(iter(report.dropped.items()))
-        told = f"{first['reason']}{': ' * bool(first['told'])}{first['told']}"
-        raise UserError(f"{root}: expected a trial that can be used, found none of {len(motions)}; {name}: {told}")
+        told = ": ".join(text for text in (name, first["reason"], first["told"]) if text)
+        raise UserError(f"{root}: expected a trial that can be used, found none of {len(motions)}; {told}")
     trials = sorted(found)
     ends = np.cumsum([0, *(len(found[trial][0].positions) for trial in trials)])
     return Recordings(
@@ -140,16 +146,16 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
     )
 
 
-def _trial(path: Path, trial: str, label: str, skeletons: Mapping[str, Path], report: _Report) -> tuple[Poses, str] | None:
-    """Poses of one and its kind, or nothing and the reason in the report."""
+def _trial(path: Path, trial: str, label: str, skeletons: Mapping[str, Path]) -> tuple[Poses, str]:
+    """Poses of one and its kind."""
     if label in ("", "unknown"):
-        return report.drop(trial, "no description in the index")
+        raise _Dropped("no description in the index")
     if label not in TRAINING_CONCEPTS and trial not in HELD_OUT:
-        return report.drop(trial, "description that is no training concept", label)
+        raise _Dropped("description that is no training concept", label)
     subject = trial.split("_")[0]
     amc, known = path.suffix.lower() == ".amc", subject in skeletons
     if amc and not known:
-        return report.drop(trial, "no skeleton of the subject", f"{subject}.asf")
+        raise _Dropped("no skeleton of the subject", f"{subject}.asf")
     try:
         skeleton = _skeleton(skeletons[subject]) if known else None
         if amc and skeleton is not None:
@@ -159,18 +165,20 @@ def _trial(path: Path, trial: str, label: str, skeletons: Mapping[str, Path], re
             joints, raw_fps = read_bvh(path, skeleton)
             kind = "bvh_mb" if known else "bvh_mb_thx"
     except UserError as error:
-        return report.drop(trial, "cannot be read", str(error))
+        raise _Dropped("cannot be read", str(error)) from None
     joints = _from_the_floor(z_up(joints))
     if len(joints) < MIN_RAW_FRAMES:
-        return report.drop(trial, f"shorter than {MIN_RAW_FRAMES} frames", f"{len(joints)} frames")
+        raise _Dropped(f"shorter than {MIN_RAW_FRAMES} frames", f"{len(joints)} frames")
     if (spread := _spread(joints)) > MAX_SPREAD:
-        return report.drop(trial, "bones that change their length", f"by {1000 * spread:.1f} mm")
+        raise _Dropped("bones that change their length", f"by {1000 * spread:.1f} mm")
     poses = normalised(joints[:: every(60 if subject in SLOW else raw_fps)])
-    states = poses.positions.astype(np.float32).reshape(-1, 3 * len(JOINTS))
-    if not pieces(states):
-        return report.drop(trial, f"less than {HORIZON} frames without glitches", f"of {len(states)}")
-    report.kept[trial] = _told(label, kind, path.name, states)
+    if not pieces(_states(poses)):
+        raise _Dropped(f"less than {HORIZON} frames without glitches", f"of {len(poses.positions)}")
     return poses, kind
+
+
+def _states(poses: Poses) -> NDArray[np.float32]:
+    return poses.positions.astype(np.float32).reshape(-1, 3 * len(JOINTS))
 
 
 def _told(label: str, kind: str, file: str, states: NDArray[np.float32]) -> dict[str, str | int]:

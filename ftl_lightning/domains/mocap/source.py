@@ -126,31 +126,32 @@ class Recorded:
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Poses of people who stand or walk with their arms down, in trials that are in no training split.
 
-        Nobody who demonstrates a new concept is among them. Without a folder they are made by rule, see
+        Trials are drawn alike; nobody who demonstrates a new concept is among them. Without a folder they are made by rule, see
         :mod:`ftl_lightning.domains.mocap.standing`.
         """
         draw = generator("cpu", seed, task_key(task))
         if self.root is None:
             return InitialStates({POSE: standing_poses(count, draw)})
-        known = self.arms_down
-        return InitialStates({POSE: known[torch.randint(len(known), (count,), generator=draw)]})
+        trials = self.arms_down
+        which = torch.randint(len(trials), (count,), generator=draw).tolist()
+        share = torch.rand(count, generator=draw).tolist()
+        found = [trials[trial][int(part * len(trials[trial]))] for trial, part in zip(which, share, strict=True)]
+        return InitialStates({POSE: torch.stack(found)})
 
     @cached_property
-    def arms_down(self) -> Tensor:
-        """What :meth:`starts` draws from ``(pose, 42)``.
+    def arms_down(self) -> tuple[Tensor, ...]:
+        """What :meth:`starts` draws from: of each trial with such poses, all of them ``(pose, 42)``.
 
         Raises:
             UserError: if there is none.
         """
         subjects = self.recordings.subject
-        held_out = [
-            piece.states for piece in self._pieces if piece.trial in self._validation and subjects[piece.trial] not in DEMONSTRATORS
-        ]
-        poses = torch.cat(held_out) if held_out else torch.empty(0, len(COLUMNS))
-        poses = poses[hang_down(poses)]
-        if not len(poses):
+        trials = {trial: self.recordings.trial(trial) for trial in sorted(self._validation)}
+        poses = [torch.from_numpy(trials[trial]) for trial in trials if subjects[trial] not in DEMONSTRATORS]
+        found = tuple(down for one in poses if len(down := one[hang_down(one)]))
+        if not found:
             raise UserError(f"{self.root}: expected held-out trials in which someone stands with arms down, found none")
-        return poses
+        return found
 
     @cached_property
     def _pieces(self) -> list[Piece]:

@@ -7,14 +7,14 @@ from ftl_lightning.domains.mocap.skeleton import COLUMNS
 
 _RIGHT_SIDE = (
     (0.09, 0.0, 0.0),
-    (0.14, 0.02, -0.40),
-    (0.12, -0.05, -0.80),
-    (0.17, -0.02, 0.45),
-    (0.23, -0.05, 0.18),
-    (0.24, 0.04, -0.03),
+    (0.09, 0.02, -0.40),
+    (0.09, -0.03, -0.83),
+    (0.18, 0.01, 0.51),
+    (0.21, -0.04, 0.22),
+    (0.22, 0.03, 0.05),
 )
 """Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of middle size."""
-_MIDDLE = ((0.0, -0.01, 0.47), (0.0, 0.02, 0.68))
+_MIDDLE = ((0.0, 0.02, 0.55), (0.0, 0.07, 0.73))
 
 
 def standing_poses(count: int, draw: torch.Generator) -> Tensor:

@@ -1,0 +1,108 @@
+"""Stick figures: strips of poses and films, limbs coloured by side, on a floor, all at the same scale."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.mocap import skeleton
+from ftl_lightning.domains.mocap.skeleton import BONES, FPS, HIPS, SHOULDERS, as_joints
+from ftl_lightning.domains.wireframe import Points, Wireframe, drawn, seen
+from ftl_lightning.evaluation.animation import side_by_side as side_by_side
+
+LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
+"""Colours of the person's own left and right limbs and of what is between; told apart by the colour-blind too."""
+MAX_SAMPLES, POSES = 8, 8
+"""Rows of a picture, and poses in a row."""
+STEP = 1.4
+"""Metres from one pose to the next; arms may reach into the neighbour's place."""
+SOLE = 0.08
+"""Metres from an ankle down to the floor."""
+HEAD = 0.11
+"""Radius of the drawn head in metres."""
+
+
+def _colour(a: int, b: int) -> str:
+    if {a, b} <= {*HIPS, *SHOULDERS, *skeleton.MIDDLE}:
+        return TRUNK
+    return RIGHT if a in skeleton.RIGHT else LEFT
+
+
+COLOURS = tuple(_colour(a, b) for a, b in BONES)
+"""Of each bone."""
+
+
+def wireframe(states: Tensor) -> Wireframe:
+    """A motion that can be drawn, standing on a floor.
+
+    States have the middle of the hips at the origin, so that nothing tells where the floor was. In every frame it is put below the
+    lowest joint: whoever squats comes down, and whoever jumps is seen to stretch, without leaving the floor.
+
+    Args:
+        states: ``(frame, 42)`` in metres.
+    """
+    points = np.ascontiguousarray(as_joints(states.detach().cpu()).numpy(), dtype=np.float32)
+    up = np.zeros(3, dtype=np.float32)
+    up[2] = 1
+    lowest = points[..., 2].min(axis=1)
+    return Wireframe(points + (SOLE - lowest)[:, None, None] * up, BONES, COLOURS, ((skeleton.HEAD, HEAD, TRUNK),), FPS)
+
+
+def film(states: Tensor) -> list[NDArray[np.uint8]]:
+    """Frames ``(240, 240, 3)`` of one motion ``(frame, 42)`` in metres."""
+    return drawn(wireframe(states))
+
+
+def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
+    """Strips of poses over time, the first at the left, one strip a sample.
+
+    Args:
+        states: ``(sample, frame, 42)`` in metres; at most :data:`MAX_SAMPLES` samples are shown.
+        right: whether the task holds, one entry a sample (green and red frames); ``None`` for grey frames.
+        title: above the strips.
+        starts: the first poses, which are not drawn apart: the plans begin with them.
+    """
+    shown = states[:MAX_SAMPLES]
+    figure = Figure(figsize=(8.2, 1.65 * len(shown) + 0.5), layout="constrained")
+    told = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
+    figure.suptitle(told, fontsize=9)
+    frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
+    for axes, plan, frame in zip(figure.subplots(len(shown), 1, squeeze=False).flat, shown, frames, strict=False):
+        _strip(axes, wireframe(plan), frame)
+    for colour, label in ((LEFT, "left"), (RIGHT, "right"), (TRUNK, "trunk")):
+        figure.axes[0].plot([], [], color=colour, linewidth=2, label=label)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=7, frameon=False, handlelength=1.2)
+    return figure
+
+
+def _strip(axes: Axes, motion: Wireframe, frame: str) -> None:
+    times = np.linspace(0, len(motion.points) - 1, min(POSES, len(motion.points))).round().astype(int)
+    axes.axhline(0, color="#b9bec4", linewidth=1, zorder=0)
+    for place, time in enumerate(times):
+        _pose(axes, seen(motion.points[time]), motion, STEP * place)
+        seconds = f"{time / motion.rate:.2f} s" if place else "0 s"
+        axes.text(STEP * place, -0.08, seconds, fontsize=6, color="#60656b", ha="center", va="top")
+    axes.set(xlim=(-STEP * 0.7, STEP * (POSES - 0.3)), ylim=(-0.34, motion.room[1] + 0.05), xticks=[], yticks=[], aspect="equal")
+    for spine in axes.spines.values():
+        spine.set(color=frame, linewidth=2.0)
+
+
+def _pose(axes: Axes, points: Points, motion: Wireframe, across: float) -> None:
+    depth = [float(points[a, 2] + points[b, 2]) for a, b in motion.lines]
+    order = np.argsort(depth).tolist()  # what is nearer hides what is behind it
+    at = points[:, :2] + (across, 0)
+    lines = LineCollection(
+        [at[list(motion.lines[index])] for index in order],
+        colors=[motion.colours[index] for index in order],
+        linewidths=2.0,
+        capstyle="round",
+    )
+    axes.add_collection(lines)
+    for point, radius, colour in motion.heads:
+        angle = np.linspace(0, 2 * np.pi, 24)
+        axes.fill(at[point, 0] + radius * np.cos(angle), at[point, 1] + radius * np.sin(angle), color=colour, linewidth=0)

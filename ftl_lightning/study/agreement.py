@@ -1,0 +1,27 @@
+"""Agreement between raters who put things into categories."""
+
+import math
+from collections import Counter
+from collections.abc import Hashable, Iterable, Sequence
+
+
+def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
+    """Krippendorff's alpha of categories without an order.
+
+    ``1 - D_observed / D_expected``: 1 where all agree, 0 where they agree as often as by chance, less where less. (K. Krippendorff,
+    "Computing Krippendorff's Alpha-Reliability", 2011, part C and D.)
+
+    Args:
+        units: for everything that was judged, the categories that raters gave it, in any order; who gave none is left out, and a
+            unit that fewer than two raters judged does not count.
+
+    Returns:
+        alpha, or NaN where nothing varies: then agreement cannot be told from a habit.
+    """
+    paired = [Counter(unit) for unit in units if len(unit) > 1]
+    totals = sum(paired, Counter())
+    count = totals.total()
+    # Pairs within a unit that differ, each unit with a weight that makes every value count once.
+    observed = sum((u.total() ** 2 - sum(n * n for n in u.values())) / (u.total() - 1) for u in paired)
+    expected = count**2 - sum(n * n for n in totals.values())
+    return 1 - (count - 1) * observed / expected if expected else math.nan

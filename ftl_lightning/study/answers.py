@@ -1,0 +1,173 @@
+"""What raters answered: files that their browsers saved, read and checked against a study's key."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.study.page import FORMAT, KEY_KIND
+from ftl_lightning.study.questions import BEST, CHECK, DEPICTS, NO, REPEAT, YES
+
+ANSWERS_KIND = "study answers"
+REPEATS_THAT_MAY_DIFFER = 0.5
+"""Share of the questions asked twice that an attentive rater may answer both ways."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """What a study's questions and films are.
+
+    Attributes:
+        study, page: 16-digit names of the study and of its page.
+        questions: by id: ``kind``, ``text``, ``films``, and ``expected`` of a check, ``scenario`` and ``setting`` of a comparison.
+        films: by id: ``setting``, ``scenario``, ``concept``, ``method``, where it is from.
+    """
+
+    study: str
+    page: str
+    questions: Mapping[str, Mapping[str, Any]]
+    films: Mapping[str, Mapping[str, Any]]
+
+    def of_kind(self, kind: str) -> dict[str, Mapping[str, Any]]:
+        """Questions of one kind, by id."""
+        return {name: question for name, question in self.questions.items() if question["kind"] == kind}
+
+
+@dataclass(frozen=True)
+class Rater:
+    """One person's answers.
+
+    Attributes:
+        file: they came from.
+        name: 16 digits that the browser drew.
+        answers: by question: ``'yes'``, ``'no'``, or a film's id.
+    """
+
+    file: Path
+    name: str
+    answers: Mapping[str, str]
+
+
+def _json(path: Path, kind: str) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: expected a {kind} file, found nothing") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign one ({error})") from error
+    found = content.get("kind") if isinstance(content, dict) else None
+    if found != kind:
+        raise UserError(f"{path}: expected a {kind} file, found {f'a {found} file' if found else 'a file of other software'}")
+    if content.get("format") != FORMAT:
+        raise UserError(f"{path}: key 'format': expected {FORMAT}, found {content.get('format')!r}; it is of another version")
+    return content
+
+
+def read_key(path: Path) -> Key:
+    """The key that ``study`` wrote.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged or something else.
+    """
+    content = _json(path, KEY_KIND)
+    try:
+        key = Key(str(content["study"]), str(content["page"]), dict(content["questions"]), dict(content["films"]))
+        for question in key.questions.values():
+            needed = {CHECK: ("expected",), BEST: ("scenario", "setting")}.get(question["kind"], ())
+            if any(part not in question for part in needed) or not {*question["films"]} <= key.films.keys():
+                raise KeyError("questions")
+        for film in key.films.values():
+            _ = film["setting"], film["scenario"], film["method"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path}: expected a study's key with study, page, questions and films, found a damaged one ({error})"
+        ) from error
+    return key
+
+
+def read_rater(path: Path, key: Key) -> Rater:
+    """One file of answers.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, of another study, of another page, or not finished.
+    """
+    content = _json(path, ANSWERS_KIND)
+    for part, expected in (("study", key.study), ("page", key.page)):
+        if content.get(part) != expected:
+            raise UserError(
+                f"{path}: key {part!r}: expected {expected}, found {content.get(part)!r}; the answers are of another {part}"
+            )
+    name, given = content.get("rater"), content.get("answers")
+    if not isinstance(name, str) or not name or not isinstance(given, list):
+        raise UserError(f"{path}: expected a rater and a list of answers, found a damaged file")
+    answers: dict[str, str] = {}
+    for entry in given:
+        if entry is None:  # the browser's word for a question that was not reached
+            continue
+        asked = entry.get("id") if isinstance(entry, dict) else None
+        question = key.questions.get(asked) if isinstance(asked, str) else None
+        if question is None or entry["id"] in answers:
+            raise UserError(f"{path}: key 'answers': expected one answer to each question, found {str(entry)[:60]}")
+        allowed = (YES, NO) if question["kind"] != BEST else question["films"]
+        if entry.get("answer") not in allowed:
+            told = " or ".join(allowed)
+            raise UserError(f"{path}: answer to {entry['id']}: expected {told}, found {entry.get('answer')!r}")
+        answers[entry["id"]] = entry["answer"]
+    if not content.get("finished") or len(answers) < len(key.questions):
+        raise UserError(
+            f"{path}: expected {len(key.questions)} answers of a finished run, found {len(answers)}; finish it in the same browser"
+        )
+    return Rater(path, name, answers)
+
+
+def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]]:
+    """Files of answers; of those that cannot be read it is told why, and the others go on.
+
+    Args:
+        paths: files, or folders whose ``answers*.json`` are meant.
+        key: of the study.
+
+    Returns:
+        Raters, each once, and one line for every file that is refused.
+    """
+    files: list[Path] = []
+    refused: list[str] = []
+    for path in paths:
+        inside = sorted(path.glob("answers*.json")) if path.is_dir() else [path]
+        if not inside:
+            refused.append(f"{path}: expected files answers*.json in this folder, found none")
+        files += inside
+    raters: dict[str, Rater] = {}
+    for path in dict.fromkeys(files):
+        try:
+            rater = read_rater(path, key)
+        except UserError as error:
+            refused.append(str(error))
+            continue
+        if rater.name in raters:
+            refused.append(
+                f"{path}: expected another rater than {raters[rater.name].file} has, found the same; keep one of the two"
+            )
+            continue
+        raters[rater.name] = rater
+    return list(raters.values()), refused
+
+
+def inattention(rater: Rater, key: Key) -> str:
+    """Why a rater's answers do not count, or nothing if they do.
+
+    A rater has failed who answers any check wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions in
+    two ways.
+    """
+    checks = key.of_kind(CHECK)
+    wrong = sum(rater.answers[name] != question["expected"] for name, question in checks.items())
+    if wrong:
+        return f"{wrong} of {len(checks)} attention checks answered wrongly"
+    first = {(question["text"], *question["films"]): name for name, question in key.of_kind(DEPICTS).items()}
+    pairs = [(name, first[(question["text"], *question["films"])]) for name, question in key.of_kind(REPEAT).items()]
+    differ = sum(rater.answers[one] != rater.answers[other] for one, other in pairs)
+    if differ > REPEATS_THAT_MAY_DIFFER * len(pairs):
+        return f"{differ} of {len(pairs)} questions that were asked twice answered in two ways"
+    return ""

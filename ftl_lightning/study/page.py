@@ -1,0 +1,169 @@
+"""The page that raters open: one file with films, questions and its own program, which asks nothing of a network."""
+
+import base64
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.wireframe import ABOVE, Wireframe, seen, window
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.animation import frame_milliseconds, gif
+from ftl_lightning.study.films import read_films
+from ftl_lightning.study.questions import Questions, ask, film_id
+from ftl_lightning.tensor_file import bytes_hash, content_hash, write_text
+
+PAGE, KEY = "study.html", "key.json"
+KEY_KIND, FORMAT = "study key", 1
+"""Of the key's file."""
+HERE = Path(__file__).parent
+CONSENT = (
+    "You will see short films of generated behaviour and say what they depict. It takes about {minutes} minutes. "
+    "Nobody asks for your name. Your answers stay in this browser until you save them as a file yourself at the end. "
+    "You may stop at any time, and what you do not save is not used. Some questions check attention."
+)
+"""What raters agree to, unless whoever runs the study says otherwise."""
+AGREE = "I am 18 or older, I have read this, and I take part voluntarily."
+SECONDS_A_QUESTION = 9
+MILLIMETRES = 1000
+
+
+@dataclass(frozen=True)
+class Made:
+    """What :func:`make_study` wrote.
+
+    Attributes:
+        page, key: the files.
+        study: 16-digit name of the study.
+        size: of the page in bytes; films: in it; questions: a rater answers.
+    """
+
+    page: Path
+    key: Path
+    study: str
+    size: int
+    films: int
+    questions: int
+
+
+def make_study(
+    domain: Domain, films: Path, out: Path, scenarios: int, repeats: int, still: int, seed: int, title: str = "", consent: str = ""
+) -> Made:
+    """Write a study's page and key; the same films and options give the same bytes.
+
+    Args:
+        domain: whose behaviour the films show.
+        films: folder, see :func:`~ftl_lightning.study.films.read_films`.
+        out: folder to write to.
+        scenarios: of each concept.
+        repeats, still: checks, see :func:`~ftl_lightning.study.questions.ask`.
+        seed: deals out the films' numbers.
+        title: of the page; empty for one that tells nothing.
+        consent: what raters agree to; empty for :data:`CONSENT`.
+
+    Raises:
+        UserError: for a domain without films, for films that are missing, and where ``out`` has the key of another study.
+    """
+    if domain.show.film is None and domain.show.wireframe is None:
+        raise UserError(f"domain: expected one whose plans are filmed, found {domain.name}, which has no films")
+    questions = ask(read_films(films, domain, scenarios, seed), repeats, still, seed)
+    minutes = max(1, round(len(questions.page) * SECONDS_A_QUESTION / 60))
+    content: dict[str, Any] = {
+        "title": title or "Which films depict what they should?",
+        "consent": (consent.strip() or CONSENT).replace("{minutes}", str(minutes)),
+        "agree": AGREE,
+        "questions": questions.page,
+        **_drawings(domain, questions),
+    }
+    content["study"] = content_hash(content)
+    content["page"] = bytes_hash(_html({**content, "page": ""}).encode())
+    key = {
+        "kind": KEY_KIND,
+        "format": FORMAT,
+        "study": content["study"],
+        "page": content["page"],
+        "domain": domain.name,
+        "seed": seed,
+        "questions": questions.key,
+        "films": questions.shown,
+    }
+    _keep_other_keys(out / KEY, content["study"])
+    text = _html(content)
+    write_text(out / KEY, json.dumps(key, indent=1, ensure_ascii=False) + "\n")
+    write_text(out / PAGE, text)
+    return Made(out / PAGE, out / KEY, content["study"], len(text.encode()), len(questions.films), len(questions.page))
+
+
+def _keep_other_keys(path: Path, study: str) -> None:
+    """Without its key nobody can read a study's answers any more."""
+    if path.is_file():
+        try:
+            found = json.loads(path.read_text(encoding="utf-8")).get("study")
+        except (OSError, ValueError, AttributeError):
+            found = "something else"
+        if found != study:
+            raise UserError(f"{path}: expected no key of another study, found that of {found}; name another folder with --out")
+
+
+def _drawings(domain: Domain, questions: Questions) -> dict[str, Any]:
+    """Films for the page: what moves, if the domain can say it, or else animations."""
+    motions = [film.states[:1] if number in questions.still else film.states for number, film in enumerate(questions.films)]
+    if domain.show.wireframe is not None:
+        # As long as the others, so that its length does not tell a standing picture.
+        frames = max(len(film.states) for film in questions.films)
+        standing = [states.expand(frames, -1) if len(states) == 1 else states for states in motions]
+        return _lines([domain.show.wireframe(states) for states in standing])
+    assert domain.show.film is not None
+    return _animations([domain.show.film(states) for states in motions], questions)
+
+
+def _lines(wireframes: Sequence[Wireframe]) -> dict[str, Any]:
+    first = wireframes[0]
+    left, lower, side = window(wireframes)
+    films = {}
+    for number, one in enumerate(wireframes):
+        whole = np.clip(np.rint(seen(one.points) * MILLIMETRES), -32768, 32767).astype("<i2")  # a body is within 32 m
+        films[film_id(number)] = {"frames": len(whole), "points": base64.b64encode(whole.tobytes()).decode()}
+    drawing = {
+        "points": first.points.shape[1],
+        "lines": first.lines,
+        "colours": first.colours,
+        "heads": first.heads,
+        "rate": first.rate,
+        "window": [round(left, 4), round(lower, 4), round(side, 4)],
+        "floor": first.room[0],
+        "above": ABOVE,
+    }
+    return {"films": films, "drawing": drawing}
+
+
+def _animations(pictures: Sequence[Sequence[np.ndarray[Any, Any]]], questions: Questions) -> dict[str, Any]:
+    films: dict[str, Any] = {}
+    for number, frames in enumerate(pictures):
+        still = number in questions.still
+        shown = list(frames[:1]) * 2 if still else list(frames)  # an animation of one frame would be told by its form
+        films[film_id(number)] = {
+            "gif": base64.b64encode(gif(shown)).decode(),
+            "seconds": len(shown) * frame_milliseconds(len(shown)) / 1000,
+        }
+    return {"films": films, "drawing": None}
+
+
+def _html(content: Mapping[str, Any]) -> str:
+    # What opens a tag is written another way, so that no concept's words can end the script element.
+    data = json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
+    parts = {
+        "%TITLE%": html.escape(str(content["title"])),
+        "%STYLE%": (HERE / "page.css").read_text(encoding="utf-8"),
+        "%SCRIPT%": (HERE / "page.js").read_text(encoding="utf-8"),
+        "%DATA%": data,
+    }
+    text = (HERE / "page.html").read_text(encoding="utf-8")
+    for mark, part in parts.items():
+        text = text.replace(mark, part, 1)
+    return text

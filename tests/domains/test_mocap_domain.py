@@ -1,0 +1,265 @@
+"""Motion capture as a domain: body, concepts, demonstrations from a folder, and where behaviour starts."""
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.data import InversionData, PretrainingData, shares
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.mocap import DOMAIN
+from ftl_lightning.domains.mocap.recordings import FILE, Recordings
+from ftl_lightning.domains.mocap.segments import SEGMENTS
+from ftl_lightning.domains.mocap.skeleton import (
+    BONES,
+    COLUMNS,
+    GROUPS,
+    HORIZON,
+    JOINTS,
+    LEFT,
+    MIRROR,
+    R_WRIST,
+    RIGHT,
+    as_joints,
+    bone_lengths,
+    mirrored,
+)
+from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, glitches, hang_down, pieces
+from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text, reads
+from ftl_lightning.errors import UserError
+from tests.domains.mocap_samples import folder, motion, recordings
+
+NAME = "ftl_lightning.domains.mocap:DOMAIN"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return folder(tmp_path / "recordings")
+
+
+def test_every_column_belongs_to_one_part_of_the_body() -> None:
+    assert sorted(column for group in GROUPS.values() for column in group) == list(range(len(COLUMNS)))
+    assert {COLUMNS[column].split(".")[0] for column in GROUPS["arms"]} == {"RElbow", "RWrist", "LElbow", "LWrist"}
+
+
+def test_the_mirror_image_exchanges_left_and_right() -> None:
+    states = torch.from_numpy(motion(5, 1)).flatten(1)
+    states[:, 3 * R_WRIST] += 0.3
+    other = mirrored(states)
+    assert torch.equal(mirrored(other), states)
+    assert [JOINTS[joint] for joint in MIRROR][:2] == ["LHip", "LKnee"]
+    assert torch.equal(as_joints(other)[:, LEFT, 0], -as_joints(states)[:, RIGHT, 0])
+    assert torch.equal(as_joints(other)[:, LEFT, 1:], as_joints(states)[:, RIGHT, 1:])
+    lengths = bone_lengths(states)
+    assert lengths.shape == (5, len(BONES))
+    assert lengths.sort(dim=1).values == pytest.approx(bone_lengths(other).sort(dim=1).values)
+
+
+def test_texts_are_cleaned_and_mirrored() -> None:
+    assert cleaned("charleston_side_by_side_female ") == "charleston side by side female"
+    assert cleaned("ZombieWalk") == "zombie walk"
+    assert mirrored_text("walk, 90-degree left turn") == "walk, 90-degree right turn"
+    assert mirrored_text("dribble, 90-degree right turns") == "dribble, 90-degree left turns"
+    assert mirrored_text("climb, left, right, upright") == "climb, right, left, upright"
+    assert all(cleaned(text) == text for text in TRAINING_CONCEPTS)
+    assert len(set(TRAINING_CONCEPTS)) == len(TRAINING_CONCEPTS)
+
+
+def test_new_concepts_are_no_training_concepts_and_goals_may_join_several() -> None:
+    assert not set(NEW_CONCEPTS) & set(TRAINING_CONCEPTS)
+    assert not [text for text in TRAINING_CONCEPTS if "jumping jack" in text]
+    assert reads("jumping jacks + walk")
+    assert reads("walk")
+    assert not reads("walk + ")
+    assert not reads("fly")
+    assert SUITES["paper"].learned == ("jumping jacks", "arm circle")
+    assert {"training", "paper", "validation"} <= set(SUITES)
+
+
+def test_the_table_holds_every_description() -> None:
+    data = PretrainingData(domain=NAME, root="/nowhere")  # nothing is read before it is needed
+    assert data.encoder(DOMAIN.concepts.descriptions).shape == (len(DOMAIN.concepts.descriptions), 384)
+
+
+def test_trials_are_cut_at_glitches_and_into_parts_that_lose_no_window() -> None:
+    states = motion(400, 1)
+    states[150:] += 0.5
+    flat = states.reshape(400, -1)
+    assert glitches(flat) == [150]
+    found = pieces(flat)
+    assert [len(piece) for piece in found] == [128, 53, 128, 128, 56]
+    starts = sum(len(piece) - HORIZON + 1 for piece in found)
+    assert starts == (150 - HORIZON + 1) + (250 - HORIZON + 1)
+    assert [len(piece) for piece in pieces(flat, longest=None)] == [150, 250]
+    assert not pieces(flat[:31])
+    assert max(len(piece) for piece in found) == LONGEST
+
+
+def test_training_has_every_piece_and_its_mirror_image(root: Path) -> None:
+    found = Recorded(root).split("train", 1, 0)
+    assert found.concepts.count("walk") == 8  # one of five trials is held out
+    assert found.concepts.count("walk, veer left") == found.concepts.count("walk, veer right") == 2
+    right = "basketball - forward dribble, 90-degree right turns, crossover dribble"
+    assert found.concepts.count(right) == 1  # the mirror image of its text is no training concept
+    assert set(found.concepts) <= set(TRAINING_CONCEPTS)
+    half = [row for row, text in enumerate(found.concepts) if text == "walk"]
+    assert torch.equal(mirrored(found.states[half[0], :70]), found.states[half[4], :70])
+    assert torch.equal(found.observed[POSE], found.states)
+    assert found.lengths.min() >= HORIZON
+
+
+def test_validation_is_of_other_trials(root: Path) -> None:
+    source = Recorded(root)
+    train, validation = source.split("train", 1, 0), source.split("validation", 1, 0)
+    assert validation.provenance["trials"] == ["02_05"]
+    assert not set(validation.provenance["trials"]) & set(train.provenance["trials"])
+    assert not set(HELD_OUT) & {*train.provenance["trials"], *validation.provenance["trials"]}
+
+
+def test_other_figures_and_other_descriptions_stay_out(tmp_path: Path) -> None:
+    recordings({"02_01": ("walk", motion(60, 1))}, kind="bvh_daz").save(tmp_path / FILE)
+    with pytest.raises(UserError, match="expected trials of the training concepts for train, found none"):
+        Recorded(tmp_path).split("train", 1, 0)
+
+
+def test_new_concepts_are_demonstrated_by_segments(root: Path) -> None:
+    source = Recorded(root)
+    found = source.draw("jumping jacks", 2, 0)
+    assert sorted(found.lengths.tolist()) == [54, 117]
+    more = source.draw("jumping jacks", 5, 0)
+    assert more.concepts == ("jumping jacks",) * 5
+    assert sorted(more.lengths.tolist()[:2]) == [54, 117]
+    assert more.lengths[2:].min() >= HORIZON
+    assert more.lengths[2:].max() <= 117
+    assert torch.equal(source.draw("jumping jacks", 5, 0).states, more.states)
+    assert not torch.equal(source.draw("jumping jacks", 5, 1).states[2:, :HORIZON], more.states[2:, :HORIZON])
+    assert set(source.draw("walk", 9, 3).concepts) == {"walk"}
+
+
+def test_segments_of_ones_own_take_the_place_of_the_shipped_ones(root: Path) -> None:
+    (root / SEGMENTS).write_text("trial_id,label,start30,stop30\n13_29,knee raise,10,70\n")
+    source = Recorded(root)
+    assert source.draw("knee raise", 1, 0).lengths.tolist() == [60]
+    with pytest.raises(UserError, match=r"task: expected a concept that trials in .* show, found 'jumping jacks', which none does"):
+        source.draw("jumping jacks", 1, 0)
+
+
+def test_whole_trials_demonstrate_what_they_show(tmp_path: Path) -> None:
+    trials = {"79_01": ("chop wood", motion(90, 1)), "80_71": ("chop wood", motion(100, 2))}
+    recordings(trials).save(tmp_path / FILE)
+    assert sorted(Recorded(tmp_path).draw("chop wood", 2, 0).lengths.tolist()) == [90, 100]
+
+
+def test_behaviour_starts_with_arms_down_in_trials_of_no_training_split(root: Path) -> None:
+    source = Recorded(root)
+    found = source.starts("jumping jacks", 20, 0)
+    poses = found.observed[POSE]
+    assert poses.shape == (20, 42)
+    assert hang_down(poses).all()
+    assert torch.equal(source.starts("jumping jacks", 20, 0).observed[POSE], poses)
+    assert not torch.equal(source.starts("jumping jacks", 20, 1).observed[POSE], poses)
+    assert not torch.equal(source.starts("walk", 20, 0).observed[POSE], poses)
+    train = source.split("train", 1, 0).states.flatten(0, 1)
+    assert torch.cdist(poses, train).min() > 0
+
+
+def test_without_recordings_people_of_different_sizes_stand_and_wait() -> None:
+    poses = Recorded(None).starts("walk", 5, 0).observed[POSE]
+    assert hang_down(poses).all()
+    assert len(poses.unique(dim=0)) == 5
+    arms_up = poses.clone()
+    arms_up[:, 3 * R_WRIST + 2] = 0.9
+    assert not hang_down(arms_up).any()
+
+
+@pytest.mark.parametrize("made", [None, "nowhere", "empty", "other", "file"])
+def test_a_missing_root_is_told_in_one_line(made: str | None, tmp_path: Path) -> None:
+    found = None if made is None else tmp_path / made
+    if found is not None and made in ("empty", "other"):
+        found.mkdir()
+    if found is not None and made == "other":
+        (found / "holiday.jpg").write_text("")
+    if found is not None and made == "file":
+        found.write_text("")
+    data = PretrainingData(domain=NAME, root=None if found is None else str(found))
+    with pytest.raises(UserError, match=r"mocap\.cs\.cmu\.edu.*python -m ftl_lightning prepare mocap --root") as told:
+        data.setup("fit")
+    assert "\n" not in str(told.value)
+    with pytest.raises(UserError, match="prepare mocap"):
+        InversionData(NAME, root=None if found is None else str(found))
+
+
+def test_batches_are_windows_that_start_in_the_observed_pose(root: Path) -> None:
+    data = PretrainingData(domain=NAME, root=str(root), batch_size=64)
+    data.setup("fit")
+    batch = data.batch(3)
+    assert batch.states.shape == (64, HORIZON, 42)
+    assert torch.equal(batch.states[:, 0], batch.observed[POSE])
+    assert not (batch.states[:, -1] == batch.states[:, -2]).all(dim=1).any()  # none reaches past an end
+    every = data.every_window()
+    assert len(every.states) == int((data.training.lengths - HORIZON + 1).sum())
+
+
+def test_a_domain_that_comes_to_rest_lets_windows_reach_past_the_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    resting: Domain = replace(DOMAIN, plans=replace(DOMAIN.plans, at_rest=True))
+    monkeypatch.setattr("ftl_lightning.domains.mocap.DOMAIN", resting)
+    data = PretrainingData(domain="ftl_lightning.domains.mocap.domain:DOMAIN", root=str(root), batch_size=64)
+    data.domain = resting
+    data.setup("fit")
+    still = (data.batch(3).states[:, -1] == data.batch(3).states[:, -2]).all(dim=1)
+    assert still.any()
+
+
+def test_concepts_are_drawn_by_a_power_of_their_size() -> None:
+    lengths = torch.tensor([10, 30, 60])
+    found = Demonstrations(torch.zeros(3, 60, 1), lengths, "", ("x",), ("",), ("few", "many", "few"))
+    assert shares(found, 1) == pytest.approx([0.1, 0.3, 0.6])
+    assert shares(found, 0) == pytest.approx([0.5 / 7, 0.5, 3 / 7])
+    few, many = 70**0.5, 30**0.5
+    assert shares(found, 0.5)[1].item() == pytest.approx(many / (few + many))
+
+
+def test_balance_changes_what_is_drawn_and_none_does_not(root: Path) -> None:
+    plain = PretrainingData(domain=NAME, root=str(root), batch_size=512)
+    even = PretrainingData(domain=NAME, root=str(root), batch_size=512, balance=0)
+    for data in (plain, even):
+        data.setup("fit")
+    assert "balance" not in plain.hparams
+    counts = even.batch(0).concepts.bincount()
+    assert counts[counts > 0].min() > 512 / 4 * 0.7  # four concepts alike
+    assert not torch.equal(plain.batch(0).concepts, even.batch(0).concepts)
+    assert torch.equal(even.batch(5).states, even.batch(5).states)
+    with pytest.raises(UserError, match=re.escape("data.balance: expected a number from 0 to 1, found 2")):
+        PretrainingData(domain=NAME, balance=2)
+
+
+def test_new_concepts_are_learned_from_what_a_folder_holds(root: Path) -> None:
+    data = InversionData(NAME, root=str(root), demonstrations_per_concept=3, suite="validation")
+    assert data.concepts == ("knee raise",)
+    assert len(data.demonstrations) == 3
+    with pytest.raises(UserError, match="found 'chop wood', which none does"):
+        InversionData(NAME, root=str(root), suite="database")
+
+
+def test_recordings_give_every_training_concept() -> None:
+    """Where recordings are named: all concepts, new ones too, and people to start from."""
+    named = os.environ.get("FTL_LIGHTNING_DATA")
+    if not named:
+        pytest.skip("FTL_LIGHTNING_DATA names no folder of recordings")
+    source = Recorded(Path(named))
+    train = source.split("train", 1, 0)
+    assert set(train.concepts) == set(TRAINING_CONCEPTS)
+    assert not set(train.provenance["trials"]) & set(HELD_OUT)
+    assert source.draw("jumping jacks", 5, 0).lengths.min() >= HORIZON
+    assert source.draw("arm circle", 2, 0).lengths.tolist() != []
+    assert len(source.arms_down) > 10
+    poses = source.starts("jumping jacks", 100, 0).observed[POSE]
+    assert len(poses.unique(dim=0)) > 80
+    lengths = bone_lengths(poses)[:, :2]
+    assert ((lengths > 0.3) & (lengths < 0.55)).all()
+    other = Recordings.load(next(path for path in Path(named).glob("*.npz") if "segment" not in path.name))
+    assert len(other) == len(source.recordings)

@@ -1,0 +1,418 @@
+"""Reading motion capture: kinematics, the folder of a user's own copy, and everything that can be wrong with it."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ftl_lightning.cli import main
+from ftl_lightning.domains.mocap.asf_amc import INCH, JOINT_BONES, read_amc, read_asf
+from ftl_lightning.domains.mocap.bvh import METRES, NODES, read_bvh
+from ftl_lightning.domains.mocap.normalise import normalised, z_up
+from ftl_lightning.domains.mocap.prepare import REPORT, prepare
+from ftl_lightning.domains.mocap.recordings import FILE, Recordings, read_folder
+from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments, shipped_segments
+from ftl_lightning.domains.mocap.skeleton import JOINTS
+from ftl_lightning.errors import UserError
+from tests.domains.mocap_samples import BONES, amc, asf, database, swing
+
+UNIT = INCH / 0.45
+WALK, TURN = {"02_01": "walk"}, {"02_01": "walk", "02_02": "Walk, Veer_Left"}
+
+
+def joints(tmp_path: Path, *frames: dict[str, str], skeleton: str = "") -> NDArray[np.float64]:
+    """Where joints are in frames, in units of the file."""
+    (tmp_path / "02.asf").write_text(skeleton or asf())
+    (tmp_path / "02_01.amc").write_text(amc(list(frames)))
+    body = read_asf(tmp_path / "02.asf")
+    return body.joints(read_amc(tmp_path / "02_01.amc", body)) / UNIT
+
+
+def at(found: NDArray[np.float64], bone: str, frame: int = 0) -> list[float]:
+    """Where a bone ends."""
+    return np.round(found[frame, JOINT_BONES.index(bone)], 6).tolist()
+
+
+def told(folder: Path) -> str:
+    """What ``prepare`` refuses a folder with."""
+    with pytest.raises(UserError) as refused:
+        prepare(folder)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def test_at_rest_bones_reach_along_their_directions(tmp_path: Path) -> None:
+    found = joints(tmp_path, {})
+    assert at(found, "rradius") == [-11.5, 23, 0]
+    assert at(found, "head") == [0, 26.5, 0]
+    assert at(found, "lhipjoint") == np.round([2 / np.sqrt(2), 17 - 2 / np.sqrt(2), 0], 6).tolist()
+
+
+def test_rotations_are_applied_x_first_then_y_then_z(tmp_path: Path) -> None:
+    found = joints(tmp_path, {"lhumerus": "90 0 0"}, {"lhumerus": "0 90 0"}, {"lhumerus": "0 90 90"}, {"root": "0 0 0 0 0 90"})
+    assert at(found, "lhumerus", 0) == [8, 23, 0]
+    assert at(found, "lhumerus", 1) == [3, 23, -5]
+    assert at(found, "lhumerus", 2) == [3, 23, -5]  # about y to -z, which z does not move
+    assert at(found, "head", 3) == [-9.5, 0, 0]
+
+
+def test_a_bone_turns_about_its_own_axes(tmp_path: Path) -> None:
+    found = joints(tmp_path, {"lradius": "90"}, {"lfemur": "90 0 0"})
+    assert at(found, "lradius", 0) == [11.5, 23, 0]  # along its own x axis
+    hip, knee = found[1, JOINTS.index("LHip")], found[1, JOINTS.index("LKnee")]
+    turn = np.deg2rad(20)  # x of the axes, turned by 20 degrees about z
+    expected = 7 * np.array([np.sin(turn) * np.cos(turn) * -1, -(np.sin(turn) ** 2), -np.cos(turn)])
+    assert knee - hip == pytest.approx(expected, abs=1e-9)
+
+
+def test_children_turn_with_their_parents(tmp_path: Path) -> None:
+    found = joints(tmp_path, {"thorax": "0 0 90"})
+    assert at(found, "rradius") == [-6, 17 - 11.5, 0]
+
+
+def test_orders_units_and_radians_are_read(tmp_path: Path) -> None:
+    usual = joints(tmp_path, {"root": "1 2 3 0 30 60"})
+    mixed = asf().replace("order TX TY TZ RX RY RZ", "order RZ RY TX TY TZ RX")
+    (tmp_path / "02.asf").write_text(mixed)
+    body = read_asf(tmp_path / "02.asf")
+    text = amc([{"root": "60 30 1 2 3 0"}])
+    (tmp_path / "02_01.amc").write_text(text)
+    other = body.joints(read_amc(tmp_path / "02_01.amc", body)) / UNIT
+    (tmp_path / "02_01.amc").write_text(
+        text.replace("DEGREES", "RADIANS").replace("60 30 1 2 3 0", f"{np.pi / 3} {np.pi / 6} 1 2 3 0")
+    )
+    radians = body.joints(read_amc(tmp_path / "02_01.amc", body)) / UNIT
+    assert radians == pytest.approx(other, abs=1e-6)
+    assert np.linalg.norm(other[0] - other[0, 0], axis=1) == pytest.approx(np.linalg.norm(usual[0] - usual[0, 0], axis=1))
+    assert other[0] != pytest.approx(usual[0])  # z first is another turn
+    (tmp_path / "02.asf").write_text(asf().replace("length 0.45", "length 0.9"))
+    assert read_asf(tmp_path / "02.asf").metres == pytest.approx(INCH / 0.9)
+
+
+def test_hips_are_put_at_the_origin_and_turned_to_the_front(tmp_path: Path) -> None:
+    frames = [{"root": f"{frame} 17 5 0 {40 * frame} 0"} for frame in range(9)]
+    poses = normalised(z_up(joints(tmp_path, *frames) * UNIT))
+    right, left = poses.positions[:, 0], poses.positions[:, 3]
+    assert right + left == pytest.approx(0, abs=1e-12)
+    assert (right[:, 0] > 0).all()
+    assert right[:, 1] == pytest.approx(0, abs=1e-12)
+    assert poses.positions == pytest.approx(poses.positions[:1].repeat(9, axis=0))  # only root and yaw differed
+    assert poses.positions[0, -1, 2] > 0.5
+    turns = np.diff(np.unwrap(poses.root[:, 3]))
+    assert turns == pytest.approx(np.deg2rad(40))
+    assert np.diff(poses.root[:, 2]) == pytest.approx(0)
+
+
+def test_a_knee_bends_backwards_which_is_behind(tmp_path: Path) -> None:
+    poses = normalised(z_up(joints(tmp_path, {"rfemur": "-60 0 0", "lfemur": "-60 0 0"}) * UNIT))
+    assert (poses.positions[0, [1, 4], 1] > 0.1).all()  # thighs lifted to the front, which is +y
+
+
+def test_a_database_becomes_one_file_and_a_report(tmp_path: Path) -> None:
+    text = prepare(database(tmp_path / "cmu", TURN), tmp_path / "out")
+    found = Recordings.load(tmp_path / "out" / FILE)
+    assert (found.trial_id, found.label, found.subject) == (("02_01", "02_02"), ("walk", "walk, veer left"), ("02", "02"))
+    assert found.kind == ("asf_amc", "asf_amc")
+    assert found.positions.shape == (80, 14, 3)  # every fourth of 160 frames, twice
+    assert "kept: 2 trials, 80 frames at 30 a second, 2 descriptions" in text
+    assert "mocap.cs.cmu.edu" in text
+    report = json.loads((tmp_path / "out" / REPORT).read_text())
+    assert report["kept"]["02_02"] == {
+        "label": "walk, veer left", "kind": "asf_amc", "file": "02_02.amc", "frames": 40, "glitches": 0,
+    }  # fmt: skip
+
+
+def test_slow_recordings_are_thinned_out_less(tmp_path: Path) -> None:
+    prepare(database(tmp_path, {"87_03": "backflip"}))
+    assert len(Recordings.load(tmp_path / FILE).positions) == 80
+
+
+def test_the_command_line_prepares(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = database(tmp_path / "cmu", WALK)
+    domain = "ftl_lightning.domains.mocap:DOMAIN"
+    assert main(["prepare", domain, "--root", str(folder), "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / FILE).is_file()
+    assert "kept: 1 trials" in capsys.readouterr().out
+    assert main(["prepare", domain]) == 2
+    assert "error: root: expected a folder with your copy of the database, found none" in capsys.readouterr().err
+    assert main(["prepare", "agent"]) == 2
+    assert "needs nothing of the kind" in capsys.readouterr().err
+
+
+def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
+    trials = TURN | {"02_03": "juggling", "02_04": "Unknown", "02_05": "walk", "02_06": "walk", "02_07": "walk", "02_08": "walk"}
+    folder = database(tmp_path, trials)
+    (folder / "02_05.amc").write_text(amc(swing(100)))
+    (folder / "02_06.amc").write_text(amc(swing(160)).replace("lradius 0", "lradius zero", 1))
+    wild = [{"root": f"0 17 0 0 0 {170 * (frame // 4 % 2)}"} for frame in range(160)]
+    (folder / "02_07.amc").write_text(amc(wild))
+    (folder / "02_08.amc").rename(folder / "05_08.amc")
+    (folder / "cmu-mocap-index.csv").write_text((folder / "cmu-mocap-index.csv").read_text() + '\n05_08,walk,"someone"')
+    (folder / "readme.amc").write_text("")
+    text = prepare(folder)
+    assert "kept: 2 trials" in text
+    assert "dropped, description that is no training concept: 1 (02_03 (juggling))" in text
+    assert "dropped, no description in the index: 1 (02_04)" in text
+    assert "dropped, shorter than 128 frames: 1 (02_05 (100 frames))" in text
+    assert "02_06.amc: line 15: expected numbers, found 'lradius zero'" in text
+    assert "dropped, less than 32 frames without glitches: 1 (02_07 (of 40))" in text
+    assert "dropped, no skeleton of the subject: 1 (05_08 (05.asf))" in text
+    assert "dropped, file not named after a trial, such as 13_29.amc: 1 (readme.amc)" in text
+
+
+def test_a_glitch_cuts_a_trial_and_does_not_drop_it(tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    frames = swing(400)
+    for frame in frames[200:]:
+        frame["thorax"] = "170 0 0"
+    (folder / "02_01.amc").write_text(amc(frames))
+    assert "kept, cut where a joint is too fast: 1 trials, 1 frames" in prepare(folder)
+
+
+def test_first_frames_that_lie_on_the_floor_are_left_out(tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    (folder / "02_01.amc").write_text(amc([{"root": "0 0 0 0 0 0"}] * 8 + swing(160)))
+    prepare(folder)
+    assert len(Recordings.load(folder / FILE).positions) == 40
+
+
+def test_an_index_as_text_will_do(tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    (folder / "cmu-mocap-index.csv").unlink()
+    (folder / "cmu-mocap-index-text.txt").write_text("Subject #2\n\n02_01\twalk\n")
+    assert "kept: 1 trials" in prepare(folder)
+
+
+def test_recordings_that_are_there_are_listed_and_copied(tmp_path: Path) -> None:
+    prepare(database(tmp_path / "cmu", TURN), tmp_path / "out")
+    (tmp_path / "out" / FILE).rename(tmp_path / "out" / "cmu14_trials.npz")
+    assert "kept: 2 trials" in prepare(tmp_path / "out", tmp_path / "again")
+    assert Recordings.load(tmp_path / "again" / FILE).label == ("walk", "walk, veer left")
+
+
+def test_a_folder_that_holds_nothing_to_read_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"root: expected a folder, found nothing at .*mocap\.cs\.cmu\.edu"):
+        prepare(tmp_path / "nowhere")
+    assert "expected AMC or BVH files, found an empty folder; get the CMU" in told(tmp_path)
+    (tmp_path / "holiday.jpg").write_text("")
+    assert "expected AMC or BVH files, found none; get the CMU" in told(tmp_path)
+    database(tmp_path, WALK)
+    (tmp_path / "cmu-mocap-index.csv").write_text("nothing of the kind")
+    assert "cmu-mocap-index.csv: expected lines such as '13_29,description', found none" in told(tmp_path)
+    (tmp_path / "cmu-mocap-index.csv").unlink()
+    assert "expected the index of descriptions, cmu-mocap-index.csv or" in told(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("lradius", "tail", "02_01.amc: line 15: expected a bone of the skeleton, found 'tail'; is it of another subject?"),
+        ("lfemur 0 0 0", "lfemur 0 0", "02_01.amc: line 6: expected 3 numbers for 'lfemur', found 'lfemur 0 0'"),
+        ("lfemur 0 0 0", "lfemur 0 x 0", "02_01.amc: line 6: expected numbers, found 'lfemur 0 x 0'"),
+        ("lfemur 0 0 0", "lfemur 0 nan 0", "02_01.amc: frame 1: expected finite numbers of 'lfemur', found others"),
+        ("lfemur 0 0 0\n", "", "02_01.amc: line 20: expected a frame's number before its bones, and each bone once"),
+        ("ltibia 0\n", "ltibia 0\nltibia 0\n", "02_01.amc: line 8: expected a frame's number before its bones, and each bone once"),
+    ],
+)
+def test_a_malformed_motion_is_told_with_file_and_line(old: str, new: str, expected: str, tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    text = (folder / "02_01.amc").read_text()
+    (folder / "02_01.amc").write_text(text.replace(old, new, 1))
+    assert expected in told(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("name head", "name skull", "02.asf: expected a skeleton of the CMU database, found one without the bone 'head'"),
+        ("length 7.0", "length long", "02.asf: line 20: expected numbers, found 'long'"),
+        ("direction 1 -1 0", "direction 1 -1", "expected 3 finite numbers, found '1 -1'"),
+        ("    direction 1 -1 0\n", "", "expected a bone with name, direction, length and axis (no 'direction' here)"),
+        ("order TX TY TZ RX RY RZ", "order TX TY", "02.asf: line 6: expected TX TY TZ RX RY RZ in some order"),
+        ("    thorax lowerneck", "", "section ':hierarchy': expected what 'lowerneck' hangs on, up to the root"),
+        ("axis 0 0 20 XYZ", "axis 0 0 20 XXZ", "expected an order of axes such as XYZ, found 'XXZ'"),
+        ("length 0.45", "length 0", "02.asf: key 'length': expected a positive number, found 0"),
+    ],
+)
+def test_a_malformed_skeleton_is_told_with_file_and_line(old: str, new: str, expected: str, tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    assert old in asf()
+    (folder / "02.asf").write_text(asf().replace(old, new, 1))
+    assert expected in told(folder)
+
+
+def test_a_trial_shorter_than_a_window_is_told(tmp_path: Path) -> None:
+    assert "02_01: shorter than 128 frames: 20 frames" in told(database(tmp_path, WALK, frames=20))
+
+
+def test_an_empty_motion_is_told(tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    (folder / "02_01.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n")
+    assert "02_01.amc: expected frames of motion, found none" in told(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "segments.csv: line 1: expected trial_id,label,start30,stop30, found nothing"),
+        ("a,b\n", "segments.csv: line 1: expected trial_id,label,start30,stop30, found a,b"),
+        (
+            "trial_id,label,start30,stop30\n\n02_01,walk,9,3\n",
+            "segments.csv: line 3: expected a trial, a label",
+        ),
+        ("trial_id,label,start30,stop30\n02_01,walk,0\n", "segments.csv: line 2: expected a trial, a label"),
+    ],
+)
+def test_malformed_segments_are_told_with_file_and_line(text: str, expected: str, tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    (folder / SEGMENTS).write_text(text)
+    assert expected in told(folder)
+
+
+def test_segments_of_ones_own_come_along(tmp_path: Path) -> None:
+    folder = database(tmp_path / "cmu", WALK)
+    (folder / SEGMENTS).write_text("trial_id,label,start30,stop30\n02_01,arm circle,3,39\n")
+    prepare(folder, tmp_path / "out")
+    _, segments = read_folder(tmp_path / "out")
+    assert [(one.label, one.start, one.stop) for one in segments if one.trial_id == "02_01"] == [("arm circle", 3, 39)]
+    assert "chop wood" in {one.label for one in segments}
+
+
+def test_the_shipped_segments_show_the_new_concepts() -> None:
+    assert sum(one.label == "jumping jacks" and one.trial_id.startswith("13") for one in shipped_segments()) == 3
+    assert all(one.stop is None or one.stop > one.start for one in shipped_segments())
+    with pytest.raises(UserError, match="expected a table of segments"):
+        read_segments(Path("nowhere.csv"))
+
+
+def bvh(frames: int, after: str = "0 0 0") -> str:
+    """A motion in the MotionBuilder-friendly form: someone who moves 1 unit up a frame."""
+    chains = (
+        ("LHipJoint 0 0 0", "LeftUpLeg 1.5 -1.5 0", "LeftLeg 0 -7 0", "LeftFoot 0 -7 0"),
+        ("RHipJoint 0 0 0", "RightUpLeg -1.5 -1.5 0", "RightLeg 0 -7 0", "RightFoot 0 -7 0"),
+    )
+    back = ("LowerBack 0 0 0", "Spine 0 2 0", "Spine1 0 2 0")
+    upper = (
+        (f"Neck {after}", "Neck1 0 1.5 0", "Head 0 1.5 0"),
+        (f"LeftShoulder {after}", "LeftArm 3 0 0", "LeftForeArm 5 0 0", "LeftHand 3.5 0 0"),
+        (f"RightShoulder {after}", "RightArm -3 0 0", "RightForeArm -5 0 0", "RightHand -3.5 0 0"),
+    )
+
+    def opened(joint: str) -> str:
+        name, *offset = joint.split()
+        return f"JOINT {name}\n{{\nOFFSET {' '.join(offset)}\nCHANNELS 3 Zrotation Yrotation Xrotation\n"
+
+    def chain(joints: tuple[str, ...], inside: str = "End Site\n{\nOFFSET 0 1.5 0\n}\n") -> str:
+        return "".join(map(opened, joints)) + inside + "}\n" * len(joints)
+
+    body = "".join(map(chain, chains)) + chain(back, "".join(map(chain, upper)))
+    count = body.count("CHANNELS")
+    rows = [f"0 {17 + frame} 0 " + " ".join(["0"] * 3 * (count + 1)) for frame in range(frames)]
+    root = "ROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation\n"
+    motion = f"MOTION\nFrames: {frames}\nFrame Time: .0083333\n" + "\n".join(rows) + "\n"
+    return f"HIERARCHY\n{root}{body}}}\n{motion}"
+
+
+class TestBvh:
+    """Only where its reader is installed."""
+
+    @pytest.fixture(autouse=True)
+    def _reader(self) -> None:
+        pytest.importorskip("pybvh", reason="the extra mocap")
+
+    def test_the_thorax_is_put_back_and_the_first_frame_left_out(self, tmp_path: Path) -> None:
+        (tmp_path / "02.asf").write_text(asf())
+        (tmp_path / "02_01.bvh").write_text(bvh(5))
+        found, fps = read_bvh(tmp_path / "02_01.bvh", read_asf(tmp_path / "02.asf"))
+        assert (found.shape, fps) == ((4, 14, 3), 120)
+        head = found[0, NODES.index("EndSiteHead")] / METRES
+        assert head == pytest.approx([0, 18 + 4 + 6 + 4.5, 0])  # the skeleton's thorax is 6 long
+        bare, _ = read_bvh(tmp_path / "02_01.bvh", None)
+        assert bare[0, NODES.index("EndSiteHead")] / METRES == pytest.approx([0, 18 + 4 + 2 + 4.5, 0])  # as the bone below
+        (tmp_path / "02_01.bvh").write_text(bvh(5, after="0 3 0"))
+        whole, _ = read_bvh(tmp_path / "02_01.bvh", None)
+        assert whole[0, NODES.index("EndSiteHead")] / METRES == pytest.approx([0, 18 + 4 + 3 + 4.5, 0])  # it is there
+
+    def test_a_folder_of_both_takes_amc_files_first(self, tmp_path: Path) -> None:
+        folder = database(tmp_path, TURN)
+        (folder / "02_01.bvh").write_text(bvh(161))
+        (folder / "02_02.amc").unlink()
+        (folder / "02_02.bvh").write_text(bvh(161))
+        prepare(folder)
+        assert Recordings.load(folder / FILE).kind == ("asf_amc", "bvh_mb")
+        (folder / "02.asf").unlink()
+        prepare(folder)
+        assert Recordings.load(folder / FILE).kind == ("bvh_mb_thx", "bvh_mb_thx")
+
+    def test_another_conversion_or_a_damaged_file_is_told(self, tmp_path: Path) -> None:
+        folder = database(tmp_path, WALK)
+        (folder / "02_01.amc").unlink()
+        (folder / "02_01.bvh").write_text(bvh(161).replace("RightUpLeg", "rThigh"))
+        assert "02_01.bvh: expected the MotionBuilder-friendly conversion of the database, found a skeleton without" in told(folder)
+        (folder / "02_01.bvh").write_text(bvh(161)[:-40])
+        assert "02_01.bvh: expected a BVH file, found a damaged one" in told(folder)
+
+
+def test_bvh_files_without_their_reader_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pybvh", None)
+    folder = database(tmp_path, WALK)
+    (folder / "02_01.amc").rename(folder / "02_01.bvh")
+    assert "BVH files need the extra 'mocap'" in told(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda found: found.pop("label"), "key 'label': expected it in a file of recordings, found none"),
+        (lambda found: found.update(root=found["root"][1:]), r"key 'root': expected shape \(80, 4\), found \(79, 4\)"),
+        (lambda found: found.update(offsets=found["offsets"] + 1), "key 'offsets': expected ends of one trial or more"),
+        (lambda found: found.update(positions=found["positions"] * np.nan), "key 'positions': expected finite numbers"),
+    ],
+)
+def test_a_damaged_file_of_recordings_is_told(change: object, expected: str, tmp_path: Path) -> None:
+    prepare(database(tmp_path, TURN))
+    with np.load(tmp_path / FILE) as archive:
+        found = dict(archive)
+    change(found)  # type: ignore[operator]
+    np.savez(tmp_path / FILE, **found)
+    with pytest.raises(UserError, match=expected):
+        Recordings.load(tmp_path / FILE)
+    (tmp_path / FILE).write_bytes(b"no archive")
+    with pytest.raises(UserError, match="expected recordings, found a damaged or foreign file"):
+        Recordings.load(tmp_path / FILE)
+
+
+def test_recorded_motion_is_read_as_it_was_before(tmp_path: Path) -> None:
+    """Where recordings are named: their raw samples give the same poses as the file that was made elsewhere."""
+    named = os.environ.get("FTL_LIGHTNING_DATA")
+    if not named or not (Path(named) / "raw_samples").is_dir():
+        pytest.skip("FTL_LIGHTNING_DATA names no folder with raw samples")
+    expected = read_folder(Path(named))[0]
+    for amc_too in (True, False):
+        folder = tmp_path / str(amc_too)
+        shutil.copytree(Path(named) / "raw_samples", folder)
+        folder.chmod(0o755)
+        if not amc_too:
+            pytest.importorskip("pybvh", reason="the extra mocap")
+            for path in folder.glob("*.amc"):
+                path.unlink()
+            (folder / "09_06.daz.bvh").unlink()
+        prepare(folder)
+        found = Recordings.load(folder / FILE)
+        assert len(found) == (6 if amc_too else 2)
+        for number, trial in enumerate(found.trial_id):
+            same = expected.trial_id.index(trial)
+            assert found.label[number] == expected.label[same]
+            assert np.abs(found.trial(number) - expected.trial(same)).max() < 1e-5
+            start, stop = expected.offsets[same : same + 2]
+            roots = found.root[found.offsets[number] : found.offsets[number + 1]]
+            assert np.abs(roots - expected.root[start:stop]).max() < 1e-5
+
+
+def test_every_joint_hangs_on_a_bone_of_the_sample() -> None:
+    assert set(JOINT_BONES) <= set(BONES)
+    assert len(JOINT_BONES) == len(NODES) == len(JOINTS)
