@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition, parse_composition
+from ftl_lightning.concepts.composition import Composition, Part, parse_composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import Explanation, explain
 from ftl_lightning.demonstrations.container import Demonstrations, padded
@@ -137,15 +137,19 @@ class FewShot:
     def compose(self, text: str) -> Composition:
         """``'go to red object:1.2 + other.safetensors:0.9'``: training concepts and files of learned concepts, with weights.
 
+        After an ``@`` the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
+
         Raises:
             UserError: for a part that is neither, or nothing at all.
         """
-        parts = [
-            weight * (self.load(name) if name.endswith(".safetensors") else self[name]) for name, weight in parse_composition(text)
-        ]
+        parts = [self._part(part) for part in parse_composition(text)]
         if not parts:
             raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
         return _sum(parts)
+
+    def _part(self, part: Part) -> Composition:
+        found = part.weight * (self.load(part.concept) if part.concept.endswith(".safetensors") else self[part.concept])
+        return found.on(self.domain.plans.grouped(part.groups), self.model.config.state_dim) if part.groups else found
 
     def _learned(self, concept: Concept) -> LearnedConcept:
         device = self.model.device

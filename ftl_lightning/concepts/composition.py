@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -311,20 +311,38 @@ def _adapted(
     return noise
 
 
-def parse_composition(text: str) -> list[tuple[str, float]]:
-    """Concepts and weights from ``'circle right of square:1.2 + triangle above circle'``; a missing weight is 1.
+class Part(NamedTuple):
+    """A part of a composition, as it is told in words.
+
+    Attributes:
+        concept: its text or file.
+        weight: omega.
+        groups: names of the groups of columns that its weight is on; all columns where empty.
+    """
+
+    concept: str
+    weight: float = 1.0
+    groups: tuple[str, ...] = ()
+
+
+def parse_composition(text: str) -> list[Part]:
+    """Concepts, weights and groups of columns from ``'circle right of square:1.2 + walk@legs,trunk:0.8'``; a missing weight is 1.
 
     Raises:
-        UserError: for a weight that is no finite number, or an empty concept.
+        UserError: for a weight that is no finite number, or an empty concept or group.
     """
     parts = []
     for part in text.split(" + ") if text.strip() else ():
-        concept, colon, weight = part.partition(":")
+        told, colon, weight = part.partition(":")
+        concept, at, groups = told.partition("@")
         try:
             omega = float(weight) if colon else 1.0
         except ValueError:
             omega = math.nan
-        if not concept.strip() or not math.isfinite(omega):
-            raise UserError(f"compose: expected 'concept:weight + concept:weight' with finite numbers as weights, found {part!r}")
-        parts.append((concept.strip(), omega))
+        found = Part(concept.strip(), omega, tuple(group.strip() for group in groups.split(",")) if at else ())
+        if not (found.concept and math.isfinite(omega) and all(found.groups)):
+            raise UserError(
+                f"compose: expected 'concept:weight + concept@group:weight' with finite numbers as weights, found {part!r}"
+            )
+        parts.append(found)
     return parts

@@ -54,6 +54,7 @@ class Plans:
             windows start anywhere: all times are alike to them.
         at_rest: whether behaviour is at rest where a demonstration ends, so that windows may reach past the end, where the last
             state stays. Without it they stay within demonstrations, of those that are long enough.
+        groups: columns that belong together, by name, such as a body's legs: a concept may be composed on some of them alone.
         resolution: columns of states and observed vectors that vary by less, in their units, hold a simulator's rounding alone.
     """
 
@@ -63,6 +64,18 @@ class Plans:
     start_exponent: float = 1.0
     resolution: float = 0.0
     at_rest: bool = True
+    groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def grouped(self, names: Sequence[str]) -> tuple[int, ...]:
+        """Columns of some groups.
+
+        Raises:
+            UserError: for a name that is none.
+        """
+        if unknown := [name for name in names if name not in self.groups]:
+            told = f"one of {', '.join(self.groups)}" if self.groups else "no group of columns, as this domain names none"
+            raise UserError(f"compose: expected {told} after '@', found {unknown[0]!r}")
+        return tuple(column for name in names for column in self.groups[name])
 
     def exponent(self, window: int) -> float:
         """That of windows of this length."""

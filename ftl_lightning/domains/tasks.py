@@ -20,6 +20,7 @@ class EvaluationTask:
         texts: training concepts that are composed in.
         without: training concepts that are composed in with :data:`WITHOUT_WEIGHT`: what the behaviour should not be.
         component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
+        on: concepts, learned or texts, whose weight is on some groups of a state's columns alone, each with the groups' names.
         initial: where behaviour starts, in domains with initial states: in new ones, or in those of the demonstrations that the
             concept was learned from.
 
@@ -34,6 +35,7 @@ class EvaluationTask:
     texts: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     component: int | None = None
+    on: tuple[tuple[str, tuple[str, ...]], ...] = ()
     initial: Literal["new", "demonstrated"] = "new"
 
     def __post_init__(self) -> None:

@@ -144,11 +144,17 @@ class Adaptation(pl.LightningModule, ABC):
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
         embeddings = [self.model.concept(text)[None] for text in (*task.texts, *task.without)]
         parts = [Composition(text, text.new_tensor([weight])) for text, weight in zip(embeddings, weights, strict=True)]
+        names = [*task.texts, *task.without, *task.learned]
         for name in task.learned:
             concept = self._found.get(name)
             if concept is None or (task.component or 0) > len(concept.weights):
                 return None
             parts.append((concept.composition if task.component is None else concept.component(task.component)).to(self.device))
+        plans, on = self.domain.plans, dict(task.on)
+        parts = [
+            part.on(plans.grouped(on[name]), len(plans.columns)) if name in on else part
+            for name, part in zip(names, parts, strict=True)
+        ]
         return functools.reduce(operator.add, parts)
 
     def demonstrated(self, concept: str) -> Demonstrations | None:

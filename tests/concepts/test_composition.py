@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.concepts.composition import Composition, Context, Denoiser, batched, composed_epsilon, parse_composition
+from ftl_lightning.concepts.composition import Composition, Context, Denoiser, Part, batched, composed_epsilon, parse_composition
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion import MLPDenoiser
 from ftl_lightning.diffusion.denoiser import Sizes
@@ -105,8 +105,12 @@ def test_the_empty_branch_is_evaluated_without_gradient_and_the_rest_in_one_call
 
 def test_compositions_in_words() -> None:
     assert parse_composition("") == []
-    assert parse_composition("a right of b:1.2 + c above d") == [("a right of b", 1.2), ("c above d", 1.0)]
-    assert parse_composition("a right of b:1.2 + c above d:-0.5") == [("a right of b", 1.2), ("c above d", -0.5)]
+    assert parse_composition("a right of b:1.2 + c above d") == [Part("a right of b", 1.2), Part("c above d")]
+    assert parse_composition("a right of b:1.2 + c above d:-0.5") == [Part("a right of b", 1.2), Part("c above d", -0.5)]
+    assert parse_composition("walk@legs,trunk:0.8 + a.safetensors@arms") == [
+        Part("walk", 0.8, ("legs", "trunk")),
+        Part("a.safetensors", 1.0, ("arms",)),
+    ]
     for wrong in ("a:heavy", "a:nan", "a:inf", ":1", "a + "):
         with pytest.raises(UserError, match="expected 'concept:weight"):
             parse_composition(wrong)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ftl_lightning.domains.domain import Concepts, Domain, Plans, Show, deferred
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, HORIZON
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
 from ftl_lightning.domains.mocap.source import NAME, OBSERVED, Recorded
 from ftl_lightning.domains.mocap.tasks import SUITES, TRAINING_CONCEPTS, reads
 
@@ -11,7 +11,7 @@ _DRAWING = "ftl_lightning.domains.mocap.rendering"
 
 DOMAIN = Domain(
     name=NAME,
-    plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False),
+    plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False, groups=GROUPS),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
