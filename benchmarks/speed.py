@@ -258,6 +258,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of demonstrations and learning")
     parser.add_argument("--repeats", type=int, default=3, help="timed runs of ours, whose median is told")
     parser.add_argument("--slice", type=int, default=300, help="timed steps of the published inversion")
+    parser.add_argument("--learned", help="an earlier run's file to take from what the published procedure has learned by then")
     parser.add_argument("--full", action="store_true", help="run the published inversion of one concept to its end")
     options = parser.parse_args()
     model, tuned = GenerativeModel.load(options.pretrained), Tuned.read(options.config)
@@ -276,19 +277,16 @@ def main() -> None:
     # First, since torch loads much when it is first used.
     curves: dict[str, list[Measured]] = {}
     states = [own.states for own in alone]
-    learned = published_together(model, states, [_draw(options.seed, name) for name in judged], PUBLISHED_AT)
+    if options.learned:
+        known = json.loads(Path(options.learned).read_text(encoding="utf-8"))["curves"]
+        accuracies = {point["steps"]: point["accuracy"] for point in known if point["curve"] == PUBLISHED}
+    else:
+        learned = published_together(model, states, [_draw(options.seed, name) for name in judged], PUBLISHED_AT)
+        accuracies = {at: round(judge.accuracy(dict(zip(judged, own, strict=True))), 4) for at, own in learned.items()}
     published(model, states[0], 20, _draw(options.seed, judged[0]))
     steps = PUBLISHED_STEPS if options.full else options.slice
     first, duration = timed(lambda: published(model, states[0], steps, _draw(options.seed, judged[0])))
-    curves[PUBLISHED] = [
-        Measured(
-            PUBLISHED,
-            at,
-            round(duration / steps * at, 2),
-            round(judge.accuracy(dict(zip(judged, own, strict=True))), 4),
-        )
-        for at, own in learned.items()
-    ]
+    curves[PUBLISHED] = [Measured(PUBLISHED, at, round(duration / steps * at, 2), accuracy) for at, accuracy in accuracies.items()]
     ours(model, alone[:1], settings, 10, 1)
     curves[ONE] = our_curve(ONE, judge, alone, settings, most, options.repeats)
     curves[TEN] = our_curve(TEN, judge, together, settings, most, options.repeats)
