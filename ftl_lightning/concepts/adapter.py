@@ -35,7 +35,7 @@ class LowRank:
         return sum(up.numel() + down.numel() for up, down in self.factors.values())
 
     def copied(self) -> "LowRank":
-        """The same on the processor, apart from what is being learned."""
+        """The same on the processor, apart from what is being learned, without factors that add nothing."""
         return LowRank(
             {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
         )

@@ -399,7 +399,8 @@ def invert(
     for step in range(steps):
         losses = inversion.step_losses(step)
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
-        gradients = torch.autograd.grad(losses.sum(), [group.parameter for group in groups])
+        # An adapter also has factors of what reads observed features, which happens once a plan, outside of the branches.
+        gradients = torch.autograd.grad(losses.sum(), [group.parameter for group in groups], materialize_grads=True)
         for group, gradient in zip(groups, gradients, strict=True):
             group.step(gradient, None if settings.tolerance is not None else (step, steps))
         tell(losses.detach().mean().item())
