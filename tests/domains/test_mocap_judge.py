@@ -126,6 +126,15 @@ def test_what_is_not_finite_shows_nothing(untrained: Judge) -> None:
     assert not said[1]
 
 
+def test_who_does_not_move_shows_no_action(untrained: Judge) -> None:
+    frozen = moving(6)[:, :1].repeat(1, HORIZON, 1)
+    trembling = frozen + 0.002 * torch.randn(frozen.shape, generator=torch.Generator().manual_seed(1))
+    for part in (untrained.part(name) for name in PARTS):
+        for states in (frozen, trembling):
+            said = {part.classes[index] for index in part(states).argmax(dim=-1).tolist()}
+            assert said <= set(judging.RESTING)
+
+
 def test_a_goal_without_a_class_is_refused(untrained: Judge) -> None:
     with pytest.raises(UserError, match=re.escape("expected an action that the judge of motion knows, such as 'walk', found 'cook'")):
         untrained.recognised("cook", moving(1))

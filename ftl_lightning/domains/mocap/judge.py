@@ -13,9 +13,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, actions, of_legs
+from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
 from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, HORIZON
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import file_hash, load_tensors, save_tensors
@@ -34,6 +34,11 @@ NUMBERS = {"summary": summary, "extremes": extremes}
 """What linear recognisers see, by name."""
 WIDTH, EMBEDDING = 40, 32
 """Channels of a network; numbers that its last layer decides by."""
+STILL = 0.3
+"""Metres a second. Where every joint is slower over a sixth of a second, nobody does anything, however it may look."""
+RESTING = ("pose", STAND, OTHER)
+"""Classes that are seen in windows without movement."""
+_SIXTH = FPS // 6
 _OUTLIER = 5.0
 """Standard deviations beyond which a feature says no more."""
 
@@ -121,8 +126,16 @@ class Recogniser(nn.Module):
         return {"networks": networks, **linear}
 
     def forward(self, states: Tensor) -> Tensor:
-        """The mean of all votes: scores ``(sample, class)``."""
-        return torch.stack(list(self.votes(states).values())).mean(dim=0)
+        """The mean of all votes: scores ``(sample, class)``; of actions, minus infinity where no joint that it sees moves."""
+        scores = torch.stack(list(self.votes(states).values())).mean(dim=0)
+        actions_only = torch.tensor([name not in RESTING for name in self.classes])
+        return scores.masked_fill(self._still(states)[:, None] & actions_only, -torch.inf)
+
+    def _still(self, states: Tensor) -> Tensor:
+        """Whether no joint gets anywhere within a sixth of a second: ``(sample,)``. Trembling joints do not."""
+        seen = as_joints(states)[:, :, list(self.joints)]
+        way = torch.linalg.vector_norm(seen[:, _SIXTH:] - seen[:, :-_SIXTH], dim=-1)
+        return way.amax(dim=(1, 2)) * (FPS / _SIXTH) < STILL
 
     def says(self, states: Tensor, name: str) -> Tensor:
         """Whether each window ``(sample, 32, 42)`` shows a class: ``(sample,)`` of bool; ``False`` where one is not finite."""
