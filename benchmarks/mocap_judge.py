@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, REVERSIBLE, STANDING, STEPPING, TESTED, action, of_legs
 from ftl_lightning.domains.mocap.features import LOWER, UPPER, bones, places, signals, sizes
-from ftl_lightning.domains.mocap.judge import ARMS, LEGS, NUMBERS, PARTS, PATH, WHOLE, Judge, Recogniser
+from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, WHOLE, Judge, Network, Recogniser
 from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
 from ftl_lightning.tensor_file import file_hash, write_text
@@ -242,9 +242,7 @@ def spoiled(states: Tensor, draw: torch.Generator) -> Tensor:
 def chances(windows: Windows) -> Tensor:
     """How often each window is drawn: classes alike; of a class, subjects by the square root of their number of windows."""
     subjects = np.unique(windows.subject, return_inverse=True)[1]
-    pairs, pair, number = np.unique(
-        np.stack([windows.label.numpy(), subjects]), axis=1, return_inverse=True, return_counts=True
-    )
+    pairs, pair, number = np.unique(np.stack([windows.label.numpy(), subjects]), axis=1, return_inverse=True, return_counts=True)
     share = np.sqrt(number)
     of_class = np.bincount(pairs[0], weights=share)
     wanted = np.where(windows.label.numpy() < len(TESTED), 1.0, RARE)
@@ -294,10 +292,11 @@ def fit(recogniser: Recogniser, states: Tensor, label: Tensor, seed: int, steps:
         recogniser.set_scale(name, NUMBERS[name](states, recogniser.joints), 0.02)
         _fit_linear(recogniser.linear[name], recogniser.numbers(name, states), label, strength)
     recogniser.train()
-    for member, network in enumerate(recogniser.networks):
+    networks = [network for network in recogniser.networks if isinstance(network, Network)]
+    for member, network in enumerate(networks):
         torch.manual_seed(1000 * seed + member)
         for layer in network.modules():
-            if layer is not network and hasattr(layer, "reset_parameters"):
+            if isinstance(layer, torch.nn.Conv1d | torch.nn.Linear | torch.nn.GroupNorm):
                 layer.reset_parameters()
         optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=0.05)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
@@ -311,8 +310,7 @@ def fit(recogniser: Recogniser, states: Tensor, label: Tensor, seed: int, steps:
             schedule.step()
     recogniser.eval()
     with torch.no_grad():
-        network = recogniser.networks[0]
-        recogniser.set_scale("embedding", torch.cat([network.embedding(some) for some in courses.split(1000)]), 1e-3)
+        recogniser.set_scale("embedding", torch.cat([networks[0].embedding(some) for some in courses.split(1000)]), 1e-3)
 
 
 def train(windows: Windows, seed: int, parts: Sequence[str] = tuple(PARTS), steps: int = STEPS) -> Judge:

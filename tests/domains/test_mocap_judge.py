@@ -12,7 +12,18 @@ from ftl_lightning.domains.mocap import judge as judging
 from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, TESTED, action, actions, judged
 from ftl_lightning.domains.mocap.features import JOINTS, LOWER, UPPER, bones, extremes, places, signals, summary
 from ftl_lightning.domains.mocap.judge import ARMS, LEGS, PARTS, PATH, WHOLE, Judge, identity, shipped_judge
-from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_ANKLE, L_ELBOW, L_WRIST, R_ANKLE, R_ELBOW, R_WRIST, as_joints, mirrored
+from ftl_lightning.domains.mocap.skeleton import (
+    FPS,
+    HORIZON,
+    L_ANKLE,
+    L_ELBOW,
+    L_WRIST,
+    R_ANKLE,
+    R_ELBOW,
+    R_WRIST,
+    as_joints,
+    mirrored,
+)
 from ftl_lightning.domains.mocap.standing import standing_poses
 from ftl_lightning.domains.mocap.tasks import AND, TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
@@ -136,7 +147,7 @@ def test_who_does_not_move_shows_no_action(untrained: Judge) -> None:
 
 
 def test_a_goal_without_a_class_is_refused(untrained: Judge) -> None:
-    with pytest.raises(UserError, match=re.escape("expected an action that the judge of motion knows, such as 'walk', found 'cook'")):
+    with pytest.raises(UserError, match="expected an action that the judge of motion knows, such as 'walk', found 'cook'"):
         untrained.recognised("cook", moving(1))
 
 

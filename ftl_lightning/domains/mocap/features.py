@@ -39,7 +39,7 @@ def places(relative: Tensor) -> Tensor:
 
 
 def sizes(relative: Tensor) -> Tensor:
-    """Summed length of a half of the body ``(sample, 1, 14, 1)``, that each bone ``(sample, frame, 14, 3)`` is in; a mean over time."""
+    """Length of all bones of the half of the body that each bone ``(sample, frame, 14, 3)`` is in: ``(sample, 1, 14, 1)``."""
     length = torch.linalg.vector_norm(relative, dim=-1).mean(dim=1, keepdim=True)
     half = [length[..., list(part)].sum(dim=-1) for part in (LOWER, UPPER)]
     return torch.stack([half[joint in UPPER] for joint in range(JOINTS)], dim=-1)[..., None].clamp_min(1e-3)
@@ -187,12 +187,18 @@ def _lower(where: Tensor, limbs: Tensor) -> list[Tensor]:
     ]
 
 
+def _ways_together(where: Tensor, one: tuple[int, int], other: tuple[int, int], axis: int) -> Tensor:
+    """How much two joints go together along an axis, and their mirror images: the mean ``(sample, 1)``."""
+    first, second = (_together(where[:, :, a, axis], where[:, :, b, axis]) for a, b in (one, other))
+    return (first + second) / 2
+
+
 def _arms_and_legs(where: Tensor) -> list[Tensor]:
     """How arms and legs go together, of the same and of the other side."""
     found = [_together(where[:, :, [RW, LW], 2].mean(dim=-1), (where[:, :, RA, 0] - where[:, :, LA, 0]).abs())]
     for one, other in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA)), ((RW, RK), (LW, LK)), ((RW, LK), (LW, RK))):
         found += _distances(where, one, other)
-        found += [sum(_together(where[:, :, a, axis], where[:, :, b, axis]) for a, b in (one, other)) / 2 for axis in (1, 2)]
+        found += [_ways_together(where, one, other, axis) for axis in (1, 2)]
     return found
 
 
@@ -236,9 +242,7 @@ def _extremes(values: Tensor) -> Tensor:
 def _paces(speed: Tensor) -> Tensor:
     """Of both sides' speeds ``(sample, frame, 2)``: ``(sample, 5)``."""
     top, mean, rest = (_log(values, 0.05) for values in (speed.amax(dim=1), speed.mean(dim=1), speed.amin(dim=1)))
-    return torch.stack(
-        [top.amax(dim=-1), top.amin(dim=-1), mean.amax(dim=-1), mean.amin(dim=-1), rest.mean(dim=-1)], dim=1
-    )
+    return torch.stack([top.amax(dim=-1), top.amin(dim=-1), mean.amax(dim=-1), mean.amin(dim=-1), rest.mean(dim=-1)], dim=1)
 
 
 def _both(where: Tensor, right: int, axis: int) -> Tensor:
@@ -304,5 +308,5 @@ def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
         legs, arms = (_log(speed[:, :, pair].mean(dim=1), 0.05).mean(dim=1, keepdim=True) for pair in ([RA, LA], [RW, LW]))
         found += [legs - arms, _together(where[:, :, [RW, LW], 2].mean(dim=-1), apart.abs())]
         for one, other in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA))):
-            found.append(sum(_together(where[:, :, a, 1], where[:, :, b, 1]) for a, b in (one, other)) / 2)
+            found.append(_ways_together(where, one, other, 1))
     return torch.cat(found, dim=1)

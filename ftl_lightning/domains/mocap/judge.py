@@ -1,8 +1,8 @@
 """The judge: which action a window of motion shows, learned from recordings of people.
 
-Three kinds of recognisers vote: small convolutional networks over time, and two linear ones on numbers of the whole window. There is
-such a jury for the whole body, one for arms and trunk, and one for the legs, so that actions at the same time are judged apart. None
-has seen generated motion, or people who demonstrate new concepts. ``benchmarks/mocap_judge.py`` trains it.
+Three kinds of recognisers vote: small convolutional networks over time, and two linear ones on numbers of the whole window. There
+is such a jury for the whole body, one for arms and trunk, and one for the legs, so that actions at the same time are judged apart.
+None has seen generated motion, or people who demonstrate new concepts. ``benchmarks/mocap_judge.py`` trains it.
 """
 
 from collections.abc import Mapping, Sequence
