@@ -1,7 +1,9 @@
+import importlib.util
 import os
-import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from ftl_lightning.domains.mocap import judge as judging
 from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, TESTED, action, actions, judged
 from ftl_lightning.domains.mocap.features import JOINTS, LOWER, UPPER, bones, extremes, places, signals, summary
 from ftl_lightning.domains.mocap.judge import ARMS, LEGS, PARTS, PATH, WHOLE, Judge, identity, shipped_judge
+from ftl_lightning.domains.mocap.recordings import FILE
 from ftl_lightning.domains.mocap.skeleton import (
     FPS,
     HORIZON,
@@ -29,6 +32,7 @@ from ftl_lightning.domains.mocap.tasks import AND, TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import save_tensors
+from tests.domains.mocap_samples import recordings
 
 ALL = (*LOWER, *UPPER)
 
@@ -37,6 +41,18 @@ ALL = (*LOWER, *UPPER)
 def untrained() -> Judge:
     torch.manual_seed(0)
     return Judge().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def training() -> Iterator[ModuleType]:
+    """The script that trains the judge."""
+    spec = importlib.util.spec_from_file_location("mocap_judge", Path(__file__).parents[2] / "benchmarks" / "mocap_judge.py")
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules["mocap_judge"] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["mocap_judge"]
 
 
 def moving(count: int, seed: int = 0) -> Tensor:
@@ -179,6 +195,34 @@ def test_a_missing_damaged_or_foreign_judge_is_refused_in_one_line(untrained: Ju
         Judge.load(path)
 
 
+def test_training_tells_made_up_actions_apart_and_repeats_itself(
+    training: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    jacks, wander = jumping_jacks(8).reshape(-1, 14, 3).numpy(), moving(8).reshape(-1, 14, 3).numpy()
+    trials = {f"{number:02}_01": ("walk", wander) for number in (2, 13)}
+    trials |= {f"{number:02}_02": ("jumping jacks", jacks) for number in (2, 13)}
+    recordings(trials).save(tmp_path / FILE)
+    monkeypatch.setattr(training, "POOL", 200)
+    monkeypatch.setattr(training, "SPOILED", 30)
+    windows = training.read(tmp_path, 8)
+    assert {str(name) for name in windows.subject} == {"02", "13"}
+    first, second = (training.train(windows.of(("13",), others=True), 0, (WHOLE,), 30).part(WHOLE) for _ in range(2))
+    assert all(torch.equal(value, second.state_dict()[name]) for name, value in first.state_dict().items())
+    test = windows.of(("13",))
+    assert (first(test.states()).argmax(dim=-1) == test.label).float().mean() > 0.9
+
+
+def test_windows_at_another_pace_stay_within_their_action(training: ModuleType) -> None:
+    frames = torch.arange(200.0)[:, None].repeat(1, 42)
+    ones = torch.ones(3, dtype=torch.long)
+    windows = training.Windows(frames, 60 + 10 * torch.arange(3), 50 * ones, 110 * ones, 0 * ones, np.array(["02"] * 3))
+    assert windows.states()[0, :, 0].tolist() == list(range(60, 92))
+    fast = windows.states(torch.tensor([1.5, 1.5, 0.5]))[..., 0]
+    assert fast.min() >= 50
+    assert fast.max() <= 109
+    assert torch.allclose(fast.diff(dim=1), torch.tensor([1.5, 1.5, 0.5])[:, None].expand(3, 31), atol=1e-4)
+
+
 def test_the_shipped_judge_is_small_and_knows_made_up_jumping_jacks_from_standing() -> None:
     assert shipped(PATH).stat().st_size < 1_000_000
     assert len(identity()) == 16
@@ -191,13 +235,11 @@ def test_the_shipped_judge_is_small_and_knows_made_up_jumping_jacks_from_standin
     assert not judge.recognised("jumping jacks", moving(8)).any()
 
 
-def test_the_shipped_judge_knows_people_it_has_not_seen() -> None:
+def test_the_shipped_judge_knows_people_it_has_not_seen(training: ModuleType) -> None:
     """Where recordings are named: jumping jacks of the demonstrator, and neither a frozen frame nor the mean pose nor walking."""
     named = os.environ.get("FTL_LIGHTNING_DATA")
     if not named:
         pytest.skip("FTL_LIGHTNING_DATA names no folder of recordings")
-    sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-    training = pytest.importorskip("mocap_judge")
     windows = training.read(Path(named), 4).of(training.UNSEEN)
     states, label = windows.states(), windows.label
     judge = shipped_judge()
