@@ -1,0 +1,167 @@
+"""Measures of generated motion: what it shows, how natural it is, how far a set of it is from recordings.
+
+The first ones are metrics of a domain: ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``. The others compare
+sets of windows by the features of the judge, which has seen neither generated motion nor the generator.
+"""
+
+import itertools
+import warnings
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+from torchmetrics.image.fid import FrechetInceptionDistance
+from torchmetrics.image.kid import KernelInceptionDistance
+
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.mocap.features import extremes
+from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
+from ftl_lightning.domains.mocap.skeleton import BONES, FPS, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
+from ftl_lightning.errors import UserError
+
+POSE = "pose"
+"""The observed feature that holds where a window starts."""
+ENOUGH = 500
+"""Windows on each side from which distances of distributions say more about motion than about the number of windows."""
+_RIGID = [BONES.index(bone) for bone in RIGID]
+
+
+def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """Whether the judge that ships sees what was asked for: ``(sample,)`` of bool, see :meth:`Judge.recognised`."""
+    return shipped_judge().recognised(goal, states)
+
+
+def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """How much bones change their lengths: ``(sample,)``, the mean share by which rigid bones differ from those of the start.
+
+    Without initial states, from those of the window's first frame. People have 0.
+    """
+    first = states[:, 0] if starts is None else starts.observed[POSE]
+    usual = bone_lengths(first)[:, None, _RIGID]
+    return ((bone_lengths(states)[..., _RIGID] - usual).abs() / usual.clamp_min(1e-3)).mean(dim=(1, 2))
+
+
+def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """How much motion trembles: ``(sample,)``, mean size of the joints' third derivative, metres a second cubed."""
+    third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
+    return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
+
+
+def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """Whether both wrists go from below their shoulders to above them within the window: ``(sample,)`` of bool.
+
+    A window that starts with raised arms shows it only if they come down and rise again; no start shows it by itself.
+    """
+    joints = as_joints(states)
+    above = joints[..., list(WRISTS), 2] - joints[..., list(SHOULDERS), 2]
+    low, high = (above < 0).all(dim=-1), (above > 0).all(dim=-1)
+    return (low.int().cummax(dim=1).values.bool() & high).any(dim=1)
+
+
+def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = None) -> dict[str, float]:
+    """Frechet and kernel distance of two sets of windows in the judge's features, at equal numbers.
+
+    The Frechet distance falls with the number of windows even between equal distributions: compare rows of one number alone, beside
+    a row of real against real motion. The kernel distance has no such bias.
+
+    Args:
+        generated, real: windows ``(sample, 32, 42)``; of the larger set, as many as the smaller has are drawn.
+        seed: of what is drawn.
+        judge: whose features; the one that ships where it is ``None``.
+
+    Returns:
+        ``fid``, ``kid`` (times 1,000), and ``number``, of windows on each side; below :data:`ENOUGH` the Frechet distance means
+        little.
+
+    Raises:
+        UserError: for a side of fewer than two windows.
+    """
+    judge = judge or shipped_judge()
+    number = min(len(generated), len(real))
+    if number < 2:
+        raise UserError(f"distances of motion: expected two windows or more on each side, found {len(generated)} and {len(real)}")
+    draw = torch.Generator().manual_seed(seed)
+    sides = {True: real, False: generated}
+    chosen = {is_real: windows[torch.randperm(len(windows), generator=draw)[:number]] for is_real, windows in sides.items()}
+    found = {}
+    with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+        warnings.simplefilter("ignore")  # of memory that features need; they are few
+        torch.manual_seed(seed)
+        frechet = FrechetInceptionDistance(feature=judge)
+        kernel = KernelInceptionDistance(feature=judge, subsets=50, subset_size=min(number, ENOUGH))
+        for name, metric in (("fid", frechet), ("kid", kernel)):
+            for is_real, windows in chosen.items():
+                metric.update(windows, real=is_real)
+            value = metric.compute()
+            found[name] = float(value[0] * 1000 if isinstance(value, tuple) else value)
+    return found | {"number": float(number)}
+
+
+def _mean_distance(features: Tensor, pairs: int, draw: torch.Generator) -> Tensor:
+    """Mean distance of random pairs of different rows."""
+    first = torch.randint(len(features), (pairs,), generator=draw)
+    other = (first + torch.randint(1, len(features), (pairs,), generator=draw)) % len(features)
+    return torch.linalg.vector_norm(features[first] - features[other], dim=-1).mean()
+
+
+def diversity(states: Tensor, seed: int, pairs: int = 200, judge: Judge | None = None) -> float:
+    """How different windows ``(sample, 32, 42)`` are: mean distance of random pairs in the judge's features.
+
+    Raises:
+        UserError: for fewer than two windows.
+    """
+    if len(states) < 2:
+        raise UserError(f"diversity of motion: expected two windows or more, found {len(states)}")
+    return float(_mean_distance((judge or shipped_judge())(states), pairs, torch.Generator().manual_seed(seed)))
+
+
+def multimodality(states: Mapping[str, Tensor], seed: int, pairs: int = 20, judge: Judge | None = None) -> float:
+    """The same within each goal's windows, a mean over goals; goals of fewer than two windows are left out.
+
+    Raises:
+        UserError: where no goal has two.
+    """
+    draw, judge = torch.Generator().manual_seed(seed), judge or shipped_judge()
+    found = [_mean_distance(judge(windows), pairs, draw) for windows in states.values() if len(windows) > 1]
+    if not found:
+        raise UserError("multimodality of motion: expected two windows or more of some goal, found none")
+    return float(torch.stack(found).mean())
+
+
+def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor]) -> float:
+    """Balanced accuracy on real windows of a linear classifier that has learned from generated ones: a second opinion.
+
+    Args:
+        generated, real: windows ``(sample, 32, 42)`` by class, of the same classes.
+
+    Raises:
+        UserError: for different classes, or fewer than two.
+    """
+    from sklearn.linear_model import LogisticRegression  # a second to import
+
+    names = sorted(generated)
+    if names != sorted(real) or len(names) < 2:
+        raise UserError(
+            f"train on generated, test on real: expected the same two classes or more, found {', '.join(names)} and "
+            f"{', '.join(sorted(real))}"
+        )
+    joints = PARTS[WHOLE][0]
+
+    def numbers(windows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        labels = itertools.chain.from_iterable([index] * len(windows[name]) for index, name in enumerate(names))
+        return extremes(torch.cat([windows[name] for name in names]), joints), torch.tensor(list(labels))
+
+    (inputs, labels), (asked, right) = numbers(generated), numbers(real)
+    mean, std = inputs.mean(dim=0), inputs.std(dim=0).clamp_min(0.02)
+    found = LogisticRegression(C=0.01, max_iter=500).fit(((inputs - mean) / std).clamp(-5, 5).numpy(), labels.numpy())
+    said = torch.from_numpy(found.predict(((asked - mean) / std).clamp(-5, 5).numpy()))
+    return float(torch.stack([(said[right == index] == index).float().mean() for index in range(len(names))]).mean())
+
+
+MEASURES: Mapping[str, Callable[[str, Tensor, InitialStates | None], Tensor]] = {
+    "recognised": recognised,
+    "bone error": bone_error,
+    "jerk": jerk,
+    "rise": rise,
+}
+"""Metrics of plans by name; of bone error and jerk, less is better."""
