@@ -36,9 +36,8 @@ class LowRank:
 
     def copied(self) -> "LowRank":
         """The same on the processor, apart from what is being learned, without factors that add nothing."""
-        return LowRank(
-            {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
-        )
+        apart = {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
+        return LowRank({name: (up, down) for name, (up, down) in apart.items() if up.any()})
 
     def tensors(self) -> dict[str, Tensor]:
         """For a file, by name."""
