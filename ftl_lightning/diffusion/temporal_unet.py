@@ -96,6 +96,8 @@ class TemporalUNet(nn.Module):
         broadcast: the features of what is observed are also channels of the input at every time; false for the paper's form.
         clock: channels that tell a state's place in the plan, in addition to the states; even, 0 for the paper's form, whose
             convolutions see it by the padding at the ends alone.
+        smooth: how often the output is smoothed over time with weights 1/4, 1/2, 1/4; 0 for the paper's form. Errors of
+            neighbouring times are independent and tremble, behaviour does not: for predictions of behaviour, not of noise.
         skip: what the first level makes of the input also goes to the output directly, at full resolution; false for the paper's
             form, all of which goes through the middle.
 
@@ -116,6 +118,7 @@ class TemporalUNet(nn.Module):
         broadcast: bool = False,
         clock: int = 0,
         skip: bool = False,
+        smooth: int = 0,
     ) -> None:
         super().__init__()
         factor = 2 ** (len(multipliers) - 1)
@@ -128,6 +131,7 @@ class TemporalUNet(nn.Module):
             raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
         if clock % 2:
             raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
+        self.smooth = smooth
         self.width, self.broadcast, self.concept_dim = width, broadcast and sizes.vector_dim > 0, sizes.concept_dim
         angle = torch.linspace(0, math.pi, sizes.horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
@@ -187,5 +191,8 @@ class TemporalUNet(nn.Module):
             hidden = grow(level(torch.cat((hidden, across), dim=1), condition))
         if self.skip is not None:
             hidden = hidden + self.skip(kept[0])
-        out: Tensor = self.out(hidden).transpose(1, 2)
-        return out
+        out: Tensor = self.out(hidden)
+        for _ in range(self.smooth):
+            ends = functional.pad(out, (1, 1), mode="replicate")
+            out = (ends[..., :-2] + 2 * out + ends[..., 2:]) / 4
+        return out.transpose(1, 2)

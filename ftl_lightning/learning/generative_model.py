@@ -47,6 +47,8 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
         raise UserError(f"denoiser: expected one of {', '.join(diffusion.__all__)}, found {config.denoiser!r}")
     if config.prediction not in PREDICTIONS:
         raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {config.prediction!r}")
+    if config.prediction in ("epsilon", "v") and config.denoiser_args.get("smooth"):
+        raise UserError(f"denoiser_args.smooth: expected 0 for a network that puts out {config.prediction}, which is not smooth")
     kind: type[nn.Module] = getattr(diffusion, config.denoiser)
     try:
         denoiser = kind(config, **config.denoiser_args)

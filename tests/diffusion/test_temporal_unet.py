@@ -54,6 +54,7 @@ def unet(**options: object) -> TemporalUNet:
         {"initial_encoder": "set"},
         {"film": True},
         {"clock": 4, "broadcast": True},
+        {"skip": True, "smooth": 1},
     ],
     ids=str,
 )

@@ -29,7 +29,7 @@ from ftl_lightning.domains.mocap.skeleton import (
     mirrored,
 )
 from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, glitches, hang_down, pieces
-from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text, reads
+from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
 from ftl_lightning.errors import UserError
 from tests.domains.mocap_samples import folder, motion, recordings
 

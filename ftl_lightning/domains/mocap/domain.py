@@ -2,25 +2,45 @@
 
 from pathlib import Path
 
-from ftl_lightning.domains.domain import Concepts, Domain, Plans, Show, deferred
-from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
-from ftl_lightning.domains.mocap.source import NAME, OBSERVED, Recorded
-from ftl_lightning.domains.mocap.tasks import SUITES, TRAINING_CONCEPTS, reads
+from torch import Tensor
 
-_DRAWING = "ftl_lightning.domains.mocap.rendering"
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, deferred
+from ftl_lightning.domains.mocap.actions import judged
+from ftl_lightning.domains.mocap.judge import identity
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
+from ftl_lightning.domains.mocap.source import NAME, OBSERVED, POSE, Recorded
+from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.tasks import training_suite
+
+_DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
+
+
+def _frozen(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+    """Plans in which nobody moves."""
+    assert starts is not None
+    return starts.observed[POSE][:, None].repeat(1, HORIZON, 1)
+
 
 DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False, groups=GROUPS),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
-        suites=SUITES,
-        reads=reads,
+        suites=SUITES | {"training": training_suite(tuple(filter(judged, TRAINING_CONCEPTS)))},
+        descriptions=(*TRAINING_CONCEPTS, *NEW_CONCEPTS),
+        reads=judged,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
     source=Recorded,
     observed=OBSERVED,
-    # metrics: of the judge.
+    metrics={
+        ACCURACY: Metric(deferred(f"{_MEASURES}:recognised"), identity=identity()),
+        "rise": Metric(deferred(f"{_MEASURES}:rise")),
+        "bone error": Metric(deferred(f"{_MEASURES}:bone_error"), less_is_better=True),
+        "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
+    },
+    references={"frozen frame": _frozen},
     show=Show(*(deferred(f"{_DRAWING}:{name}") for name in ("picture", "film", "wireframe"))),
     prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
     fresh=False,  # there is no more behaviour than what was recorded

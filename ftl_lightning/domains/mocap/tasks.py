@@ -6,7 +6,7 @@ as :func:`cleaned`. Of the others no trial is pretrained on.
 
 import re
 
-from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
+from ftl_lightning.domains.tasks import EvaluationTask, Suite
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
 """Trials that pretraining never sees: those that show a new concept, whole."""
@@ -124,11 +124,6 @@ def goal_parts(goal: str) -> tuple[str, ...]:
     return tuple(goal.split(AND))
 
 
-def reads(goal: str) -> bool:
-    """Whether a text is a goal: a concept, or several joined by :data:`AND`."""
-    return all(part in _KNOWN for part in goal_parts(goal))
-
-
 def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     """From new poses, and from those that the demonstrations start in."""
     return (
@@ -138,16 +133,24 @@ def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
 
 
 def _composed(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
-    return tuple(
-        EvaluationTask("training composition", AND.join((text, other)), (text,), (other,))
-        for text in concepts
-        for other in COMPOSED_WITH
+    """With the same weights on the whole body, and with each concept on its own parts of it."""
+    pairs = [(text, other) for text in concepts for other in COMPOSED_WITH]
+    return (
+        *(EvaluationTask("new + training", AND.join(pair), pair[:1], pair[1:]) for pair in pairs),
+        *(
+            EvaluationTask(
+                "new + training, by parts of the body",
+                AND.join(pair),
+                pair[:1],
+                pair[1:],
+                on=((pair[0], ("arms", "trunk")), (pair[1], ("legs",))),
+            )
+            for pair in pairs
+        ),
     )
 
 
-_KNOWN = frozenset((*TRAINING_CONCEPTS, *NEW_CONCEPTS))
 SUITES = {
-    "training": training_suite(TRAINING_CONCEPTS),
     "paper": Suite(_new(PAPER_CONCEPTS)),
     "composition": Suite(_composed(PAPER_CONCEPTS)),
     "database": Suite(_new(DATABASE_CONCEPTS)),
