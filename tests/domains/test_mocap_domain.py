@@ -24,11 +24,12 @@ from ftl_lightning.domains.mocap.skeleton import (
     MIRROR,
     R_WRIST,
     RIGHT,
+    WRISTS,
     as_joints,
     bone_lengths,
     mirrored,
 )
-from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, glitches, hang_down, pieces
+from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, at_rest, glitches, hang_down, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
 from ftl_lightning.errors import UserError
 from tests.domains.mocap_samples import folder, motion, recordings
@@ -72,12 +73,40 @@ def test_texts_are_cleaned_and_mirrored() -> None:
 def test_new_concepts_are_no_training_concepts_and_goals_may_join_several() -> None:
     assert not set(NEW_CONCEPTS) & set(TRAINING_CONCEPTS)
     assert not [text for text in TRAINING_CONCEPTS if "jumping jack" in text]
+    reads = DOMAIN.concepts.reads
     assert reads("jumping jacks + walk")
     assert reads("walk")
     assert not reads("walk + ")
     assert not reads("fly")
+    assert not reads("wash self")  # which the judge does not know
     assert SUITES["paper"].learned == ("jumping jacks", "arm circle")
-    assert {"training", "paper", "validation"} <= set(SUITES)
+    assert {"training", "paper", "validation"} <= set(DOMAIN.concepts.suites)
+    assert all(
+        reads(goal) for name in ("training", "paper", "composition", "validation") for goal in DOMAIN.concepts.suites[name].goals
+    )
+
+
+def test_compositions_are_told_with_the_whole_body_and_by_its_parts() -> None:
+    tasks = SUITES["composition"].tasks
+    parts = {task.setting: dict(task.on) for task in tasks if task.goal == "jumping jacks + walk"}
+    assert parts == {
+        "new + training": {},
+        "new + training, by parts of the body": {"jumping jacks": ("arms", "trunk"), "walk": ("legs",)},
+    }
+    every = [column for groups in parts["new + training, by parts of the body"].values() for column in DOMAIN.plans.grouped(groups)]
+    assert sorted(every) == list(range(42))
+    with pytest.raises(UserError, match="expected one of arms, legs, trunk after '@', found 'leg'"):
+        DOMAIN.plans.grouped(("leg",))
+
+
+def test_a_frozen_frame_is_still_has_its_bones_and_is_no_action() -> None:
+    starts = DOMAIN.source(None).starts("walk", 4, 0)
+    plans = DOMAIN.references["frozen frame"]("walk", 4, starts, 0)
+    found = DOMAIN.measure("walk", plans, starts)
+    assert set(found) == {"accuracy", "rise", "bone error", "jerk"}
+    assert not found["accuracy"].any()
+    assert found["jerk"].max() < 1
+    assert found["bone error"].max() < 1e-4
 
 
 def test_the_table_holds_every_description() -> None:
@@ -126,24 +155,27 @@ def test_other_figures_and_other_descriptions_stay_out(tmp_path: Path) -> None:
         Recorded(tmp_path).split("train", 1, 0)
 
 
-def test_new_concepts_are_demonstrated_by_segments(root: Path) -> None:
+def test_new_concepts_are_demonstrated_by_windows_that_start_at_rest(root: Path) -> None:
     source = Recorded(root)
-    found = source.draw("jumping jacks", 2, 0)
-    assert sorted(found.lengths.tolist()) == [54, 117]
-    more = source.draw("jumping jacks", 5, 0)
-    assert more.concepts == ("jumping jacks",) * 5
-    assert sorted(more.lengths.tolist()[:2]) == [54, 117]
-    assert more.lengths[2:].min() >= HORIZON
-    assert more.lengths[2:].max() <= 117
-    assert torch.equal(source.draw("jumping jacks", 5, 0).states, more.states)
-    assert not torch.equal(source.draw("jumping jacks", 5, 1).states[2:, :HORIZON], more.states[2:, :HORIZON])
+    shown = [piece.states for piece in source._shown("jumping jacks")]
+    assert sorted(map(len, shown)) == [54, 117]
+    rest = [states[start : start + HORIZON] for states in shown for start in at_rest(states)]
+    assert len(rest) >= 3
+    more = source.draw("jumping jacks", len(rest) + 3, 0)
+    assert more.concepts == ("jumping jacks",) * (len(rest) + 3)
+    assert set(more.lengths.tolist()) == {HORIZON}
+    assert all(any(torch.equal(window, own) for own in more.states[: len(rest)]) for window in rest)
+    every = torch.cat([states.unfold(0, HORIZON, 1).transpose(1, 2) for states in shown])
+    assert all((every == window).all(dim=(1, 2)).any() for window in more.states)
+    assert torch.equal(source.draw("jumping jacks", len(rest) + 3, 0).states, more.states)
+    assert not torch.equal(source.draw("jumping jacks", len(rest) + 3, 1).states, more.states)
     assert set(source.draw("walk", 9, 3).concepts) == {"walk"}
 
 
 def test_segments_of_ones_own_take_the_place_of_the_shipped_ones(root: Path) -> None:
     (root / SEGMENTS).write_text("trial_id,label,start30,stop30\n13_29,knee raise,10,70\n")
     source = Recorded(root)
-    assert source.draw("knee raise", 1, 0).lengths.tolist() == [60]
+    assert [len(piece.states) for piece in source._shown("knee raise")] == [60]
     with pytest.raises(UserError, match=r"task: expected a concept that trials in .* show, found 'jumping jacks', which none does"):
         source.draw("jumping jacks", 1, 0)
 
@@ -151,7 +183,14 @@ def test_segments_of_ones_own_take_the_place_of_the_shipped_ones(root: Path) -> 
 def test_whole_trials_demonstrate_what_they_show(tmp_path: Path) -> None:
     trials = {"79_01": ("chop wood", motion(90, 1)), "80_71": ("chop wood", motion(100, 2))}
     recordings(trials).save(tmp_path / FILE)
-    assert sorted(Recorded(tmp_path).draw("chop wood", 2, 0).lengths.tolist()) == [90, 100]
+    assert [len(piece.states) for piece in Recorded(tmp_path)._shown("chop wood")] == [90, 100]
+
+
+def test_a_window_starts_where_a_motion_that_goes_to_and_fro_is_nearest_to_standing() -> None:
+    states = torch.from_numpy(motion(1, 0)).reshape(1, 42).repeat(120, 1)
+    lift = 0.5 - 0.5 * torch.cos(torch.arange(120) * 2 * torch.pi / 30)
+    states[:, [3 * WRISTS[0] + 2, 3 * WRISTS[1] + 2]] += lift[:, None]
+    assert at_rest(states) == [0, 30, 60]
 
 
 def test_behaviour_starts_with_arms_down_in_trials_of_no_training_split(root: Path) -> None:

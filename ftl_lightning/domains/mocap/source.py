@@ -33,6 +33,8 @@ LONGEST = 128
 """Frames in a piece of a trial; longer ones are cut, and their parts overlap by a window less a frame, so that none is lost."""
 OTHER_FIGURES = ("bvh_daz",)
 """Kinds of recordings that are left out: all subjects moved onto one figure that is not theirs."""
+CYCLE = 8
+"""Frames: what is repeated takes at least twice as many."""
 ARMS_DOWN = 0.4
 """Metres at most from a wrist to its hip, sideways and in height, where arms hang down."""
 UPRIGHT = 0.35
@@ -52,6 +54,10 @@ class Piece:
     trial: int
     concept: str
     states: Tensor
+
+    def window(self, start: int) -> "Piece":
+        """As long as a plan."""
+        return Piece(self.trial, self.concept, self.states[start : start + HORIZON])
 
 
 @dataclass(frozen=True)
@@ -103,24 +109,24 @@ class Recorded:
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         """Demonstrations of a concept, without replacement where there are enough.
 
-        Those of a new concept are the segments of its subjects, whole. Where more are asked for than there are, each further one is
-        a window of at least 32 frames from one of them, at a random place and of a random length. Those of a training concept are
-        pieces of its trials.
+        Those of a new concept are windows as long as a plan, each from where its subject is nearest to standing at rest
+        (:func:`at_rest`): what varies over a plan is told at the same times in all of them. Where more are asked for than there
+        are, each further one is a window from a random place. Those of a training concept are pieces of its trials.
 
         Raises:
             UserError: if no trial of the folder shows it.
         """
-        every = self._shown(task) if task in NEW_CONCEPTS else [piece for piece in self._pieces if piece.concept == task]
-        if not every:
+        new = task in NEW_CONCEPTS
+        shown = self._shown(task) if new else [piece for piece in self._pieces if piece.concept == task]
+        if not shown:
             raise UserError(f"task: expected a concept that trials in {self.root} show, found {task!r}, which none does")
         draw = generator("cpu", seed, task_key(task))
+        every = [piece.window(start) for piece in shown for start in at_rest(piece.states)] if new else shown
         order = torch.randperm(len(every), generator=draw).tolist()
         found = [every[row] for row in order[:count]]
         while len(found) < count:
-            piece = every[order[len(found) % len(every)]]
-            length = int(torch.randint(HORIZON, len(piece.states) + 1, (1,), generator=draw))
-            start = int(torch.randint(len(piece.states) - length + 1, (1,), generator=draw))
-            found.append(Piece(piece.trial, piece.concept, piece.states[start : start + length]))
+            piece = shown[int(torch.randint(len(shown), (1,), generator=draw))]
+            found.append(piece.window(int(torch.randint(len(piece.states) - HORIZON + 1, (1,), generator=draw))))
         return self._demonstrations(found, {"task": task, "seed": seed})
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
@@ -223,6 +229,14 @@ def glitches(states: NDArray[np.float32]) -> list[int]:
     joints = states.reshape(len(states), -1, 3)
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1, initial=0) * FPS
     return (np.flatnonzero(speed > MAX_SPEED) + 1).tolist()
+
+
+def at_rest(states: Tensor) -> list[int]:
+    """Frames of ``(frame, 42)`` where windows as long as a plan start: nearest to standing among :data:`CYCLE` on both sides."""
+    (standing,) = standing_poses(1, generator("cpu", 0))
+    far = torch.linalg.vector_norm(states - standing, dim=1)
+    frames = range(len(states) - HORIZON + 1)
+    return [frame for frame in frames if far[frame] == far[max(frame - CYCLE, 0) : frame + CYCLE + 1].min()]
 
 
 def hang_down(poses: Tensor) -> Tensor:
