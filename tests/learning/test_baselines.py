@@ -16,6 +16,7 @@ from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.learning.baselines.additive import added
 from ftl_lightning.learning.baselines.cloning import CloningConfig, CloningModel, ParallelMLP
 from ftl_lightning.learning.baselines.in_context import InContextConfig, InContextModel
 from ftl_lightning.learning.baselines.language import LanguageAdaptation
@@ -285,3 +286,9 @@ def test_tasks_are_told_in_the_papers_words() -> None:
     )
     assert sentence("square diagonal to triangle and circle above square").endswith("to triangle and circle above square")
     assert DOMAIN.concepts.sentence("go to red bowl") == "go to red bowl"
+
+
+def test_models_that_add_concepts_refuse_weights_on_some_columns() -> None:
+    part = Composition(torch.zeros(1, 1, 3), torch.ones(1, 1)).on((0,), 4)
+    with pytest.raises(UserError, match="expected concepts without '@' for a model that adds them up"):
+        added(part)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, Draws
 
 
@@ -29,6 +30,12 @@ class AdditiveModel(ConceptModel):
 
 
 def added(composition: Composition) -> Tensor:
-    """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, n)``."""
+    """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, n)``.
+
+    Raises:
+        UserError: for a concept whose weight is on some columns alone: one sum acts on all of them.
+    """
+    if composition.columns is not None:
+        raise UserError("compose: expected concepts without '@' for a model that adds them up, found groups of columns")
     rows = zip(composition.weights, composition.embeddings, strict=True)
     return torch.stack([weights @ embeddings for weights, embeddings in rows])
