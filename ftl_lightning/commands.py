@@ -115,7 +115,7 @@ class SampleOptions:
         steps: of the sampler; 0 likewise.
         temperature: the paper's alpha; lower is less diverse and more accurate; null likewise.
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
-            drawn from the seed.
+            drawn from the seed; without a goal, those of the task that the concept was learned from, or of the first composed text.
         initial: demonstrations file whose initial states are used instead; one sample of each.
         out: demonstrations file to write.
         figure: picture to write, .png or .svg.
@@ -211,7 +211,7 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     if options.animation and not options.execute and domain.show.film is None:
         raise UserError(f"animation: expected --execute true (plans of {domain.name} are not filmed), found {options.animation!r}")
-    if domain.observed and not (options.goal or options.initial):
+    if domain.observed and not (options.initial or _start_task(options, domain)):
         raise UserError(
             f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
         )
@@ -223,7 +223,18 @@ def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates |
 
     if options.initial:
         return Demonstrations.load(options.initial).fitted(domain.observed).initial_states
-    return domain.source(None).starts(options.goal, options.count, options.seed) if domain.observed else None
+    task = _start_task(options, domain)
+    return domain.source(None).starts(task, options.count, options.seed) if domain.observed else None
+
+
+def _start_task(options: SampleOptions, domain: "Domain") -> str:
+    """The task whose initial states are drawn; empty where nothing names one that the domain reads."""
+    from ftl_lightning.concepts.composition import parse_composition
+    from ftl_lightning.concepts.concept import Concept
+
+    learned = (Concept.load(options.concept).origin.name,) if options.concept and not options.goal else ()
+    named = (options.goal, *learned, *(part.concept for part in parse_composition(options.compose)))
+    return next((text for text in named if text and domain.concepts.reads(text)), "")
 
 
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:

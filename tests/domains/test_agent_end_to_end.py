@@ -71,8 +71,10 @@ def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pyt
     assert main([*common, "--initial=states.safetensors", "--out=again.safetensors"]) == 0
     again = Demonstrations.load("again.safetensors")
     assert (again.states == drawn.states).all()
+    assert main([*common, "--count=3", "--out=own.safetensors"]) == 0  # the composed text names a task to start from
+    assert (Demonstrations.load("own.safetensors").states == drawn.states).all()
     capsys.readouterr()
-    assert main(common) == 2
+    assert main(["sample", f"--pretrained={model}"]) == 2
     assert "goal, initial: expected" in capsys.readouterr().err
 
 
