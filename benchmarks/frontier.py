@@ -50,7 +50,7 @@ class Form:
         method: its name in tables.
         variant: what tells it apart from others of the same method; may be empty.
         config: configuration file of ``invert``, where ``{domain}`` stands for the domain.
-        changes: of the module's arguments, for ours those of :class:`~ftl_lightning.learning.inversion.InversionSettings`.
+        changes: of the module's arguments, for ours those of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
         tempered: whether the temperature matters.
     """
 

@@ -34,7 +34,8 @@ from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import ACCURACY
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.seeding import generator

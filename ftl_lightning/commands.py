@@ -306,20 +306,11 @@ def report(results: str = "results", out: str = "results/report", readme: str = 
     print(f"written to {out}")
 
 
-def study(
-    domain: str,
-    films: str = "films",
-    out: str = "study",
-    scenarios: int = 1,
-    repeats: int = 2,
-    still: int = 1,
-    seed: int = 0,
-    title: str = "",
-    consent: str = "",
-) -> None:
+@dataclass(frozen=True)
+class StudyOptions:
     """Make a web page in which people rate films of generated behaviour.
 
-    Args:
+    Attributes:
         domain: name of a domain whose plans are filmed.
         films: folder with files METHOD/CONCEPT.safetensors that "sample --out" wrote, or with films.json, a list of
             {"concept", "method", "file"} and, if wanted, "scenario", "setting" and "row".
@@ -328,21 +319,43 @@ def study(
         repeats: attention checks: questions that are asked twice.
         still: attention checks: films that stand still and so depict no motion.
         seed: deals out the films' numbers and draws what is shown and repeated.
-        title: of the page.
+        title: of the page; empty for one that tells nothing.
         consent: text file that raters agree to, in place of the page's own words.
     """
+
+    domain: str
+    films: str = "films"
+    out: str = "study"
+    scenarios: int = 1
+    repeats: int = 2
+    still: int = 1
+    seed: int = 0
+    title: str = ""
+    consent: str = ""
+
+    def __post_init__(self) -> None:
+        from ftl_lightning.errors import UserError
+
+        for name, least in (("scenarios", 1), ("repeats", 0), ("still", 0), ("seed", 0)):
+            if (value := getattr(self, name)) < least:
+                raise UserError(f"{name}: expected {least} or more, found {value}")
+
+
+def study(options: StudyOptions) -> None:
+    """Make the page and its key as the options say."""
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.errors import UserError
+    from ftl_lightning.study.films import read_films
     from ftl_lightning.study.page import make_study
+    from ftl_lightning.study.questions import ask
 
-    for name, value, least in (("scenarios", scenarios, 1), ("repeats", repeats, 0), ("still", still, 0), ("seed", seed, 0)):
-        if value < least:
-            raise UserError(f"{name}: expected {least} or more, found {value}")
     try:
-        words = Path(consent).read_text(encoding="utf-8") if consent else ""
+        words = Path(options.consent).read_text(encoding="utf-8") if options.consent else ""
     except (OSError, ValueError) as error:
-        raise UserError(f"consent: expected a text file, found {consent} ({error})") from error
-    made = make_study(load_domain(domain), Path(films), Path(out), scenarios, repeats, still, seed, title, words)
+        raise UserError(f"consent: expected a text file, found {options.consent} ({error})") from error
+    domain = load_domain(options.domain)
+    films = read_films(Path(options.films), domain, options.scenarios, options.seed)
+    made = make_study(domain, ask(films, options.repeats, options.still, options.seed), Path(options.out), options.title, words)
     print(f"{made.page}: {made.films} films, {made.questions} questions, {made.size / 1000:.0f} kB; it goes to the raters")
     print(f"{made.key}: says which film is whose; it stays with you")
 

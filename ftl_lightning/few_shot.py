@@ -216,7 +216,7 @@ class FewShot:
             steps: of gradient descent; ``None`` for the tuned number.
             seed: decides starts, noise and timesteps.
             progress: show a bar.
-            changes: of :class:`~ftl_lightning.learning.inversion.InversionSettings`, such as ``components=1``.
+            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``components=1``.
 
         Raises:
             UserError: where demonstrations or settings do not fit the model.

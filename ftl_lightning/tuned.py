@@ -6,7 +6,7 @@ from typing import Self
 
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.inversion import InversionSettings
+from ftl_lightning.learning.inversion_settings import InversionSettings
 
 
 @dataclass(frozen=True)

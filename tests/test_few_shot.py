@@ -22,7 +22,8 @@ from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot, LearnedConcept, Tuned
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
-from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import file_hash
 from tests.conftest import CONF, ROOT

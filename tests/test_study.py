@@ -16,6 +16,7 @@ from ftl_lightning.study.agreement import krippendorff_alpha
 from ftl_lightning.study.answers import Key, inattention, read_key, read_rater
 from ftl_lightning.study.films import read_films
 from ftl_lightning.study.page import Made, make_study
+from ftl_lightning.study.questions import ask
 from ftl_lightning.study.report import Report, study_table
 from tests.study import FILMED, FRAMES, METHODS, NEW, PEOPLE, TRAINING, simulated, write_films
 
@@ -29,9 +30,10 @@ def films(tmp_path: Path) -> Path:
 
 
 def make(films: Path, out: Path, **options: Any) -> Made:
-    return make_study(
-        **{"domain": PEOPLE, "films": films, "out": out, "scenarios": 1, "repeats": 2, "still": 1, "seed": 0} | options
-    )
+    told = {"domain": PEOPLE, "scenarios": 1, "repeats": 2, "still": 1, "seed": 0} | options
+    domain, scenarios, repeats, still, seed = (told.pop(name) for name in ("domain", "scenarios", "repeats", "still", "seed"))
+    questions = ask(read_films(films, domain, scenarios, seed), repeats, still, seed)
+    return make_study(domain, questions, out, **told)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,10 +15,10 @@ from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import moved
-from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
 from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.stopping import Stopping
 from ftl_lightning.seeding import generator
 
@@ -29,90 +28,6 @@ FINAL_SAMPLES = 128
 """Noised demonstrations on which a learned concept is judged, the same for all restarts."""
 HELD_OUT = 32
 """Noised demonstrations whose loss decides when a run stops."""
-EXPLAINED = 0.4
-"""Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class InversionSettings:
-    """How concepts are learned.
-
-    Attributes:
-        components: K.
-        omega: fixed guidance weight of every component, or ``'learned'``.
-        initial_omega: where learned weights start (the paper draws them from U(0, 1)).
-        off_span: how freely embeddings leave the affine span of the training embeddings: 1 is the paper's free form, 0 keeps
-            them in the span, between the two the part off the span is scaled, which slows its learning down.
-        initial_spread: embeddings start at the mean of the training embeddings plus so much normal noise a column.
-        restarts: independent starts of each concept; the one with the lowest loss on common noise is kept.
-        learning_rate: of the embeddings (Adam).
-        weight_learning_rate: of the weights; with the embeddings' rate they collapse.
-        samples: noised demonstrations a step and run, spread over the run's demonstrations and timesteps.
-        mode_samples: the same of the run of a mode.
-        modes: sets of embeddings of a concept, see :class:`~ftl_lightning.concepts.composition.Modes`. 1 is the paper's form;
-            otherwise beside it, from the same start, a set is learned from every demonstration (``'each'``), or from every
-            n-th one for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes where one set explains the
-            demonstrations at least :data:`EXPLAINED` as well as they do, and from single modes elsewhere.
-        tolerance: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than this share of
-            all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
-            :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not
-            count; of fewer steps than a round has, the last one does. ``None`` for all
-            steps, the rate decaying to 0.
-        knots: embeddings of a component at even times of the plan, between which the denoiser interpolates; 1 is the paper's form.
-            For denoisers that see time, such as the temporal U-Net.
-        adapter: rank of a low-rank change of the denoiser in the concept's own branches (LoRA), learned beside the embeddings; 0,
-            the paper's form, for none.
-        adapter_learning_rate: of that.
-        loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
-            at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
-        timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
-            of them fall in the noisiest eighth. There the concept alone tells what to do; at low noise the plan reveals the goal,
-            so the empty concept already has a low loss: a local minimum.
-        seed: decides starts, noise and timesteps.
-
-    Raises:
-        UserError: at construction, for a value that is none.
-    """
-
-    components: int = 2
-    omega: float | Literal["learned"] = 1.2
-    initial_omega: float = 1.0
-    off_span: float = 1.0
-    initial_spread: float = 0.05
-    restarts: int = 1
-    learning_rate: float = 0.1
-    weight_learning_rate: float = 3e-3
-    samples: int = 32
-    mode_samples: int = 8
-    modes: int | Literal["each", "auto"] = 1
-    tolerance: float | None = None
-    knots: int = 1
-    adapter: int = 0
-    adapter_learning_rate: float = 1e-3
-    loss: str = "epsilon"
-    timestep_power: float = 1.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("components", "restarts", "samples", "mode_samples", "knots"):
-            if (value := getattr(self, name)) < 1:
-                raise UserError(f"model.{name}: expected 1 or more, found {value}")
-        if isinstance(self.modes, int) and self.modes < 1:
-            raise UserError(f"model.modes: expected 1 or more, 'each' or 'auto', found {self.modes}")
-        if isinstance(self.modes, str) and self.modes not in ("each", "auto"):
-            raise UserError(f"model.modes: expected a number, 'each' or 'auto', found {self.modes!r}")
-        if self.tolerance is not None and not 0 <= self.tolerance < 1:
-            raise UserError(f"model.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
-        if self.adapter < 0:
-            raise UserError(f"model.adapter: expected 0 (none) or a rank, found {self.adapter}")
-        if self.adapter and (self.modes != 1 or self.tolerance is not None):
-            raise UserError("model.adapter: expected model.modes 1 and model.tolerance null beside it, found others")
-        if not 0 <= self.off_span <= 1:
-            raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {self.off_span}")
-        if self.timestep_power < 1:
-            raise UserError(f"model.timestep_power: expected 1 or more, found {self.timestep_power}")
-        if self.loss not in LOSSES:
-            raise UserError(f"model.loss: expected one of {', '.join(LOSSES)}, found {self.loss!r}")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.baselines.additive import AdditiveModel
 from ftl_lightning.learning.checkpoint import check_signature, sign
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.learning.inversion import Inversion, InversionSettings, check_settings
+from ftl_lightning.learning.inversion import Inversion, check_settings
+from ftl_lightning.learning.inversion_settings import InversionSettings
 
 
 class InversionModule(Adaptation):
@@ -25,7 +26,7 @@ class InversionModule(Adaptation):
 
     Args:
         pretrained: folder of the pretrained model.
-        components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion.InversionSettings`.
+        components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
         initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
         mode_samples, modes, tolerance, knots, adapter, adapter_learning_rate, loss, timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed

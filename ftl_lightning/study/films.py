@@ -62,8 +62,11 @@ def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[
         seed: decides the rows that no listing names.
 
     Raises:
-        UserError: for files that are missing, of another domain or without enough samples, and for a scenario that lacks a method.
+        UserError: for a domain without films, for files that are missing, of another domain or without enough samples, and for a
+            scenario that lacks a method.
     """
+    if domain.show.film is None and domain.show.wireframe is None:
+        raise UserError(f"domain: expected one whose plans are filmed, found {domain.name}, which has no films")
     if not folder.is_dir():
         raise UserError(f"films: expected a folder of generated behaviour, found {'a file' if folder.exists() else 'no'} {folder}")
     listing = folder / LISTING

@@ -14,8 +14,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.wireframe import ABOVE, Wireframe, seen, window
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.animation import frame_milliseconds, gif
-from ftl_lightning.study.films import read_films
-from ftl_lightning.study.questions import Questions, ask, film_id
+from ftl_lightning.study.questions import Questions, film_id
 from ftl_lightning.tensor_file import bytes_hash, content_hash, write_text
 
 PAGE, KEY = "study.html", "key.json"
@@ -51,27 +50,19 @@ class Made:
     questions: int
 
 
-def make_study(
-    domain: Domain, films: Path, out: Path, scenarios: int, repeats: int, still: int, seed: int, title: str = "", consent: str = ""
-) -> Made:
-    """Write a study's page and key; the same films and options give the same bytes.
+def make_study(domain: Domain, questions: Questions, out: Path, title: str = "", consent: str = "") -> Made:
+    """Write a study's page and key; the same questions and options give the same bytes.
 
     Args:
         domain: whose behaviour the films show.
-        films: folder, see :func:`~ftl_lightning.study.films.read_films`.
+        questions: about them.
         out: folder to write to.
-        scenarios: of each concept.
-        repeats, still: checks, see :func:`~ftl_lightning.study.questions.ask`.
-        seed: deals out the films' numbers.
         title: of the page; empty for one that tells nothing.
         consent: what raters agree to; empty for :data:`CONSENT`.
 
     Raises:
-        UserError: for a domain without films, for films that are missing, and where ``out`` has the key of another study.
+        UserError: where ``out`` has the key of another study.
     """
-    if domain.show.film is None and domain.show.wireframe is None:
-        raise UserError(f"domain: expected one whose plans are filmed, found {domain.name}, which has no films")
-    questions = ask(read_films(films, domain, scenarios, seed), repeats, still, seed)
     minutes = max(1, round(len(questions.page) * SECONDS_A_QUESTION / 60))
     content: dict[str, Any] = {
         "title": title or "Which films depict what they should?",
@@ -88,7 +79,7 @@ def make_study(
         "study": content["study"],
         "page": content["page"],
         "domain": domain.name,
-        "seed": seed,
+        "seed": questions.seed,
         "questions": questions.key,
         "films": questions.shown,
     }

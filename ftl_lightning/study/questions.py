@@ -30,6 +30,7 @@ class Questions:
         page: questions as the page has them: ``{"id", "text", "films"}``, a single film for yes or no, several to choose from.
         key: what each question is, by its id.
         shown: what each film is, by its id.
+        seed: that dealt them out.
     """
 
     films: tuple[Film, ...]
@@ -37,6 +38,7 @@ class Questions:
     page: tuple[Mapping[str, Any], ...]
     key: Mapping[str, Mapping[str, Any]]
     shown: Mapping[str, Mapping[str, Any]]
+    seed: int
 
 
 def film_id(number: int) -> str:
@@ -97,6 +99,7 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
         page=tuple(page),
         key=key,
         shown={film_id(number): _told(film, number in standing) for number, film in enumerate(dealt)},
+        seed=seed,
     )
 
 

@@ -23,7 +23,8 @@ from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
-from ftl_lightning.learning.inversion import InversionSettings, invert
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.tuned import Tuned
 from tests.strokes import strokes
 

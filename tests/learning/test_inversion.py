@@ -18,7 +18,8 @@ from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.learning.inversion import EXPLAINED, InversionSettings, explained, invert
+from ftl_lightning.learning.inversion import explained, invert
+from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer

@@ -13,7 +13,8 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import Inversion, InversionSettings, invert
+from ftl_lightning.learning.inversion import Inversion, invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.learning.stopping import IDLE, ROUND, Stopping
 from ftl_lightning.trainer import Trainer

@@ -14,7 +14,7 @@ from ftl_lightning.domains.data import InversionData
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.learning.generative_model import GenerativeModel
-from ftl_lightning.learning.inversion import InversionSettings
+from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.reporting.figures import learning_time
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached, read_speed
 from ftl_lightning.seeding import generator
