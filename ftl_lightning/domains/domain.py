@@ -226,12 +226,13 @@ class View:
         features: what the model observes, by name.
         observe: observed features of the domain to those.
         encode: ``(states (sample, horizon, state), observed) -> (sample, horizon, state)``.
-        decode: its inverse.
+        decode: its inverse for behaviour that there can be; of other states, which a network may generate, the nearest such.
         perturb: ``(states, observed, generator) -> both``, as if the present had been a little different: training on perturbed
             starts teaches recovery from states outside the demonstrations. Without a generator, only what a new task will not
             show is hidden. ``None`` where neither is known.
         act: as of :class:`ClosedLoop`, for a planner that looks at behaviour likewise; ``None`` for the domain's.
         scales: groups of columns of a state, in the same order: those in the same place of each share a scale.
+        same_columns: what it sees has the columns of a state of the domain.
     """
 
     features: Mapping[str, Feature]
@@ -241,6 +242,7 @@ class View:
     perturb: Callable[[Tensor, Observed, torch.Generator | None], tuple[Tensor, Observed]] | None = None
     act: Callable[[Tensor, int, Observed], Tensor] | None = None
     scales: tuple[tuple[int, ...], ...] = ()
+    same_columns: bool = False
 
 
 def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:

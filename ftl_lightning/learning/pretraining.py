@@ -153,7 +153,7 @@ class Pretraining(pl.LightningModule, ABC):
             if features:
                 sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
                 beside = Normalization.fit(joined_vectors(seen, features), sizes.entities, resolution)
-                if sizes.state_columns and view is None:  # a view has another scale
+                if sizes.state_columns and (view is None or view.same_columns):  # else plans have another scale
                     beside.share(sizes.state_columns, normalization)
             self.model = self.build(shared, data, normalization, embeddings, beside)
             self.model.examples = data.examples

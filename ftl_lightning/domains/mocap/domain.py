@@ -11,6 +11,7 @@ from ftl_lightning.domains.mocap.judge import identity
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
 from ftl_lightning.domains.mocap.source import NAME, OBSERVED, POSE, Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.mocap.views import VIEWS
 from ftl_lightning.domains.tasks import training_suite
 
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
@@ -41,6 +42,7 @@ DOMAIN = Domain(
         "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
     },
     references={"frozen frame": _frozen},
+    views=VIEWS,
     show=Show(*(deferred(f"{_DRAWING}:{name}") for name in ("picture", "film", "wireframe"))),
     prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
     fresh=False,  # there is no more behaviour than what was recorded
