@@ -1,4 +1,4 @@
-"""Low-rank adapters (LoRA, Hu et al., 2022): what a concept changes of the denoiser, in its own branch of the formula alone."""
+"""Low-rank adapters (LoRA, Hu et al., 2022): what a concept changes of the denoiser, in its own branch of the formula."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +15,11 @@ class LowRank:
 
     Attributes:
         factors: ``up (outputs, rank)`` and ``down (rank, everything else)`` of each weight, by the parameter's name.
+        everywhere: whether all other branches of a composition are changed too, as by fine-tuning the network.
     """
 
     factors: Mapping[str, tuple[Tensor, Tensor]]
+    everywhere: bool = False
 
     def __call__(self, denoiser: Denoiser) -> Denoiser:
         """The network with changed weights; its own stay as they are, and gradients reach the factors."""
@@ -37,17 +39,17 @@ class LowRank:
     def copied(self) -> "LowRank":
         """The same on the processor, apart from what is being learned, without factors that add nothing."""
         apart = {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
-        return LowRank({name: (up, down) for name, (up, down) in apart.items() if up.any()})
+        return LowRank({name: (up, down) for name, (up, down) in apart.items() if up.any()}, self.everywhere)
 
     def tensors(self) -> dict[str, Tensor]:
         """For a file, by name."""
         return {f"{name}/{kind}": factor for name, both in self.factors.items() for kind, factor in zip(KINDS, both, strict=True)}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "LowRank":
+    def from_tensors(cls, tensors: Mapping[str, Tensor], everywhere: bool = False) -> "LowRank":
         """The inverse of :meth:`tensors`."""
         names = dict.fromkeys(name.rpartition("/")[0] for name in tensors)
-        return cls({name: (tensors[f"{name}/{KINDS[0]}"], tensors[f"{name}/{KINDS[1]}"]) for name in names})
+        return cls({name: (tensors[f"{name}/{KINDS[0]}"], tensors[f"{name}/{KINDS[1]}"]) for name in names}, everywhere)
 
 
 KINDS = ("up", "down")

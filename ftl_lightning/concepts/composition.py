@@ -1,9 +1,10 @@
 """Compositions of concepts, and the composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +16,17 @@ Context = tuple[Tensor, ...]
 Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Context], Tensor]
 """``(x (batch, horizon, state), t (batch,), concepts (concept, knots * n), index (batch,), context) -> noise like x``, where
 ``index`` is each sample's row of ``concepts``."""
-Adapter = Callable[[Denoiser], Denoiser]
-"""Changes a denoiser for the branches of its own concept, see :mod:`ftl_lightning.concepts.adapter`."""
+
+
+class Adapter(Protocol):
+    """Changes a denoiser for the branches of its own concept, see :mod:`ftl_lightning.concepts.adapter`."""
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it changes all other branches of a composition too, of concepts without an adapter and of the empty one."""
+
+    def __call__(self, denoiser: Denoiser, /) -> Denoiser:
+        """The changed denoiser."""
 
 
 STRETCH = 1.5
@@ -93,8 +103,10 @@ class Composition:
         """Both; concepts that do not vary over the plan are said at every knot of those that do.
 
         Raises:
-            UserError: for concepts of different numbers of knots, neither of which is 1.
+            UserError: for concepts of different numbers of knots, neither of which is 1; for two adapters that change all.
         """
+        if all(any(adapter.everywhere for adapter in part.adapters) for part in (self, other)):
+            raise UserError("compose: expected at most one concept whose adapter changes the whole network, found two")
         knots, state = _common([self.knots, other.knots]), _columns_of((self, other))
         parts = [part._filled(knots, state, len(self.adapters) * first) for first, part in enumerate((self, other))]
         return Composition(
@@ -244,8 +256,8 @@ def composed_epsilon(
     """``eps(x, empty) + sum_k w_k (eps_k(x, c_k) - eps(x, empty))``, all branches in one call of the network.
 
     ``eps_k`` is the denoiser or, where a concept has an adapter, what the adapter makes of it, which is called for those branches
-    alone. A weight may differ between the columns of a state. While learning, the empty branch, which depends on no concept, is
-    evaluated apart, without gradient.
+    alone unless it changes everything. A weight may differ between the columns of a state. While learning, the empty branch, which
+    depends on no concept, is evaluated apart, without gradient.
 
     Args:
         denoiser: estimates noise for one concept a sample.
@@ -279,7 +291,13 @@ def composed_epsilon(
         with torch.no_grad():
             unconditional = evaluate(denoiser, silent, nothing)[0]
         if composition.adapters:
-            conditional = _adapted(denoiser, composition, own, rows, evaluate, unconditional)
+            number = _given(composition.adapter)  # (composition, K)
+            whole = number.new_tensor([0, *(n * adapter.everywhere for n, adapter in enumerate(composition.adapters, start=1))])
+            every = whole[number].amax(dim=1, keepdim=True)[own]  # (batch, 1)
+            made = functools.partial(_adapted, denoiser, composition.adapters, evaluate, unconditional)
+            conditional = made(concepts.flatten(0, 1), rows, torch.where(number[own] == 0, every, number[own]).T)
+            if every.any():
+                (unconditional,) = made(silent, nothing, every.T)
         else:
             conditional = evaluate(denoiser, concepts.flatten(0, 1), rows)
     else:
@@ -293,17 +311,16 @@ def composed_epsilon(
 
 def _adapted(
     denoiser: Denoiser,
-    composition: Composition,
-    own: Tensor,
-    rows: Tensor,
+    adapters: Sequence[Adapter],
     evaluate: Callable[[Denoiser, Tensor, Tensor, Tensor], Tensor],
     like: Tensor,
+    concepts: Tensor,
+    rows: Tensor,
+    number: Tensor,
 ) -> Tensor:
-    """Noise of the concepts' branches ``(K, batch, horizon, state)``, those of each adapter by the denoiser that it makes."""
-    number = _given(composition.adapter)[own].T  # (K, batch)
-    concepts = composition.embeddings.flatten(0, 1)
+    """Noise ``(branch, batch, horizon, state)`` for ``rows (branch, batch)`` of concepts, each by the adapter of that number."""
     noise = like.expand(len(rows), *like.shape)
-    for this, adapter in enumerate((None, *composition.adapters)):
+    for this, adapter in enumerate((None, *adapters)):
         branch, sample = (number == this).nonzero(as_tuple=True)
         if len(branch):
             changed = denoiser if adapter is None else adapter(denoiser)

@@ -110,6 +110,8 @@ class Concept:
         if self.modes is not None:
             tensors |= {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
             header |= {"mixed": self.modes.mixed}
+        if self.adapter is not None and self.adapter.everywhere:
+            header |= {"everywhere": True}
         if form in AXES:
             header |= {"axes": AXES[form]}
         if form == 3:
@@ -141,7 +143,7 @@ class Concept:
             knots = tensors["embeddings"].shape[1]
             tensors |= {name: tensors[name].flatten(-2) for name in names if "embeddings" in name}
             own = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
-            adapter = LowRank.from_tensors(own) if own else None
+            adapter = LowRank.from_tensors(own, header.get("everywhere", False)) if own else None
         modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], header["mixed"]) if several else None
         origin = Origin(**{field.name: header[field.name] for field in fields(Origin)})
         return cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)

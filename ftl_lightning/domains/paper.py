@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 OURS = "FTL-IGM"
 """The name of the paper's method."""
+FINE_TUNED = "LoRA fine-tuning"
+"""Learning a concept with an adapter that changes the whole network: what ours is compared with."""
 WITH_MODES = " with modes"
 WITH_KNOTS = " over time"
 WITH_ADAPTER = " with adapter"

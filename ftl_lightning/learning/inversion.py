@@ -125,7 +125,10 @@ class Inversion(nn.Module):
     def adapter(self, run: int) -> LowRank | None:
         """A run's adapter; ``None`` where there are none."""
         factors = [factor[run] for factor in self.factors]
-        return LowRank(dict(zip(self._names, zip(factors[::2], factors[1::2], strict=True), strict=True))) if factors else None
+        if not factors:
+            return None
+        named = dict(zip(self._names, zip(factors[::2], factors[1::2], strict=True), strict=True))
+        return LowRank(named, self.settings.adapter_scope == "all")
 
     def _losses(self, samples: int, draw: torch.Generator, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
         """The model's loss (ours is Eq. 2) for every sample ``(run, samples)``. Runs share what is random in it and, as a share of

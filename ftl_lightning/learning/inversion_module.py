@@ -8,7 +8,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.domains.paper import WITH_ADAPTER, WITH_KNOTS, WITH_MODES
+from ftl_lightning.domains.paper import FINE_TUNED, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.baselines.additive import AdditiveModel
@@ -28,7 +28,8 @@ class InversionModule(Adaptation):
         pretrained: folder of the pretrained model.
         components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
         initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
-        mode_samples, modes, tolerance, knots, adapter, adapter_learning_rate, loss, timestep_power, seed: likewise.
+        mode_samples, modes, tolerance, knots, adapter, adapter_learning_rate, adapter_scope, loss: likewise.
+        timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -56,6 +57,7 @@ class InversionModule(Adaptation):
         knots: int = 1,
         adapter: int = 0,
         adapter_learning_rate: float = 1e-3,
+        adapter_scope: Literal["concept", "all"] = "concept",
         loss: str = "epsilon",
         timestep_power: float = 1.0,
         training_omega: float | None = None,
@@ -71,6 +73,8 @@ class InversionModule(Adaptation):
     @property
     def method(self) -> str:
         """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
+        if self.settings.adapter and self.settings.adapter_scope == "all":
+            return FINE_TUNED
         modes, knots, adapter = (self.settings.modes != 1, self.settings.knots > 1, self.settings.adapter > 0)
         forms = [name for name, has in ((WITH_MODES, modes), (WITH_KNOTS, knots), (WITH_ADAPTER, adapter)) if has]
         return "".join((super().method, *forms))

@@ -40,6 +40,8 @@ class InversionSettings:
         adapter: rank of a low-rank change of the denoiser in the concept's own branches (LoRA), learned beside the embeddings; 0,
             the paper's form, for none.
         adapter_learning_rate: of that.
+        adapter_scope: ``'concept'`` for these branches alone; ``'all'`` changes everything that the concept is composed with
+            too, as fine-tuning does, to compare with.
         loss: whose squared error is minimised, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps,
             at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
@@ -66,6 +68,7 @@ class InversionSettings:
     knots: int = 1
     adapter: int = 0
     adapter_learning_rate: float = 1e-3
+    adapter_scope: Literal["concept", "all"] = "concept"
     loss: str = "epsilon"
     timestep_power: float = 1.0
     seed: int = 0
@@ -80,6 +83,8 @@ class InversionSettings:
             raise UserError(f"model.modes: expected a number, 'each' or 'auto', found {self.modes!r}")
         if self.tolerance is not None and not 0 <= self.tolerance < 1:
             raise UserError(f"model.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
+        if self.adapter_scope not in ("concept", "all"):
+            raise UserError(f"model.adapter_scope: expected concept or all, found {self.adapter_scope!r}")
         if self.adapter < 0:
             raise UserError(f"model.adapter: expected 0 (none) or a rank, found {self.adapter}")
         if self.adapter and (self.modes != 1 or self.tolerance is not None):

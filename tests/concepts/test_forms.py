@@ -1,5 +1,6 @@
 """Forms of a concept beyond the paper's: over time (knots), on some columns of a state, with an adapter in its own branch."""
 
+import copy
 import functools
 import operator
 from dataclasses import replace
@@ -133,6 +134,25 @@ def test_an_adapter_changes_its_own_branch_and_no_other(network: TemporalUNet) -
     assert torch.allclose(each, alone, atol=1e-4)
 
 
+def test_an_adapter_that_changes_everything_is_another_network(network: TemporalUNet) -> None:
+    walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
+    change = replace(adapter(network), everywhere=True)
+    tuned = copy.deepcopy(network)
+    for name in change.factors:
+        tuned.get_parameter(name).data = change.changed(name, network.get_parameter(name))
+    tuned.requires_grad_(False)
+    for together, plain in ((adapted(wave, change), wave), (walk + adapted(wave, change), walk + wave)):
+        # What is observed is read before, by the network as it is.
+        own, rows = batched([plain], 3, [torch.Generator()])
+        expected = composed_epsilon(tuned, X, T, own, EMPTY, network.observe(PLACE), rows)
+        assert torch.allclose(noise(network, together), expected, atol=1e-4)
+    each, rows = batched([walk, adapted(wave, change)], 1, [torch.Generator(), torch.Generator()])
+    sample = composed_epsilon(network, X[:2], T[:2], each, EMPTY, network.observe(PLACE[:2]), rows)
+    assert torch.allclose(sample[0], noise(network, walk)[0], atol=1e-4)
+    with pytest.raises(UserError, match="expected at most one concept whose adapter changes the whole network, found two"):
+        adapted(wave, change) + adapted(walk, change)
+
+
 @pytest.mark.parametrize("modes", [False, True])
 @pytest.mark.parametrize(("knots", "adapters"), [(3, False), (1, True), (3, True)])
 def test_every_form_comes_back_from_its_file(network: TemporalUNet, knots: int, adapters: bool, modes: bool) -> None:
@@ -182,7 +202,11 @@ def model() -> GenerativeModel:
     return found.requires_grad_(False).eval()
 
 
-@pytest.mark.parametrize("options", [{"knots": 4}, {"adapter": 2}, {"knots": 4, "adapter": 2, "omega": "learned"}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [{"knots": 4}, {"adapter": 2}, {"adapter": 2, "adapter_scope": "all"}, {"knots": 4, "adapter": 2, "omega": "learned"}],
+    ids=str,
+)
 def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeModel, options: dict[str, object]) -> None:
     learner = FewShot(model, Tuned(InversionSettings(samples=8), 40, Sampling(steps=2), 1))
     before = {name: parameter.clone() for name, parameter in model.named_parameters()}
@@ -197,6 +221,7 @@ def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeMo
         assert learner.sample(own, 2).states.isfinite().all()
     long.save("heart.safetensors")
     again = learner.load("heart.safetensors")
+    assert [one.everywhere for one in again.concept.composition.adapters] == ["adapter_scope" in options] * ("adapter" in options)
     assert torch.equal(learner.sample(again, 2).states, learner.sample(long, 2).states)
     assert long.explain().nearest
 

@@ -9,9 +9,11 @@ import pytest
 import torch
 
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.data import InversionData, PretrainingData, shares
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.mocap import DOMAIN
+from ftl_lightning.domains.mocap.measures import bone_error
 from ftl_lightning.domains.mocap.recordings import FILE, Recordings
 from ftl_lightning.domains.mocap.segments import SEGMENTS
 from ftl_lightning.domains.mocap.skeleton import (
@@ -22,6 +24,8 @@ from ftl_lightning.domains.mocap.skeleton import (
     JOINTS,
     LEFT,
     MIRROR,
+    NECK,
+    R_SHOULDER,
     R_WRIST,
     RIGHT,
     WRISTS,
@@ -31,6 +35,7 @@ from ftl_lightning.domains.mocap.skeleton import (
 )
 from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, at_rest, glitches, hang_down, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
+from ftl_lightning.domains.mocap.views import with_rigid_bones
 from ftl_lightning.errors import UserError
 from tests.domains.mocap_samples import folder, motion, recordings
 
@@ -45,6 +50,19 @@ def root(tmp_path: Path) -> Path:
 def test_every_column_belongs_to_one_part_of_the_body() -> None:
     assert sorted(column for group in GROUPS.values() for column in group) == list(range(len(COLUMNS)))
     assert {COLUMNS[column].split(".")[0] for column in GROUPS["arms"]} == {"RElbow", "RWrist", "LElbow", "LWrist"}
+
+
+def test_generated_bones_are_as_long_as_at_the_start_and_recorded_ones_stay_as_they_are() -> None:
+    recorded = torch.from_numpy(motion(HORIZON, 1)).flatten(1)[None].repeat(3, 1, 1)
+    start = {POSE: recorded[:, 0]}
+    assert with_rigid_bones(recorded, start) == pytest.approx(recorded, abs=1e-5)
+    generated = recorded + 0.03 * torch.randn(recorded.shape, generator=torch.Generator().manual_seed(0))
+    rigid = with_rigid_bones(generated, start)
+    assert (rigid - generated).abs().max() < 0.3
+    assert bone_error("walk", generated, InitialStates(start)).min() > 0.02
+    assert bone_error("walk", rigid, InitialStates(start)).max() < 1e-5
+    moved = [as_joints(rigid)[..., joint, :] - as_joints(generated)[..., joint, :] for joint in (R_SHOULDER, NECK)]
+    assert not torch.stack(moved).any()  # no rigid bone leads there
 
 
 def test_the_mirror_image_exchanges_left_and_right() -> None:
