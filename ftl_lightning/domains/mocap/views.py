@@ -1,5 +1,7 @@
 """How a model may see motion: as it stands in files, or with bones that keep their lengths."""
 
+import itertools
+
 import torch
 from torch import Tensor
 
@@ -38,6 +40,18 @@ def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
     return torch.stack(moved, dim=-2).flatten(-2)
 
 
+def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
+    """How each pose differs from the one before; the first, from the present."""
+    return torch.diff(states, dim=1, prepend=observed[POSE][:, None])
+
+
+def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
+    """The inverse, with rigid bones."""
+    # Not cumsum, which has no deterministic form on GPUs.
+    states = itertools.accumulate(steps.unbind(dim=1), initial=observed[POSE])
+    return with_rigid_bones(torch.stack(list(states)[1:], dim=1), observed)
+
+
 VIEWS = {
     "rigid": View(
         OBSERVED,
@@ -45,6 +59,8 @@ VIEWS = {
         encode=lambda states, observed: states,
         decode=with_rigid_bones,
         same_columns=True,
-    )
+    ),
+    "steps": View(OBSERVED, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps),
 }
-"""Seen as ``rigid``, what is learned from is as it stands in files, and what is generated has rigid bones."""
+"""Seen as ``rigid``, what is learned from is as it stands in files, and what is generated has rigid bones. In ``steps`` the same for
+methods that go from one pose to the next."""
