@@ -277,6 +277,7 @@ def ablate(
     seeds: list[int] = [0],  # noqa: B006 (never changed)
     shard: str = "1/1",
     executor: Literal["local", "ray"] = "local",
+    root: str = "",
 ) -> None:
     """Run every cell of an ablation that the results do not hold yet.
 
@@ -286,10 +287,11 @@ def ablate(
         seeds: each stage runs once a seed.
         shard: "3/8" for the third of eight parts; models that it needs and does not make itself must be there.
         executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
+        root: folder of recordings, of domains that read one: data.root of every cell.
     """
     from ftl_lightning.ablation.run import run_ablation
 
-    run_ablation(stages, seeds, results, shard, executor)
+    run_ablation(stages, seeds, results, shard, executor, root)
 
 
 def report(results: str = "results", out: str = "results/report", readme: str = "") -> None:

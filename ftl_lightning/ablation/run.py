@@ -7,7 +7,7 @@ import traceback
 from argparse import ArgumentError
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -33,7 +33,12 @@ class Outcome:
 
 
 def run_ablation(
-    stages: Sequence[Stage], seeds: Sequence[int], results: str, shard: str = "1/1", executor: Literal["local", "ray"] = "local"
+    stages: Sequence[Stage],
+    seeds: Sequence[int],
+    results: str,
+    shard: str = "1/1",
+    executor: Literal["local", "ray"] = "local",
+    root: str = "",
 ) -> None:
     """Run all cells of all seeds, stage after stage. A cell that fails does not stop the others; failures are listed at the end.
 
@@ -44,13 +49,16 @@ def run_ablation(
         shard: ``'3/8'`` for the third of eight parts of the plan, for as many machines or processes.
         executor: ``'local'``, one cell after another in this process; ``'ray'``, as many side by side as a cluster has room for,
             the one that ``RAY_ADDRESS`` names, whose machines share this folder, or one of this machine's processors.
+        root: ``data.root`` of every cell; empty for what their configurations say.
 
     Raises:
         UserError: before anything runs, for cells that cannot; at the end, naming the cells that failed.
     """
     from ftl_lightning.evaluation.results import add_rows
 
-    plan = [[cell for seed in seeds for cell in stage.cells(seed)] for stage in stages]
+    shared = {"data.root": root} if root else {}
+    every = [replace(stage, options={**shared, **stage.options}) for stage in stages]
+    plan = [[cell for seed in seeds for cell in stage.cells(seed)] for stage in every]
     plan = part(plan, shard)
     check([cell for cells in plan for cell in cells])
     total, number, failed = sum(map(len, plan)), 0, []

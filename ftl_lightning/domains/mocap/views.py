@@ -62,5 +62,5 @@ VIEWS = {
     ),
     "steps": View(OBSERVED, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps),
 }
-"""Seen as ``rigid``, what is learned from is as it stands in files, and what is generated has rigid bones. In ``steps`` the same for
-methods that go from one pose to the next."""
+"""Seen as ``rigid``, what is learned from is as it stands in files, and what is generated has rigid bones. In ``steps`` the same
+for methods that go from one pose to the next."""
