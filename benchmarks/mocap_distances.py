@@ -1,0 +1,150 @@
+"""How far generated motion is from recordings of people, in the features of the judge, beside recordings of other people.
+
+    python benchmarks/mocap_distances.py --root FOLDER --concepts results/concepts/mocap/seed0 --out results/mocap_distances.json
+
+FOLDER holds recordings as ``prepare mocap`` leaves them. Each row compares as many windows with recordings of a concept by people
+who did not demonstrate it. A second table: a classifier that has learned from generated motion alone, tested on recordings.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.mocap.actions import TESTED, action
+from ftl_lightning.domains.mocap.measures import distances, diversity, learned_elsewhere, multimodality
+from ftl_lightning.domains.mocap.skeleton import HORIZON
+from ftl_lightning.domains.mocap.source import POSE, Recorded, pieces
+from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.progress import bar
+from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import write_text
+
+MOST = 500
+"""Windows on each side, where there are as many."""
+SAMPLING = Sampling("dpm_solver", 10, 1.0)
+"""As conf/sampling/mocap.yaml."""
+GUIDANCE = 1.2
+"""Of training concepts."""
+
+
+def windows(states: Tensor, stride: int) -> list[Tensor]:
+    """All windows as long as a plan of ``(frame, 42)``."""
+    return [states[start : start + HORIZON] for start in range(0, len(states) - HORIZON + 1, stride)]
+
+
+def recorded(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
+    """Windows ``(window, 32, 42)`` of a new concept by those who demonstrate it, or by others."""
+    every, found = source.recordings, []
+    for segment in source.segments:
+        if segment.label != concept or segment.trial_id not in every.trial_id:
+            continue
+        trial = every.trial_id.index(segment.trial_id)
+        if (every.subject[trial] in DEMONSTRATORS) == demonstrators:
+            for states in pieces(every.trial(trial)[segment.start : segment.stop], longest=None):
+                found += windows(states, 1)
+    return torch.stack(found) if found else torch.zeros(0, HORIZON, 42)
+
+
+def actions(source: Recorded, stride: int) -> dict[str, Tensor]:
+    """Windows of the training concepts' trials by the judge's action, of those that are tested."""
+    found: dict[str, list[Tensor]] = {}
+    training = source.split("train", 0, 0)
+    half = len(training) // 2  # the others are mirror images
+    for states, length, text in zip(training.states[:half], training.lengths[:half].tolist(), training.concepts, strict=False):
+        if (name := action(text)) in TESTED:
+            found.setdefault(name, []).extend(windows(states[:length], stride))
+    return {name: torch.stack(own) for name, own in found.items()}
+
+
+def generated(model: ConceptModel, composition: Composition, starts: Tensor, seed: int) -> Tensor:
+    """A window from each start."""
+    return model.sample([composition], len(starts), SAMPLING, [generator("cpu", seed)], {POSE: starts})[0]
+
+
+def said(model: ConceptModel, *texts: str) -> Composition:
+    """Training concepts; of none, whatever the model generates."""
+    embeddings = torch.stack([model.concept(text) for text in texts]) if texts else model.empty[None]
+    return Composition(embeddings, torch.full((len(embeddings),), GUIDANCE if texts else 0.0))
+
+
+def table(
+    source: Recorded, model: ConceptModel, folders: Mapping[str, Sequence[Path]], concept: str, seed: int
+) -> dict[str, object]:
+    """Each row's distances to recordings of people who did not demonstrate a concept."""
+    real, shown = recorded(source, concept, False), recorded(source, concept, True)
+    number = min(MOST, len(real), len(shown))
+    starts = source.starts(concept, number, seed).observed[POSE]
+    turns = torch.arange(number)
+    demonstrations = source.draw(concept, 5, seed).states
+    rows = {
+        "recordings of the demonstrators": shown,
+        "demonstrations replayed": demonstrations[turns % len(demonstrations)],
+        "frozen frame": starts[:, None].repeat(1, HORIZON, 1),
+        "unconditional": generated(model, said(model), starts, seed),
+        "text: walk": generated(model, said(model, "walk"), starts, seed),
+    }
+    for name, places in folders.items():
+        for place in places:
+            path = place / f"{concept.replace(' ', '_')}.safetensors"
+            learned = Concept.load(path)
+            model.check(learned, path)
+            rows[name if len(places) == 1 else f"{name}, {place.name}"] = generated(model, learned.composition, starts, seed)
+    halves = {"recordings of the others, half against half": distances(real[::2], real[1::2], seed)} if len(real) > 3 else {}
+    found = {name: {**distances(own, real, seed), "diversity": diversity(own, seed)} for name, own in rows.items()}
+    return {"diversity of the others": diversity(real, seed), **halves, **found}
+
+
+def second_opinion(source: Recorded, model: ConceptModel, seed: int, number: int = 100) -> dict[str, object]:
+    """Balanced accuracy on recordings of a classifier that has learned from generated motion of training concepts."""
+    real = actions(source, 8)
+    texts = {name: [text for text in model.config.training_concepts if action(text) == name] for name in real}
+    starts = source.starts("walk", number, seed).observed[POSE]
+    made = {}
+    for index, (name, own) in enumerate(texts.items()):
+        parts = [generated(model, said(model, text), starts[row :: len(own)], seed + index) for row, text in enumerate(own)]
+        made[name] = torch.cat(parts)
+    return {
+        "actions": sorted(real),
+        "learned from generated, tested on recordings": learned_elsewhere(made, real),
+        "multimodality": multimodality(made, seed),
+        "multimodality of recordings": multimodality(real, seed),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, required=True, help="recordings, as `prepare mocap` leaves them")
+    parser.add_argument("--pretrained", default="pretrained/mocap")
+    parser.add_argument("--concepts", type=Path, nargs="*", default=[], help="folders of learned concepts")
+    parser.add_argument("--adapters", type=Path, nargs="*", default=[], help="folders of concepts with an adapter")
+    parser.add_argument("--tasks", nargs="*", default=["jumping jacks", "arm circle"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=None)
+    chosen = parser.parse_args(arguments)
+    source, model = Recorded(chosen.root), load_model(chosen.pretrained)
+    folders = {"ours": chosen.concepts, "ours with adapter": chosen.adapters}
+    found: dict[str, object] = {"model": model.hash, "seed": chosen.seed}
+    with bar("concepts", len(chosen.tasks) + 1) as advance:
+        for concept in chosen.tasks:
+            found[concept] = table(source, model, folders, concept, chosen.seed)
+            advance()
+        found["second opinion"] = second_opinion(source, model, chosen.seed)
+        advance()
+    text = json.dumps(found, indent=1) + "\n"
+    print(text)
+    if chosen.out is not None:
+        write_text(chosen.out, text)
+
+
+if __name__ == "__main__":
+    main()
