@@ -262,7 +262,8 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
     if learned.modes is not None:
         how = "a random mixture of them" if learned.modes.mixed else "one of them"
-        print(f"alone it generates from {how}: {len(learned.modes)} modes; composed, from the components that have no mode")
+        composed = "composed too" if learned.knots > 1 else "composed, from the components that have no mode"
+        print(f"alone it generates from {how}: {len(learned.modes)} modes; {composed}")
     parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
     if len(learned.weights) > 1:
         whole = learned.at_knots(learned.weights @ learned.embeddings)

@@ -83,7 +83,9 @@ class Composition:
         embeddings: ``(..., K, knots * n)``: of every concept one embedding or, one after another, several at even times of the
             plan, between which the denoiser interpolates.
         weights: ``(..., K)``, omega.
-        modes: what samples are generated from where a learned concept stands alone; its embeddings are used where it is composed.
+        modes: what samples are generated from. Where a concept is composed they are left out and its embeddings are used, unless it
+            varies over the plan: what demonstrations show at different times has no mean. Two concepts' modes are combined each
+            with each.
         knots: embeddings of each concept.
         columns: share of its weight that a concept has on each column of a state ``(..., K, state)``, usually 0 or 1; ``None`` for
             all of it on every column.
@@ -112,6 +114,7 @@ class Composition:
         return Composition(
             torch.cat([part.embeddings for part in parts], dim=-2),
             torch.cat([part.weights for part in parts], dim=-1),
+            modes=_together(*parts),
             knots=knots,
             columns=None if state is None else torch.cat([_given(part.columns) for part in parts], dim=-2),
             adapters=(*self.adapters, *other.adapters),
@@ -147,7 +150,11 @@ class Composition:
         columns = self.columns if self.columns is not None or state is None else self.weights.new_ones((*shape, state))
         number = self.weights.new_zeros(shape, dtype=torch.int64) if self.adapter is None else self.adapter
         return self._with(
-            embeddings=embeddings, knots=knots, columns=columns, adapter=torch.where(number > 0, number + first, number), modes=None
+            embeddings=embeddings,
+            knots=knots,
+            columns=columns,
+            adapter=torch.where(number > 0, number + first, number),
+            modes=self.modes if self.knots > 1 else None,
         )
 
     def to(self, device: torch.device) -> "Composition":
@@ -181,6 +188,21 @@ class Composition:
             return self
         rows, row = self.draw(1, generator)
         return self._with(embeddings=rows.embeddings[row[0]], weights=rows.weights[row[0]], modes=None)
+
+
+def _together(one: Composition, other: Composition) -> Modes | None:
+    """Each of one's modes with each of the other's; ``None`` where neither has any."""
+    if one.modes is None and other.modes is None:
+        return None
+    first, second = (part.modes or Modes(part.embeddings[None], part.weights[None]) for part in (one, other))
+    counts = (len(first), len(second))
+
+    def pairs(left: Tensor, right: Tensor) -> Tensor:
+        return torch.cat((left.repeat_interleave(counts[1], dim=0), right.repeat(counts[0], *(1,) * (right.dim() - 1))), dim=1)
+
+    return Modes(
+        pairs(first.embeddings, second.embeddings), pairs(first.weights, second.weights), mixed=first.mixed or second.mixed
+    )
 
 
 def _given(values: Tensor | None) -> Tensor:

@@ -57,7 +57,7 @@ class Concept:
         weights: ``(K,)`` float32, omega.
         origin: where it comes from.
         modes: several sets of embeddings, which samples are generated from where the concept stands alone; ``None`` for the paper's
-            form. Composing uses ``embeddings``.
+            form. Composing uses ``embeddings``, unless the concept has several knots.
         knots: embeddings of a component, one after another, at even times of the plan; 1 is the paper's form.
         adapter: what it changes of the denoiser; ``None`` for the paper's form.
     """

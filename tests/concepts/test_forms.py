@@ -96,6 +96,30 @@ def test_concepts_of_one_knot_compose_with_those_of_several_and_others_are_refus
     assert own.tolist() == [0, 0, 1, 1]
 
 
+def test_modes_stay_in_compositions_of_concepts_that_vary_over_time(network: TemporalUNet) -> None:
+    def several(count: int, knots: int, seed: int) -> Composition:
+        modes = Modes(normal(count, 1, 4 * knots, seed=seed), torch.ones(count, 1))
+        return Composition(normal(1, 4 * knots), torch.ones(1), modes=modes, knots=knots)
+
+    still, walk = Composition(normal(1, 4, seed=5), torch.tensor([0.8])), several(3, 1, 6)
+    assert (walk + still).modes is None
+    wave, kick = several(2, 3, 7), several(3, 3, 8)
+    both = (wave.on((0,), 3) + still.on((1, 2), 3)) * 0.5
+    assert both.modes is not None
+    assert wave.modes is not None
+    assert both.modes.embeddings.shape == (2, 2, 12)
+    assert torch.equal(both.modes.embeddings[1, 0], wave.modes.embeddings[1, 0])
+    assert torch.equal(both.modes.embeddings[1, 1], still.embeddings[0].repeat(3))
+    assert torch.allclose(both.modes.weights, torch.tensor([[0.5, 0.4]]).expand(2, 2))
+    pairs = (wave + kick + walk).modes
+    assert pairs is not None
+    assert pairs.embeddings.shape == (6, 3, 12)
+    assert len(torch.unique(pairs.embeddings[:, :2].flatten(1), dim=0)) == 6
+    together, own = batched([both], 8, [torch.Generator().manual_seed(0)])
+    assert together.embeddings.shape == (2, 2, 12)
+    assert set(own.tolist()) == {0, 1}
+
+
 def test_a_weight_on_some_columns_changes_those_alone(network: TemporalUNet) -> None:
     walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
     nothing = noise(network, 0.0 * walk)
