@@ -46,18 +46,24 @@ def methods(rows: pd.DataFrame) -> list[str]:
     return [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
 
 
-def comparison_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """One line for each setting, metric and method: measured, its errors, the paper's number, the difference, the paired test."""
+def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
+    """One line for each setting, metric and method: measured, its errors, the paper's number, the difference, the paired test.
+
+    Args:
+        domain: whose.
+        results: with rows of it.
+        shown: metrics; those that methods are compared by where none are named.
+    """
     rows, references = compared(domain, results), reference_lines(domain, results)
     lines = []
     for setting in settings(domain, rows):
-        for metric in metrics(domain):
+        for metric in shown or metrics(domain):
             own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
             numbers = [(method, summarise(select(own, method=method))) for method in methods(rows)]
             numbers += [(name, summarise(select(around, method=name))) for name in sorted(set(around["method"]))]
             tested = {
                 lead.baseline: [signed(lead.difference), lead.shown]
-                for lead in leads(own, OURS, rivals(domain, rows, setting), domain.less_is_better(metric))
+                for lead in leads(own, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
             }
             for method, number in numbers:
                 if number:
@@ -139,8 +145,8 @@ def _line(
 ) -> list[str]:
     own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
     cells = [_cell(domain, own, method, setting, metric) for method in names]
-    lead = least_certain(leads(own, OURS, rivals(domain, rows, setting), domain.less_is_better(metric)))
-    alike = _alike(domain, select(rows, setting=setting, method=OURS)) if metric == domain.headline else {}
+    lead = least_certain(leads(own, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric)))
+    alike = _alike(domain, select(rows, setting=setting, method=domain.ours)) if metric == domain.headline else {}
     return [domain.name, f"{setting}, {metric}", *cells, MISSING if lead is None else str(lead), _around(around, alike)]
 
 

@@ -6,9 +6,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
-from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
+from ftl_lightning.reporting.comparison import compared, comparison_table, methods, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time
 from ftl_lightning.reporting.frontier import frontier_table, read_frontier
@@ -50,6 +51,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
             found.append(_written(comparison_table(domain, comparison), out / name))
             for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
                 _save(comparison_bars(domain, comparison, metric), out / name / f"comparison_{_file(metric)}.png")
+        elif any(not method.startswith(OURS) for method in methods(compared(domain, ablations))):
+            found.append(_written(comparison_table(domain, ablations), out / name))
         if name in set(curves["domain"]):
             found.append(_written(curves_table(domain, curves), out / name))
             _save(growth(domain, curves), out / name / "curves.png")
