@@ -98,9 +98,9 @@ def table(
             learned = Concept.load(path)
             model.check(learned, path)
             rows[name if len(places) == 1 else f"{name}, {place.name}"] = generated(model, learned.composition, starts, seed)
-    halves = {"recordings of the others, half against half": distances(real[::2], real[1::2], seed)} if len(real) > 3 else {}
+    halves = {**distances(real[::2], real[1::2], seed), "diversity": diversity(real, seed)}
     found = {name: {**distances(own, real, seed), "diversity": diversity(own, seed)} for name, own in rows.items()}
-    return {"diversity of the others": diversity(real, seed), **halves, **found}
+    return {"recordings of the others, half against half": halves, **found}
 
 
 def second_opinion(source: Recorded, model: ConceptModel, seed: int, number: int = 100) -> dict[str, object]:

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, deferred
-from ftl_lightning.domains.mocap.actions import judged
+from ftl_lightning.domains.mocap.actions import TESTED, action, judged
 from ftl_lightning.domains.mocap.judge import identity
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
 from ftl_lightning.domains.mocap.source import NAME, OBSERVED, POSE, Recorded
@@ -29,7 +29,7 @@ DOMAIN = Domain(
     plans=Plans(HORIZON, COLUMNS, ("m",) * len(COLUMNS), resolution=1e-3, at_rest=False, groups=GROUPS),
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
-        suites=SUITES | {"training": training_suite(tuple(filter(judged, TRAINING_CONCEPTS)))},
+        suites=SUITES | {"training": training_suite(tuple(text for text in TRAINING_CONCEPTS if action(text) in TESTED))},
         descriptions=(*TRAINING_CONCEPTS, *NEW_CONCEPTS),
         reads=judged,
         table=Path(__file__).parent / "embeddings.safetensors",

@@ -130,15 +130,19 @@ class Recorded:
         return self._demonstrations(found, {"task": task, "seed": seed})
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
-        """Poses of people who stand or walk with their arms down, in trials that are in no training split.
+        """Poses to start from, of trials that are drawn alike.
 
-        Trials are drawn alike; nobody who demonstrates a new concept is among them. Without a folder they are made by rule, see
-        :mod:`ftl_lightning.domains.mocap.standing`.
+        Of a training concept those that its own trials pass through: held-out ones, where it has any. Of anything else those of
+        people who stand or walk with their arms down, in trials that are in no training split; nobody who demonstrates a new
+        concept is among them. Without a folder they are made by rule, see :mod:`ftl_lightning.domains.mocap.standing`.
+
+        Raises:
+            UserError: if the folder has no such trial.
         """
         draw = generator("cpu", seed, task_key(task))
         if self.root is None:
             return InitialStates({POSE: standing_poses(count, draw)})
-        trials = self.arms_down
+        trials = self._passed(task) if task in TRAINING_CONCEPTS else self.arms_down
         which = torch.randint(len(trials), (count,), generator=draw).tolist()
         share = torch.rand(count, generator=draw).tolist()
         found = [trials[trial][int(part * len(trials[trial]))] for trial, part in zip(which, share, strict=True)]
@@ -158,6 +162,16 @@ class Recorded:
         if not found:
             raise UserError(f"{self.root}: expected held-out trials in which someone stands with arms down, found none")
         return found
+
+    def _passed(self, concept: str) -> tuple[Tensor, ...]:
+        """Poses ``(pose, 42)`` of each piece of a training concept's trials that a window starts from."""
+        own = [piece for piece in self._pieces if piece.concept == concept]
+        if not own:
+            raise UserError(f"task: expected a concept that trials in {self.root} show, found {concept!r}, which none does")
+        return tuple(
+            piece.states[: len(piece.states) - HORIZON + 1]
+            for piece in [piece for piece in own if piece.trial in self._validation] or own
+        )
 
     @cached_property
     def _pieces(self) -> list[Piece]:
