@@ -137,12 +137,12 @@ class Recorded:
         concept is among them. Without a folder they are made by rule, see :mod:`ftl_lightning.domains.mocap.standing`.
 
         Raises:
-            UserError: if the folder has no such trial.
+            UserError: if the folder has neither.
         """
         draw = generator("cpu", seed, task_key(task))
         if self.root is None:
             return InitialStates({POSE: standing_poses(count, draw)})
-        trials = self._passed(task) if task in TRAINING_CONCEPTS else self.arms_down
+        trials = self._passed(task) or self.arms_down
         which = torch.randint(len(trials), (count,), generator=draw).tolist()
         share = torch.rand(count, generator=draw).tolist()
         found = [trials[trial][int(part * len(trials[trial]))] for trial, part in zip(which, share, strict=True)]
@@ -164,14 +164,10 @@ class Recorded:
         return found
 
     def _passed(self, concept: str) -> tuple[Tensor, ...]:
-        """Poses ``(pose, 42)`` of each piece of a training concept's trials that a window starts from."""
+        """Poses ``(pose, 42)`` of each piece of a training concept's trials that a window starts from; none where there is none."""
         own = [piece for piece in self._pieces if piece.concept == concept]
-        if not own:
-            raise UserError(f"task: expected a concept that trials in {self.root} show, found {concept!r}, which none does")
-        return tuple(
-            piece.states[: len(piece.states) - HORIZON + 1]
-            for piece in [piece for piece in own if piece.trial in self._validation] or own
-        )
+        held_out = [piece for piece in own if piece.trial in self._validation]
+        return tuple(piece.states[: len(piece.states) - HORIZON + 1] for piece in held_out or own)
 
     @cached_property
     def _pieces(self) -> list[Piece]:
