@@ -281,6 +281,7 @@ class InversionData(pl.LightningDataModule):
             raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {found}")
         self.seed = seed
         self.steps = steps
+        self.root = None if root is None else Path(root)
         self.own = demonstrations is not None
         self.domain_name = domain if domain == OWN else recorded_name(domain)
         if demonstrations is None and domain == OWN:
@@ -288,18 +289,18 @@ class InversionData(pl.LightningDataModule):
         if domain == OWN:
             self.demonstrations = read_own(str(demonstrations))
         elif demonstrations is None:
-            self.demonstrations = self._drawn(load_domain(domain), suite, demonstrations_per_concept, root)
+            self.demonstrations = self._drawn(load_domain(domain), suite, demonstrations_per_concept)
         else:
             self.demonstrations = read_demonstrations(demonstrations, load_domain(domain))
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
-    def _drawn(self, domain: Domain, suite: str, count: int, root: str | None) -> Demonstrations:
+    def _drawn(self, domain: Domain, suite: str, count: int) -> Demonstrations:
         suites = domain.concepts.suites
         if suite not in suites:
             raise UserError(f"data.suite: expected one of {', '.join(suites)}, found {suite!r}")
         if not (learned := suites[suite].learned):
             raise UserError(f"data.suite: expected a suite that learns concepts, found {suite!r}, which learns none")
-        source = domain.source(None if root is None else Path(root))
+        source = domain.source(self.root)
         return concatenate([source.draw(task, count, DEMONSTRATION_SEED + self.seed) for task in learned])
 
     def train_dataloader(self) -> DataLoader[int]:

@@ -201,7 +201,7 @@ class Evaluator(pl.Callback):
         if not isinstance(pl_module, Evaluable):
             raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(pl_module).__name__}")
         data = trainer.datamodule  # type: ignore[attr-defined]
-        self.asked, self.root = self._asked(data), getattr(data, "root", None)
+        self.asked, self.root = self._asked(data), data.root
         total = pl_module.model.max_steps
         if total is not None and self.sampling.steps > total:
             raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.sampling.steps}")
@@ -253,6 +253,9 @@ class Evaluator(pl.Callback):
             title = one.task.name if one.right is None else f"{one.task.name}: {share(one.right):.2f}"
             figure = domain.show.picture(one.states[shown], right, title, start)
             logger.experiment.add_figure(f"{one.task.setting}/{one.task.name}", figure, step)
+            if domain.show.film is not None:
+                pictures = domain.show.film(one.states[0])
+                log_animation(logger, f"film/{one.task.setting}/{one.task.name}", pictures, step, title)
             film = domain.closed_loop.film if domain.closed_loop else None
             if film and one.rollout is not None and one.followed is not None:
                 pictures = film(one.rollout.take(0, 1), one.followed)
