@@ -229,7 +229,7 @@ def test_behaviour_starts_with_arms_down_in_trials_of_no_training_split(root: Pa
     assert torch.cdist(poses, train).min() > 0
 
 
-def test_without_recordings_people_of_different_sizes_stand_and_wait() -> None:
+def test_without_recordings_people_of_different_sizes_stand_or_walk_with_their_arms_down() -> None:
     poses = Recorded(None).starts("walk", 5, 0).observed[POSE]
     assert hang_down(poses).all()
     assert len(poses.unique(dim=0)) == 5

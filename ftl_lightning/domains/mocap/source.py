@@ -18,7 +18,7 @@ from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.recordings import WHERE, Recordings, read_folder
 from ftl_lightning.domains.mocap.segments import Segment
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints, mirrored
-from ftl_lightning.domains.mocap.standing import standing_poses
+from ftl_lightning.domains.mocap.standing import standing_poses, walking_poses
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, HELD_OUT, NEW_CONCEPTS, TRAINING_CONCEPTS, mirrored_text
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import generator, task_key
@@ -65,7 +65,7 @@ class Recorded:
     """Recordings of a folder, which is read when it is needed first.
 
     Attributes:
-        root: the folder; ``None`` where there is none, and then only standing poses to start from.
+        root: the folder; ``None`` where there is none, and then only poses made by rule to start from.
     """
 
     root: Path | None
@@ -141,7 +141,7 @@ class Recorded:
         """
         draw = generator("cpu", seed, task_key(task))
         if self.root is None:
-            return InitialStates({POSE: standing_poses(count, draw)})
+            return InitialStates({POSE: walking_poses(count, draw)})
         trials = self._passed(task) or self.arms_down
         which = torch.randint(len(trials), (count,), generator=draw).tolist()
         share = torch.rand(count, generator=draw).tolist()

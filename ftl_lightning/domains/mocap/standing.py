@@ -1,9 +1,10 @@
-"""Standing poses made by rule, for those who have no recordings: where a shipped model's behaviour starts."""
+"""Poses made by rule, for those who have no recordings: where a shipped model's behaviour starts."""
 
 import torch
 from torch import Tensor
 
-from ftl_lightning.domains.mocap.skeleton import COLUMNS
+from ftl_lightning.domains.mocap import skeleton
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, as_joints
 
 _RIGHT_SIDE = (
     (0.09, 0.0, 0.0),
@@ -15,6 +16,12 @@ _RIGHT_SIDE = (
 )
 """Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of middle size."""
 _MIDDLE = ((0.0, 0.02, 0.55), (0.0, 0.07, 0.73))
+STRIDE = 0.4
+"""Radians at most that a leg is swung forwards or back."""
+SWING = 0.8
+"""How far the arm of the same side is swung the other way, compared to the leg."""
+BEND = 0.15
+"""Radians by which thighs point further forwards, and shanks further back."""
 
 
 def standing_poses(count: int, draw: torch.Generator) -> Tensor:
@@ -24,3 +31,25 @@ def standing_poses(count: int, draw: torch.Generator) -> Tensor:
     body = torch.cat((right[:3], left[:3], right[3:], left[3:], torch.tensor(_MIDDLE)))
     size = 1 + 0.05 * (2 * torch.rand(count, 1, 1, generator=draw) - 1)
     return (body * size).reshape(count, len(COLUMNS))
+
+
+def walking_poses(count: int, draw: torch.Generator) -> Tensor:
+    """Poses ``(count, 42)`` of the same people within a step, of any length down to none."""
+    joints = as_joints(standing_poses(count, draw)).clone()
+    stride = STRIDE * (2 * torch.rand(count, generator=draw) - 1)
+    sides = ((skeleton.R_HIP, skeleton.R_SHOULDER, stride), (skeleton.L_HIP, skeleton.L_SHOULDER, -stride))
+    for hip, shoulder, angle in sides:  # joints of a limb follow one another
+        _turned(joints, (hip, hip + 1, hip + 2), angle + BEND)
+        _turned(joints, (hip + 1, hip + 2), -torch.full_like(angle, 2 * BEND))
+        _turned(joints, (shoulder, shoulder + 1, shoulder + 2), -SWING * angle)
+    return joints.flatten(1)
+
+
+def _turned(joints: Tensor, limb: tuple[int, ...], angle: Tensor) -> None:
+    """Turn what hangs on a limb's first joint forwards by an angle ``(pose,)`` in radians, in place."""
+    first, *others = limb
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    hanging = joints[:, others] - joints[:, first : first + 1]
+    y, z = hanging[..., 1], hanging[..., 2]
+    turned = torch.stack((hanging[..., 0], y * cos - z * sin, y * sin + z * cos), dim=-1)
+    joints[:, others] = joints[:, first : first + 1] + turned

@@ -1,0 +1,61 @@
+"""The shipped model of human motion: behaviour, films and learning without recordings, and with a folder of made-up ones."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ftl_lightning import FewShot
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.mocap.measures import bone_error
+from ftl_lightning.domains.mocap.skeleton import GROUPS, HORIZON
+from ftl_lightning.domains.mocap.source import POSE, Recorded
+from ftl_lightning.evaluation.results import read_rows
+from tests.conftest import CONF, ROOT
+from tests.domains.mocap_samples import folder
+
+SHIPPED = ROOT / "pretrained" / "mocap"
+JACKS = SHIPPED / "jumping_jacks.safetensors"
+
+
+def test_motion_is_generated_and_filmed_without_recordings(capsys: pytest.CaptureFixture[str]) -> None:
+    told = ["--concept", str(JACKS), "--compose", "walk:0.6", "--count", "4", "--animation", "jj.gif", "--out", "jj.safetensors"]
+    assert main(["sample", "--pretrained", str(SHIPPED), *told]) == 0
+    assert "jj.gif" in capsys.readouterr().out
+    with Image.open("jj.gif") as film:
+        assert film.n_frames >= HORIZON / 2  # type: ignore[attr-defined]
+    found = Demonstrations.load("jj.safetensors")
+    assert found.states.shape == (4, HORIZON, 42)
+    starts = InitialStates({POSE: Recorded(None).starts("jumping jacks", 4, 0).observed[POSE]})
+    assert torch.allclose(found.states[:, 0], starts.observed[POSE], atol=0.1)
+
+
+def test_most_of_what_the_shipped_concept_generates_raises_both_arms_and_legs_can_walk_below() -> None:
+    model = FewShot.from_pretrained(SHIPPED)
+    jacks, starts = model.load(JACKS), model.starts("jumping jacks", 20)
+    plans = model.sample(jacks, observed=starts)
+    assert model.evaluate(plans, "jumping jacks")["rise"] >= 0.5
+    assert float(bone_error("jumping jacks", plans.states, starts).max()) < 1e-4
+    assert model.evaluate(model.sample(model["walk"], observed=starts), "jumping jacks")["rise"] == 0
+    both = model.sample(model.compose(f"walk@legs:1.8 + {JACKS}@arms,trunk"), observed=starts)
+    legs = (both.states - plans.states)[..., list(GROUPS["legs"])].abs().amax(dim=(1, 2))
+    assert (legs > 0.05).float().mean() > 0.5
+    assert model.evaluate(both, "jumping jacks + walk")["rise"] >= 0.5
+
+
+@pytest.mark.parametrize("config", ["mocap.yaml", "mocap_adapter.yaml"])
+def test_concepts_are_learned_judged_and_filmed_from_a_folder(config: str, tmp_path: Path) -> None:
+    quick = ["--data.steps=2", "--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.figures=2", "--seed_everything=3"]
+    arguments = [f"--data.root={folder(tmp_path / 'recordings')}", f"--model.pretrained={SHIPPED}", "--data.suite=validation"]
+    suites = ["--evaluation.suites=[training,validation]", "--trainer.enable_progress_bar=false"]
+    assert main(["invert", f"--config={CONF / 'invert' / config}", *arguments, *quick, *suites]) == 0
+    rows = read_rows("logs/mocap/invert/results.csv")
+    assert {"frozen frame", "demonstrations replayed"} < set(rows["method"])
+    assert {"accuracy", "rise", "bone error", "jerk"} < set(rows["metric"])
+    assert set(rows["setting"]) == {"training concept", "new concept", "new concept, demonstrated poses"}
+    events = EventAccumulator("logs/mocap/invert", size_guidance={"images": 0}).Reload()
+    assert "film/new concept/knee raise" in events.Tags()["images"]
