@@ -190,7 +190,7 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
         components, weight = usual if usual in measured else measured.most_common(1)[0][0]
         chosen.append(select(own, K=components, omega=weight))
     found = pd.concat(chosen).loc[lambda some: rows.index.intersection(some.index)] if chosen else rows
-    ours = found["method"] == OURS
+    ours = found["method"].str.startswith(OURS)
     forms = set(_forms(found[ours]))
     common = usual if usual in forms or not forms else next(iter(forms)) if len(forms) == 1 else None
     marks = [
