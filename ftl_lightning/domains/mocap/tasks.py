@@ -132,29 +132,35 @@ def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     )
 
 
+def _pairs(concepts: tuple[str, ...]) -> list[tuple[str, str]]:
+    return [(text, other) for text in concepts for other in COMPOSED_WITH]
+
+
 def _composed(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
-    """With the same weights on the whole body, and with each concept on its own parts of it."""
-    pairs = [(text, other) for text in concepts for other in COMPOSED_WITH]
-    return (
-        *(EvaluationTask("new + training", AND.join(pair), pair[:1], pair[1:]) for pair in pairs),
-        *(
-            EvaluationTask(
-                "new + training, by parts of the body",
-                AND.join(pair),
-                pair[:1],
-                pair[1:],
-                on=((pair[0], ("arms", "trunk")), (pair[1], ("legs",))),
-            )
-            for pair in pairs
-        ),
+    """With the same weights on the whole body."""
+    return tuple(EvaluationTask("new + training", AND.join(pair), pair[:1], pair[1:]) for pair in _pairs(concepts))
+
+
+def _by_parts(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
+    """With each concept on its own parts of the body."""
+    return tuple(
+        EvaluationTask(
+            "new + training, by parts of the body",
+            AND.join(pair),
+            pair[:1],
+            pair[1:],
+            on=((pair[0], ("arms", "trunk")), (pair[1], ("legs",))),
+        )
+        for pair in _pairs(concepts)
     )
 
 
 SUITES = {
     "paper": Suite(_new(PAPER_CONCEPTS)),
-    "composition": Suite(_composed(PAPER_CONCEPTS)),
+    "composition": Suite((*_composed(PAPER_CONCEPTS), *_by_parts(PAPER_CONCEPTS))),
+    "whole": Suite(_composed(PAPER_CONCEPTS)),
     "database": Suite(_new(DATABASE_CONCEPTS)),
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
 }
 """``'paper'`` is for final evaluation alone, ``'validation'`` for tuning; ``'database'`` needs the trials of
-:data:`DATABASE_CONCEPTS` in the user's copy."""
+:data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for methods that cannot compose by parts of the body."""

@@ -144,7 +144,12 @@ class InContextModel(ConceptModel):
         """Concepts are demonstrations; the temperature sharpens the bins' probabilities, 0 takes the most probable.
 
         Weights, sampler and steps do not matter.
+
+        Raises:
+            UserError: for a concept whose weight is on some columns alone.
         """
+        if any(one.columns is not None for one in compositions):
+            raise UserError("compose: expected concepts without '@' for a model that reads demonstrations, found groups of columns")
         prompts = batched(compositions, count, generators)[0].embeddings
         temperature = sampling.temperature
         counts = torch.tensor([len(one.weights) for one in compositions], device=self.device)
