@@ -163,4 +163,5 @@ SUITES = {
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
 }
 """``'paper'`` is for final evaluation alone, ``'validation'`` for tuning; ``'database'`` needs the trials of
-:data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for methods that cannot compose by parts of the body."""
+:data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for methods that cannot compose by parts
+of the body."""
