@@ -67,8 +67,11 @@ def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bod
     client.setGravity(0, 0, -9.81)
     client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
     _box(client, (0.9, 1.0, 0.04), (0.5, 0.0, -0.02), TABLE_COLOUR, 0.0, TABLE_FRICTION)
+    # Without its own shapes those for collisions are drawn, which load quicker; these are made invisible.
     flags = 0 if arm_drawn else pybullet.URDF_IGNORE_VISUAL_SHAPES
     robot: int = client.loadURDF(_panda(), [0, 0, 0], useFixedBase=True, flags=flags)
+    for link in () if arm_drawn else range(-1, client.getNumJoints(robot)):
+        client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
     for finger in FINGERS:
         client.changeDynamics(robot, finger, lateralFriction=FINGER_FRICTION)
     objects = {name: _object(client, scene, name) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
