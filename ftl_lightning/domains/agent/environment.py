@@ -25,7 +25,6 @@ from ftl_lightning.domains.agent.scenes import (
 from ftl_lightning.domains.physics import Simulator, pybullet
 from ftl_lightning.errors import UserError
 
-
 STEP = 0.05
 """Seconds between two states."""
 SUBSTEPS = 6

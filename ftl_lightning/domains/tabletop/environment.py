@@ -72,7 +72,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         }
     )
     action_space = gymnasium.spaces.Box(
-        np.array([*(low for low, _ in REACH), 0.0], dtype=np.float32), np.array([*(high for _, high in REACH), OPEN], dtype=np.float32)
+        np.array([*(low for low, _ in REACH), 0.0], dtype=np.float32),
+        np.array([*(high for _, high in REACH), OPEN], dtype=np.float32),
     )
 
     def __init__(self, arm_drawn: bool = False) -> None:
@@ -168,7 +169,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
                 self.client.stepSimulation()
         self._steps += 1
         places = self.places()
-        self._touched |= touching(self._outline(TRIANGLE), places[CIRCLE]) if TRIANGLE in places else False
+        if TRIANGLE in places and abs(places[CIRCLE][2] - places[TRIANGLE][2]) < LIFTED:
+            self._touched |= touching(self._outline(TRIANGLE), places[CIRCLE])
         self._lifted |= bool(places[CIRCLE][2] > self._first[CIRCLE][2] + LIFTED)
         self._trace.append(self._now())
         seen, found = self._observation(), self._told()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.tabletop.environment import IMAGE, MAX_STEPS, OPEN, POSE, TableTopEnvironment
-from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, RADIUS, TRIANGLE, WHITE, support
+from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, RING, TRIANGLE, WHITE, support
 from ftl_lightning.domains.tabletop.success import judged
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, BESIDE_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
 
@@ -22,8 +22,6 @@ STEERING = 3.0
 """Weight of what the hand is beside the line through the circle, in units of :data:`CONTACT`."""
 LOST = 1.0
 """Radians off that line, beyond which the hand goes around the circle to get behind it again."""
-CLEARANCE = 0.028
-"""Metres between the circle and the bowl on the way around it."""
 AHEAD = 0.02
 """Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
 SLOWER = 1.4
@@ -75,7 +73,6 @@ class _Expert:
     def __init__(self, env: TableTopEnvironment, task: str, how: Style) -> None:
         self.env, self.task, self.how = env, task, how
         self.at = env.command.copy()
-        self.yaw = float(env.scene[COLUMNS[CIRCLE]][3])
 
     def circle(self) -> Place:
         return self.env.places()[CIRCLE]
@@ -86,7 +83,7 @@ class _Expert:
         steps = max(2, math.ceil(1.3 * float(np.linalg.norm(goal - start)) / (speed * self.how.speed)))
         for number in range(1, steps + 1):
             share = number / steps
-            share += 0.3 * math.sin(2 * math.pi * share) / (2 * math.pi) * -1
+            share -= 0.3 * math.sin(2 * math.pi * share) / (2 * math.pi)
             self.at = np.array([*(start + share * (goal - start)), opening])
             yield self.at
 
@@ -158,24 +155,27 @@ def _way_around(expert: _Expert) -> list[Place]:
     """Corners, 5 mm apart or less, of the circle's way to the triangle: straight to a ring around the bowl, along it, straight on."""
     start, end = expert.circle()[:2], _triangle(expert)
     bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
-    ring = RADIUS[BOWL] + RADIUS[CIRCLE] + CLEARANCE
     along = (end - start) / np.linalg.norm(end - start)
-    beside = float(np.cross(along, bowl - start))
-    if abs(beside) >= ring:
+    beside = _cross(along, bowl - start)
+    if abs(beside) >= RING:
         return _spread(start, end)
-    side = -1.0 if beside > 0 else 1.0  # counter-clockwise is 1: the bowl is passed where there is more room
-    first, last = (_tangent(bowl, ring, place, turn) for place, turn in ((start, -side), (end, side)))
+    side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1: the bowl is passed where the way is shorter
+    first, last = (_tangent(bowl, place, turn) for place, turn in ((start, -side), (end, side)))
     sweep = (side * (last - first)) % (2 * math.pi)
-    angles = first + side * np.linspace(0, sweep, max(2, int(ring * sweep / 0.005)))
-    arc = [bowl + ring * np.array([math.cos(angle), math.sin(angle)]) for angle in angles]
+    angles = first + side * np.linspace(0, sweep, max(2, int(RING * sweep / 0.005)))
+    arc = [bowl + RING * np.array([math.cos(angle), math.sin(angle)]) for angle in angles]
     return [*_spread(start, arc[0]), *arc, *_spread(arc[-1], end)]
 
 
-def _tangent(centre: Place, ring: float, place: Place, turn: float) -> float:
-    """Angle on a ring where the line from a place touches it."""
+def _cross(one: Place, other: Place) -> float:
+    return float(one[0] * other[1] - one[1] * other[0])
+
+
+def _tangent(centre: Place, place: Place, turn: float) -> float:
+    """Angle on the ring around a centre where the line from a place touches it."""
     off = place - centre
-    distance = max(float(np.linalg.norm(off)), ring + 1e-6)
-    return math.atan2(off[1], off[0]) + -turn * math.acos(ring / distance)
+    distance = max(float(np.linalg.norm(off)), RING + 1e-6)
+    return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
 
 
 def _spread(start: Place, end: Place) -> list[Place]:
@@ -208,7 +208,7 @@ def _push(expert: _Expert, height: float) -> Moves:
         along = (ahead - circle) / max(float(np.linalg.norm(ahead - circle)), 1e-6)
         to = circle - hand
         across = to - (to @ along) * along
-        off = math.atan2(abs(float(np.cross(to, along))), float(to @ along))
+        off = math.atan2(abs(_cross(to, along)), float(to @ along))
         if off > LOST:
             # Around the circle at a distance, on the side where the hand is.
             away = -to / max(float(np.linalg.norm(to)), 1e-6)
@@ -251,7 +251,7 @@ class Episode:
     success: bool
 
 
-REST = 4
+STAY = 4
 """Steps that the hand stays after a task is done, so that plans end at rest."""
 
 
@@ -278,9 +278,8 @@ def perform(
     seen, told = env.reset(options={"scene": scene})
     how = style(rng)
     commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
-    wander, ended = np.zeros(3), 0
-    plan = moves(env, task, how, height, feedback)
-    for command in plan:
+    wander = np.zeros(3)
+    for command in moves(env, task, how, height, feedback):
         wander = 0.8 * wander + how.noise * rng.standard_normal(3) * (1, 1, 0.3)
         seen, _, terminated, truncated, told = env.step((command + np.array([*wander, 0.0])).astype(np.float32))
         commands.append(env.command.copy())
@@ -288,12 +287,9 @@ def perform(
         poses.append(seen[POSE])
         if terminated or truncated:
             break
-    for _ in range(REST):
-        ended += 1
+    for _ in range(STAY):
         commands.append(commands[-1])
         images.append(images[-1])
         poses.append(poses[-1])
     success = judged(task, env.scene, told)
-    return Episode(
-        np.stack(commands).astype(np.float32), np.stack(images), np.stack(poses).astype(np.float32), success
-    )
+    return Episode(np.stack(commands).astype(np.float32), np.stack(images), np.stack(poses).astype(np.float32), success)

@@ -41,6 +41,8 @@ SIGHT = ((0.22, 0.78), (-0.34, 0.34))
 """x and y in which every object lies as a whole: what the camera sees and the arm does not touch."""
 START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))
 """Where the hand starts."""
+RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028
+"""Radius in metres of the circle's way around the bowl."""
 APART = 0.002
 """Metres between objects, at least."""
 
@@ -171,12 +173,17 @@ def _push(rng: Rng) -> _Placed:
 
 
 def _around(rng: Rng) -> _Placed:
-    placed = _pair(rng, 0.23, 0.30)
-    start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
-    along = (end - start) / np.linalg.norm(end - start)
-    across = np.array([-along[1], along[0]])
-    bowl = (start + end) / 2 + rng.uniform(-0.02, 0.02) * along + rng.uniform(-0.02, 0.02) * across
-    return {**placed, BOWL: (float(bowl[0]), float(bowl[1]), 0.0)}
+    """The bowl between circle and triangle, with room for the circle's way on the side where it is shorter."""
+    while True:
+        placed = _pair(rng, 0.23, 0.30)
+        start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
+        along = (end - start) / np.linalg.norm(end - start)
+        across = np.array([-along[1], along[0]])
+        beside = rng.uniform(-0.02, 0.02)
+        bowl = (start + end) / 2 + rng.uniform(-0.02, 0.02) * along + beside * across
+        farthest = bowl - np.sign(beside) * RING * across
+        if all(low <= value <= high for value, (low, high) in zip(farthest, WORKSPACE, strict=True)):
+            return {**placed, BOWL: (float(bowl[0]), float(bowl[1]), 0.0)}
 
 
 def _on_book(rng: Rng) -> _Placed:
@@ -222,7 +229,7 @@ def _clear(task: str, placed: _Placed) -> bool:
                 near = 0.02  # as the task says
             if {CIRCLE, BOWL} == {name, other} and task == AROUND_BOWL:
                 near = 0.03
-            if BOWL == other and task == BESIDE_BOWL:
+            if other == BOWL and task == BESIDE_BOWL:
                 near = 0.10  # the circle is put down there
             if gap(shape, points) < near:
                 return False
@@ -251,7 +258,9 @@ def draw_scene(task: str, rng: Rng) -> NDArray[np.float32]:
     return scene_of(placed, hand)
 
 
-def scene_of(placed: Mapping[str, tuple[float, float, float]], hand: Sequence[float] = (0.42, 0.0, 0.2, 0.0)) -> NDArray[np.float32]:
+def scene_of(
+    placed: Mapping[str, tuple[float, float, float]], hand: Sequence[float] = (0.42, 0.0, 0.2, 0.0)
+) -> NDArray[np.float32]:
     """The numbers of a scene, which nobody has checked.
 
     Args:

@@ -9,7 +9,19 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.agent.bodies import bowl
 from ftl_lightning.domains.physics import Simulator, pybullet
-from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, OBJECTS, RADIUS, SIZE, TRIANGLE, WHITE, support
+from ftl_lightning.domains.tabletop.scenes import (
+    BOOK,
+    BOWL,
+    CIRCLE,
+    COLUMNS,
+    HEIGHT,
+    OBJECTS,
+    RADIUS,
+    SIZE,
+    TRIANGLE,
+    WHITE,
+    support,
+)
 
 STEP = 1 / 240
 """Seconds of a step of the simulation."""
