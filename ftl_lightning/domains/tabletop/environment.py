@@ -51,10 +51,12 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     Observed are :data:`FEATURES`. An action is where the hand should be 0.1 s later, and the opening of its gripper; the hand
     points down and keeps its yaw. An episode is a function of scene and actions alone. It ends when the circle touches the
-    triangle or has been put down, and after :data:`MAX_STEPS` steps; the simulation can be stepped on. What ``step`` tells:
-    places of ``circle``, ``triangle`` and book (``book place``), metres by which the ``book`` has moved, whether the circle ``touched`` the triangle, was
-    ``lifted`` and is ``released``, and the ``trace``, joint angles and poses of all that moves at each step, for films. Every
-    instance has a simulator of its own, without a display.
+    triangle or has been put down, and after :data:`MAX_STEPS` steps; the simulation can be stepped on. Every instance has a
+    simulator of its own, without a display.
+
+    What ``step`` tells: places of ``circle``, ``triangle`` and book (``book place``), or ``None`` of what is not there; metres by
+    which the ``book`` has moved; whether the circle ``touched`` the triangle, was ``lifted`` and is ``released``; the ``trace``,
+    joint angles and poses of all objects at each step, for films.
 
     Args:
         arm_drawn: whether pictures show the arm, which hides much of the table from above.

@@ -137,7 +137,7 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     # In front of the bowl or behind it, where the fingers, which open to the sides, do not meet it.
     bowl = scene[COLUMNS[BOWL]][1:3].astype(np.float64)
     side = 1.0 if bowl[0] < 0.5 else -1.0
-    return bowl + (side * (BESIDE + 0.01 * how.place[0]), 0.02 * how.place[1]), 0.0
+    return bowl + np.array([side * (BESIDE + 0.01 * how.place[0]), 0.02 * how.place[1]]), 0.0
 
 
 def _behind(expert: _Expert, goal: Place) -> Place:
@@ -152,7 +152,7 @@ def _triangle(expert: _Expert) -> Place:
 
 
 def _way_around(expert: _Expert) -> list[Place]:
-    """Corners, 5 mm apart or less, of the circle's way to the triangle: straight to a ring around the bowl, along it, straight on."""
+    """Places, some 5 mm apart, on the circle's way to the triangle: straight to the ring around the bowl, along it, straight on."""
     start, end = expert.circle()[:2], _triangle(expert)
     bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
     along = (end - start) / np.linalg.norm(end - start)
