@@ -24,6 +24,8 @@ LOST = 1.0
 """Radians off that line, beyond which the hand goes around the circle to get behind it again."""
 AHEAD = 0.02
 """Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
+PATIENCE = 10
+"""Steps in a row around the circle, after which the hand is lifted and comes down behind it."""
 SLOWER = 1.4
 """On the book pushes are slower by this factor, which gives more moments to learn from."""
 STRAIGHT_SPEED = 0.009
@@ -199,16 +201,22 @@ def _push(expert: _Expert, height: float) -> Moves:
         ahead = done + int(AHEAD / 0.005)
         return way[ahead] if ahead < len(way) else _triangle(expert)
 
-    begin = _behind(expert, goal())
-    yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
-    yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
     speed = 0.008 * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
+    lost = PATIENCE  # at first the hand is anywhere
     while True:
+        if lost >= PATIENCE:
+            if expert.at[2] < height + 0.05:
+                yield from expert.go(np.array([*expert.at[:2], height + 0.06]), 0.016, CLOSED)
+            begin = _behind(expert, goal())
+            yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
+            yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
+            lost = 0
         circle, hand, ahead = expert.circle()[:2], expert.at[:2], goal()
         along = (ahead - circle) / max(float(np.linalg.norm(ahead - circle)), 1e-6)
         to = circle - hand
         across = to - (to @ along) * along
         off = math.atan2(abs(_cross(to, along)), float(to @ along))
+        lost = lost + 1 if off > LOST else 0
         if off > LOST:
             # Around the circle at a distance, on the side where the hand is.
             away = -to / max(float(np.linalg.norm(to)), 1e-6)
