@@ -90,7 +90,10 @@ def test_a_domain_that_is_not_installed_is_used_by_its_module() -> None:
     assert json.loads((folder / "config.json").read_text())["domain"] == "ftl_strokes:DOMAIN"
     run("sample", "--pretrained", str(folder), "--compose=arc upwards", "--count=2", "--steps=3", "--sampler=dpm_solver")
     told = run("generate", "strokes", code=2)
-    assert "domain: expected one of agent, driving, mocap, object_rearrangement, or package.module:DOMAIN, found 'strokes'" in told
+    assert (
+        "domain: expected one of agent, driving, mocap, object_rearrangement, tabletop, or package.module:DOMAIN, found 'strokes'"
+        in told
+    )
 
 
 def test_the_example_is_small() -> None:

@@ -1,0 +1,5 @@
+"""Table-top manipulation: a Panda picks, places and pushes a green circle, seen by a camera (paper, section 'Table-Top')."""
+
+from ftl_lightning.domains.tabletop.domain import DOMAIN
+
+__all__ = ["DOMAIN"]

@@ -1,0 +1,54 @@
+"""The domain object: what the rest of the package knows of the table-top."""
+
+from pathlib import Path
+
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, deferred
+from ftl_lightning.domains.tabletop.environment import FEATURES, MAX_STEPS, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.policies import POLICIES
+from ftl_lightning.domains.tabletop.source import NAME, STATE_NAMES, STATE_UNITS, Expert
+from ftl_lightning.domains.tabletop.success import judge
+from ftl_lightning.domains.tabletop.tasks import SUITES, TRAINING_CONCEPTS
+
+HORIZON = 32
+"""States in a plan; the paper's number."""
+RENDERING = "ftl_lightning.domains.tabletop.rendering"
+
+
+def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
+    """Where the hand should be next ``(episode, 4)``: the plan's next state. Its first is where the hand was told to be last.
+
+    Args:
+        plans: ``(episode, horizon, 4)``.
+        step: steps since the plan was made.
+        observed: not needed: the environment moves the hand from where it was told to be last.
+    """
+    return plans[:, min(step + 1, plans.shape[1] - 1)]
+
+
+DOMAIN = Domain(
+    name=NAME,
+    plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, resolution=1e-4),
+    concepts=Concepts(
+        training=TRAINING_CONCEPTS,
+        suites=SUITES,
+        table=Path(__file__).parent / "embeddings.safetensors",
+    ),
+    source=lambda root: Expert(),
+    observed=FEATURES,
+    headline="closed loop success",
+    show=Show(deferred(f"{RENDERING}:render")),
+    closed_loop=ClosedLoop(
+        environment=TableTopEnvironment,
+        act=act,
+        steps=MAX_STEPS,
+        judge=judge,
+        film=deferred(f"{RENDERING}:film"),
+        keeps=(POSE,),
+        less_is_better=("book moved",),
+        policies=POLICIES,
+    ),
+    fresh=False,  # an expert takes about half a second for an episode
+)

@@ -1,0 +1,245 @@
+"""A Panda at a table, in pybullet, as a gymnasium environment."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.domains.physics import Simulator, pybullet
+from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, HAND, SCENE, TRIANGLE, check, draw_scene, gap, outline
+from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
+from ftl_lightning.domains.tabletop.world import ARM, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward
+from ftl_lightning.errors import UserError
+
+IMAGE, POSE = "image", "pose"
+FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,))}
+"""The overhead camera's picture, without the arm; measured place (m), quaternion (real part last) and opening (m) of the hand."""
+ACTION = 4
+"""Place of the hand (m) and opening of the gripper (m): what plans consist of."""
+MAX_STEPS = 160
+"""The paper's number: 16 seconds."""
+HERTZ = 10
+FASTEST = 0.02
+"""Metres that the hand is moved in a step at most; of an action farther away it goes the first part."""
+TARGETS, SUBSTEPS = 3, 8
+"""In a step the arm is given so many targets in a row, for so many steps of the simulation each."""
+ITERATIONS = 20
+"""Of the search for the joint angles of a target."""
+GAIN = 0.1
+OPEN, THRESHOLD = 0.08, 0.06
+"""Metres between the fingers of an open gripper; an action with a larger opening than the threshold opens it, others close it."""
+FORCE = 20.0
+"""Newtons of a finger."""
+REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))
+"""Metres in which the hand is moved."""
+TOUCH = 0.003
+"""Metres between circle and triangle at which they touch."""
+LIFTED, AWAY, STILL = 0.02, 0.05, 0.001
+"""Metres: the circle is lifted when it is so much higher than before, put down when the hand is open and so far above, and it has
+moved by less in a step."""
+RECYCLE = 200
+"""A simulator is started anew after so many scenes: it does not give back all memory."""
+
+Seen = dict[str, NDArray[Any]]
+"""Observed features by name."""
+
+
+class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
+    """An arm, a table and what lies on it.
+
+    Observed are :data:`FEATURES`. An action is where the hand should be 0.1 s later, and the opening of its gripper; the hand
+    points down and keeps its yaw. An episode is a function of scene and actions alone. It ends when the circle touches the
+    triangle or has been put down, and after :data:`MAX_STEPS` steps; the simulation can be stepped on. Every instance has a
+    simulator of its own, without a display.
+
+    What ``step`` tells: places of ``circle``, ``triangle`` and book (``book place``), or ``None`` of what is not there; metres by
+    which the ``book`` has moved; whether the circle ``touched`` the triangle, was ``lifted`` and is ``released``; the ``trace``,
+    joint angles and poses of all objects at each step, for films.
+
+    Args:
+        arm_drawn: whether pictures show the arm, which hides much of the table from above.
+
+    Raises:
+        UserError: if the simulator does not start.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": HERTZ}  # noqa: RUF012 (gymnasium's)
+    render_mode = "rgb_array"
+    observation_space: gymnasium.spaces.Space[Any] = gymnasium.spaces.Dict(
+        {
+            IMAGE: gymnasium.spaces.Box(0, 255, FEATURES[IMAGE].shape, np.uint8),
+            POSE: gymnasium.spaces.Box(-np.inf, np.inf, FEATURES[POSE].shape, np.float32),
+        }
+    )
+    action_space = gymnasium.spaces.Box(
+        np.array([*(low for low, _ in REACH), 0.0], dtype=np.float32),
+        np.array([*(high for _, high in REACH), OPEN], dtype=np.float32),
+    )
+
+    def __init__(self, arm_drawn: bool = False) -> None:
+        self.arm_drawn = arm_drawn
+        self.client = self._connected()
+        self.scene = np.zeros(SCENE, dtype=np.float32)
+        self.bodies = Bodies(-1, {})
+        self.command = np.zeros(ACTION)
+        self._built = 0
+
+    @staticmethod
+    def _connected() -> Simulator:
+        try:
+            return Simulator()
+        except pybullet.error as error:
+            raise UserError(f"table-top: the physics simulator does not start ({error}); close some of its instances") from error
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
+        """Build a scene.
+
+        Args:
+            seed: of the scene that is drawn if none is given.
+            options: ``scene``, 24 numbers; or ``task``, whose scene is drawn (default 'push green circle to orange triangle').
+
+        Raises:
+            UserError: for a scene that cannot be built, see :func:`~ftl_lightning.domains.tabletop.scenes.check`.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        if (given := options.get("scene")) is None:
+            given = draw_scene(expect_task(options.get("task", PUSH)), self.np_random)
+        self.scene = check(given).copy()
+        if self._built == RECYCLE:
+            self.client.disconnect()
+            self.client, self._built = self._connected(), 0
+        self._built += 1
+        self.bodies = build(self.client, self.scene, self.arm_drawn)
+        self._steps, self._lifted, self._touched = 0, False, False
+        self._start()
+        self._first = self.places()
+        self._before = self._first[CIRCLE]
+        self._trace = [self._now()]
+        return self._observation(), self._told()
+
+    def _start(self) -> None:
+        """Put the hand where the scene says, with an open gripper."""
+        robot = self.bodies.robot
+        for joint, angle in zip(ARM, REST, strict=True):
+            self.client.resetJointState(robot, joint, angle)
+        for finger in FINGERS:
+            self.client.resetJointState(robot, finger, OPEN / 2)
+        self.command = np.array([*map(float, self.scene[HAND][:3]), OPEN])
+        for _ in range(10):  # each search starts from where the last one ended
+            for joint, angle in zip(ARM, self._angles(self.command[:3]), strict=True):
+                self.client.resetJointState(robot, joint, angle)
+
+    def _angles(self, place: NDArray[np.float64]) -> list[float]:
+        """Joint angles that bring the hand there."""
+        robot, turn = self.bodies.robot, downward(float(self.scene[HAND][3]))
+        found = self.client.calculateInverseKinematics(
+            robot, TIP, place.tolist(), turn, maxNumIterations=ITERATIONS, residualThreshold=1e-5
+        )
+        return list(found[: len(ARM)])
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        """Move for 0.1 s. The reward is 0: what is right depends on the task, which physics does not know.
+
+        Raises:
+            UserError: for an action of another size, or with numbers that are not finite.
+        """
+        told = np.asarray(action, dtype=np.float64)
+        if told.shape != (ACTION,) or not np.isfinite(told).all():
+            raise UserError(f"table-top action: expected {ACTION} finite numbers, found {told.tolist()}")
+        before = self.command[:3]
+        way = np.clip(told[:3], *np.transpose(REACH)) - before
+        way *= min(1.0, FASTEST / max(float(np.linalg.norm(way)), 1e-9))
+        opening = OPEN if told[3] > THRESHOLD else 0.0
+        self.command = np.array([*(before + way), opening])
+        robot = self.bodies.robot
+        self.client.setJointMotorControlArray(
+            robot, FINGERS, pybullet.POSITION_CONTROL, targetPositions=[opening / 2] * 2, forces=[FORCE] * 2
+        )
+        for part in range(1, TARGETS + 1):
+            self.client.setJointMotorControlArray(
+                robot,
+                ARM,
+                pybullet.POSITION_CONTROL,
+                targetPositions=self._angles(before + way * part / TARGETS),
+                forces=[87.0] * 4 + [12.0] * 3,
+                positionGains=[GAIN] * len(ARM),
+            )
+            for _ in range(SUBSTEPS):
+                self.client.stepSimulation()
+        self._steps += 1
+        places = self.places()
+        if TRIANGLE in places and abs(places[CIRCLE][2] - places[TRIANGLE][2]) < LIFTED:
+            self._touched |= touching(self._outline(TRIANGLE), places[CIRCLE])
+        self._lifted |= bool(places[CIRCLE][2] > self._first[CIRCLE][2] + LIFTED)
+        self._trace.append(self._now())
+        seen, found = self._observation(), self._told()
+        self._before = places[CIRCLE]
+        return seen, 0.0, self._touched or (self._lifted and found["released"]), self._steps >= MAX_STEPS, found
+
+    def places(self) -> dict[str, NDArray[np.float64]]:
+        """Centres ``(3,)`` of the objects, by name."""
+        found = {name: self.client.getBasePositionAndOrientation(body)[0] for name, body in self.bodies.objects.items()}
+        return {name: np.array(place) for name, place in found.items()}
+
+    def _outline(self, name: str) -> NDArray[np.float64]:
+        place, turn = self.client.getBasePositionAndOrientation(self.bodies.objects[name])
+        return outline(name, place[0], place[1], pybullet.getEulerFromQuaternion(turn)[2])
+
+    def hand(self) -> NDArray[np.float64]:
+        """Measured place, quaternion and opening ``(8,)``."""
+        link = self.client.getLinkState(self.bodies.robot, TIP, computeForwardKinematics=1)
+        opening = sum(state[0] for state in self.client.getJointStates(self.bodies.robot, FINGERS))
+        return np.array([*link[4], *link[5], opening])
+
+    def _observation(self) -> Seen:
+        picture = OVERHEAD.picture(self.client)
+        return {IMAGE: np.ascontiguousarray(picture.transpose(2, 0, 1)), POSE: self.hand().astype(np.float32)}
+
+    def _told(self) -> dict[str, Any]:
+        places, hand = self.places(), self.hand()
+        circle = places[CIRCLE]
+        released = bool(
+            hand[7] > THRESHOLD and hand[2] > circle[2] + AWAY and np.linalg.norm(circle - self._before) < STILL and self._steps
+        )
+        moved = float(np.linalg.norm(places[BOOK] - self._first[BOOK])) if BOOK in places else 0.0
+        triangle = places.get(TRIANGLE)
+        return {
+            "circle": circle,
+            "triangle": triangle,
+            "book": moved,
+            "book place": places.get(BOOK),
+            "touched": self._touched,
+            "lifted": self._lifted,
+            "released": released,
+            "trace": self._trace,
+        }
+
+    def _now(self) -> NDArray[np.float64]:
+        joints = [state[0] for state in self.client.getJointStates(self.bodies.robot, (*ARM, *FINGERS))]
+        poses = [self.client.getBasePositionAndOrientation(body) for body in self.bodies.objects.values()]
+        return np.array([*joints, *(value for place, turn in poses for value in (*place, *turn))])
+
+    def show(self, moment: NDArray[np.float64]) -> None:
+        """Put arm and objects where they were at a moment of a trace of this scene, for a picture."""
+        joints, poses = np.split(moment, [len(ARM) + len(FINGERS)])
+        for joint, angle in zip((*ARM, *FINGERS), joints, strict=True):
+            self.client.resetJointState(self.bodies.robot, joint, angle)
+        for body, pose in zip(self.bodies.objects.values(), poses.reshape(-1, 7), strict=True):
+            self.client.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
+
+    def render(self) -> NDArray[np.uint8]:
+        """A picture ``(240, 320, 3)`` from the front, with the arm if this instance draws it."""
+        return FRONT.picture(self.client, shadow=True)
+
+    def close(self) -> None:
+        """Stop the simulator."""
+        if self.client.isConnected():
+            self.client.disconnect()
+
+
+def touching(triangle: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
+    """Whether a circle with this centre touches the outline of a triangle, seen from above."""
+    return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), triangle) <= TOUCH

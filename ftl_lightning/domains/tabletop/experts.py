@@ -1,0 +1,303 @@
+"""Scripted experts: each says where the hand should go next, from where the objects are."""
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftl_lightning.domains.tabletop.environment import IMAGE, MAX_STEPS, OPEN, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, RING, TRIANGLE, WHITE, support
+from ftl_lightning.domains.tabletop.success import judged
+from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, BESIDE_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
+
+CLOSED = 0.0
+PUSH_HEIGHT = 0.014
+"""Metres of the hand above what the circle stands on while it pushes."""
+GRASP_HEIGHT = 0.016
+CONTACT = 0.037
+"""Metres between the centres of hand and circle while one pushes the other."""
+STEERING = 3.0
+"""Weight of what the hand is beside the line through the circle, in units of :data:`CONTACT`."""
+LOST = 1.0
+"""Radians off that line, beyond which the hand goes around the circle to get behind it again."""
+AHEAD = 0.02
+"""Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
+PATIENCE = 10
+"""Steps in a row around the circle, after which the hand is lifted and comes down behind it."""
+SLOWER = 1.4
+"""On the book pushes are slower by this factor, which gives more moments to learn from."""
+STRAIGHT_SPEED = 0.009
+BESIDE = 0.105
+"""Metres between bowl and circle that is put down beside it, centre to centre."""
+
+Place = NDArray[np.float64]
+Moves = Generator[Place, None, None]
+"""Places ``(4,)`` to go to, one a step: x, y, z and opening."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """What varies between two demonstrations, drawn once for each.
+
+    Attributes:
+        speed: factor of all speeds.
+        behind: metres behind the circle at which a push begins.
+        hover: height in metres at which the hand travels.
+        noise: standard deviation in metres of what the hand wanders off its way.
+        grasp, place: metres, beside the circle's centre and beside where it is put.
+    """
+
+    speed: float
+    behind: float
+    hover: float
+    noise: float
+    grasp: Place
+    place: Place
+
+
+def style(rng: np.random.Generator) -> Style:
+    """At random."""
+    return Style(
+        speed=float(rng.uniform(0.8, 1.2)),
+        behind=float(rng.uniform(0.055, 0.08)),
+        hover=float(rng.uniform(0.11, 0.16)),
+        noise=float(rng.uniform(0.0003, 0.001)),
+        grasp=rng.uniform(-0.004, 0.004, 2),
+        place=rng.uniform(-1, 1, 2),
+    )
+
+
+class _Expert:
+    """What an expert knows: the world as it is, its style, and where it went last."""
+
+    def __init__(self, env: TableTopEnvironment, task: str, how: Style) -> None:
+        self.env, self.task, self.how = env, task, how
+        self.at = env.command.copy()
+
+    def circle(self) -> Place:
+        return self.env.places()[CIRCLE]
+
+    def go(self, place: Place, speed: float, opening: float) -> Moves:
+        """Straight there, with a soft start and end; metres a step at most."""
+        start, goal = self.at[:3].copy(), np.asarray(place, dtype=np.float64)
+        steps = max(2, math.ceil(1.3 * float(np.linalg.norm(goal - start)) / (speed * self.how.speed)))
+        for number in range(1, steps + 1):
+            share = number / steps
+            share -= 0.3 * math.sin(2 * math.pi * share) / (2 * math.pi)
+            self.at = np.array([*(start + share * (goal - start)), opening])
+            yield self.at
+
+    def wait(self, steps: int, opening: float) -> Moves:
+        self.at = np.array([*self.at[:3], opening])
+        for _ in range(steps):
+            yield self.at
+
+
+def moves(env: TableTopEnvironment, task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
+    """What the expert of a task does in the scene in which the environment is.
+
+    Args:
+        env: reset; it is looked at, not stepped.
+        task: known.
+        how: the demonstration's style.
+        height: of pushes, in metres above the table; by default above what the circle stands on.
+        feedback: whether pushes look where the circle is; else they go straight to where the triangle is in the beginning.
+    """
+    expert = _Expert(env, task, how)
+    if task not in PUSHES:
+        return _pick(expert)
+    above = support(env.scene, CIRCLE) + PUSH_HEIGHT if height is None else height
+    return _push(expert, above) if feedback else _straight(expert, above)
+
+
+def _pick(expert: _Expert) -> Moves:
+    scene, how = expert.env.scene, expert.how
+    circle = expert.circle()
+    target, surface = _target(expert)
+    over = circle[:2] + how.grasp
+    yield from expert.go(np.array([*over, circle[2] + how.hover]), 0.016, OPEN)
+    yield from expert.go(np.array([*over, support(scene, CIRCLE) + GRASP_HEIGHT]), 0.012, OPEN)
+    yield from expert.wait(4, CLOSED)
+    yield from expert.go(np.array([*over, HEIGHT[WHITE] + how.hover]), 0.014, CLOSED)
+    target = target - (expert.circle()[:2] - expert.at[:2])
+    yield from expert.go(np.array([*target, HEIGHT[WHITE] + how.hover]), 0.016, CLOSED)
+    yield from expert.go(np.array([*target, surface + GRASP_HEIGHT + 0.003]), 0.012, CLOSED)
+    yield from expert.wait(3, OPEN)
+    yield from expert.go(np.array([*target, surface + how.hover]), 0.014, OPEN)
+    yield from expert.wait(6, OPEN)
+
+
+def _target(expert: _Expert) -> tuple[Place, float]:
+    """Where the circle is put, and how high that is."""
+    scene, how = expert.env.scene, expert.how
+    if expert.task in (TO_BOOK, TO_WHITE):
+        name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
+        return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.place, HEIGHT[name]
+    assert expert.task == BESIDE_BOWL
+    # In front of the bowl or behind it, where the fingers, which open to the sides, do not meet it.
+    bowl = scene[COLUMNS[BOWL]][1:3].astype(np.float64)
+    side = 1.0 if bowl[0] < 0.5 else -1.0
+    return bowl + np.array([side * (BESIDE + 0.01 * how.place[0]), 0.02 * how.place[1]]), 0.0
+
+
+def _behind(expert: _Expert, goal: Place) -> Place:
+    """Where a push of the circle towards a goal begins."""
+    circle = expert.circle()[:2]
+    along = (goal - circle) / np.linalg.norm(goal - circle)
+    return circle - expert.how.behind * along
+
+
+def _triangle(expert: _Expert) -> Place:
+    return expert.env.places()[TRIANGLE][:2]
+
+
+def _way_around(expert: _Expert) -> list[Place]:
+    """Places, some 5 mm apart, on the circle's way to the triangle: straight to the ring around the bowl, along it, straight on."""
+    start, end = expert.circle()[:2], _triangle(expert)
+    bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
+    along = (end - start) / np.linalg.norm(end - start)
+    beside = _cross(along, bowl - start)
+    if abs(beside) >= RING:
+        return _spread(start, end)
+    side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1: the bowl is passed where the way is shorter
+    first, last = (_tangent(bowl, place, turn) for place, turn in ((start, -side), (end, side)))
+    sweep = (side * (last - first)) % (2 * math.pi)
+    angles = first + side * np.linspace(0, sweep, max(2, int(RING * sweep / 0.005)))
+    arc = [bowl + RING * np.array([math.cos(angle), math.sin(angle)]) for angle in angles]
+    return [*_spread(start, arc[0]), *arc, *_spread(arc[-1], end)]
+
+
+def _cross(one: Place, other: Place) -> float:
+    return float(one[0] * other[1] - one[1] * other[0])
+
+
+def _tangent(centre: Place, place: Place, turn: float) -> float:
+    """Angle on the ring around a centre where the line from a place touches it."""
+    off = place - centre
+    distance = max(float(np.linalg.norm(off)), RING + 1e-6)
+    return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
+
+
+def _spread(start: Place, end: Place) -> list[Place]:
+    count = max(2, int(np.linalg.norm(end - start) / 0.005))
+    return list(start + np.linspace(0, 1, count)[:, None] * (end - start))
+
+
+def _push(expert: _Expert, height: float) -> Moves:
+    """Bring the circle to the triangle, looking where it goes."""
+    how = expert.how
+    way = _way_around(expert) if expert.task == AROUND_BOWL else []
+    done = 0
+
+    def goal() -> Place:
+        nonlocal done
+        if not way:
+            return _triangle(expert)
+        circle = expert.circle()[:2]
+        near = range(done, min(len(way), done + 20))
+        done = min(near, key=lambda number: float(np.linalg.norm(way[number] - circle)))
+        ahead = done + int(AHEAD / 0.005)
+        return way[ahead] if ahead < len(way) else _triangle(expert)
+
+    speed = 0.008 * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
+    lost = PATIENCE  # at first the hand is anywhere
+    while True:
+        if lost >= PATIENCE:
+            if expert.at[2] < height + 0.05:
+                yield from expert.go(np.array([*expert.at[:2], height + 0.06]), 0.016, CLOSED)
+            begin = _behind(expert, goal())
+            yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
+            yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
+            lost = 0
+        circle, hand, ahead = expert.circle()[:2], expert.at[:2], goal()
+        along = (ahead - circle) / max(float(np.linalg.norm(ahead - circle)), 1e-6)
+        to = circle - hand
+        across = to - (to @ along) * along
+        off = math.atan2(abs(_cross(to, along)), float(to @ along))
+        lost = lost + 1 if off > LOST else 0
+        if off > LOST:
+            # Around the circle at a distance, on the side where the hand is.
+            away = -to / max(float(np.linalg.norm(to)), 1e-6)
+            round_ = np.array([-away[1], away[0]])
+            round_ *= 1.0 if round_ @ -along > 0 else -1.0
+            direction = round_ + 4 * (how.behind - float(np.linalg.norm(to))) / how.behind * away
+        else:
+            direction = along + STEERING * across / CONTACT
+        direction /= max(float(np.linalg.norm(direction)), 1e-6)
+        expert.at = np.array([*(hand + speed * direction), height, CLOSED])
+        yield expert.at
+
+
+def _straight(expert: _Expert, height: float) -> Moves:
+    """Push on the line from circle to triangle as they lie in the beginning."""
+    goal = _triangle(expert).copy()
+    begin = _behind(expert, goal)
+    yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
+    yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
+    along = (goal - begin) / np.linalg.norm(goal - begin)
+    for _ in range(MAX_STEPS):
+        expert.at = np.array([*(expert.at[:2] + STRAIGHT_SPEED * along), height, CLOSED])
+        yield expert.at
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What an expert did.
+
+    Attributes:
+        commands: ``(time, 4)``, where the hand was told to be; the first is where it starts.
+        images: ``(time, 3, 64, 64)`` uint8.
+        poses: ``(time, 8)``, as measured.
+        success: whether it did the task.
+    """
+
+    commands: NDArray[np.float32]
+    images: NDArray[np.uint8]
+    poses: NDArray[np.float32]
+    success: bool
+
+
+STAY = 4
+"""Steps that the hand stays after a task is done, so that plans end at rest."""
+
+
+def perform(
+    env: TableTopEnvironment,
+    task: str,
+    scene: NDArray[np.float32],
+    rng: np.random.Generator,
+    height: float | None = None,
+    feedback: bool = True,
+) -> Episode:
+    """One episode of the expert of a task.
+
+    Args:
+        env: any; it is reset.
+        task: known.
+        scene: of it.
+        rng: draws its style and its noise.
+        height, feedback: see :func:`moves`.
+
+    Raises:
+        UserError: for a scene that cannot be built.
+    """
+    seen, told = env.reset(options={"scene": scene})
+    how = style(rng)
+    commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
+    wander = np.zeros(3)
+    for command in moves(env, task, how, height, feedback):
+        wander = 0.8 * wander + how.noise * rng.standard_normal(3) * (1, 1, 0.3)
+        seen, _, terminated, truncated, told = env.step((command + np.array([*wander, 0.0])).astype(np.float32))
+        commands.append(env.command.copy())
+        images.append(seen[IMAGE])
+        poses.append(seen[POSE])
+        if terminated or truncated:
+            break
+    for _ in range(STAY):
+        commands.append(commands[-1])
+        images.append(images[-1])
+        poses.append(poses[-1])
+    success = judged(task, env.scene, told)
+    return Episode(np.stack(commands).astype(np.float32), np.stack(images), np.stack(poses).astype(np.float32), success)

@@ -1,0 +1,47 @@
+"""Reference lines of pushing: what the expert, one that ignores heights and one that does not look achieve from the same starts."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import Policy
+from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform
+from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, expect_task
+
+_Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
+
+
+def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> _Make:
+    """Commands of an expert that was there before, in a simulation of its own.
+
+    Args:
+        tasks: of other tasks there is no such line.
+        height, feedback: see :func:`ftl_lightning.domains.tabletop.experts.moves`.
+    """
+
+    def make(goal: str, starts: InitialStates, known: Demonstrations | None, seed: int) -> Policy | None:
+        if expect_task(goal) not in tasks:
+            return None
+        env = TableTopEnvironment()
+        try:
+            commands = [
+                torch.from_numpy(perform(env, goal, scene, np.random.default_rng([seed, row]), height, feedback).commands)
+                for row, scene in enumerate(starts.require_scenes().numpy())
+            ]
+        finally:
+            env.close()
+        return lambda observed, rows, step: torch.stack([commands[row][min(step + 1, len(commands[row]) - 1)] for row in rows])
+
+    return make
+
+
+POLICIES = {
+    "expert (oracle)": _repeated(TASKS),
+    "table-height push": _repeated((PUSH_ON_BOOK,), height=PUSH_HEIGHT),
+    "straight push": _repeated((PUSH, PUSH_ON_BOOK), feedback=False),
+}
+"""``table-height push`` does on the book what pushing on the table is; ``straight push`` never looks again."""

@@ -1,0 +1,292 @@
+"""A scene: 24 numbers that say what stands where on the table, and where the hand starts. Metres and radians.
+
+The robot's base is at the origin, the table's top is z = 0. An object takes four numbers (present, x, y, yaw), the hand four
+(x, y, z, yaw).
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.domains.tabletop.tasks import (
+    AROUND_BOWL,
+    BESIDE_BOWL,
+    PUSH,
+    PUSH_ON_BOOK,
+    TO_BOOK,
+    TO_WHITE,
+    expect_task,
+)
+from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import task_key
+
+CIRCLE, TRIANGLE, BOOK, WHITE, BOWL = OBJECTS = ("green circle", "orange triangle", "book", "white surface", "purple bowl")
+COLUMNS = {name: slice(4 * number, 4 * number + 4) for number, name in enumerate(OBJECTS)}
+"""Columns (present, x, y, yaw) of each object."""
+HAND = slice(4 * len(OBJECTS), 4 * len(OBJECTS) + 4)
+"""Columns (x, y, z, yaw) of the hand."""
+SCENE = HAND.stop
+
+RADIUS = {CIRCLE: 0.025, BOWL: 0.05, TRIANGLE: 0.07 / math.sqrt(3)}
+"""Of the circle and the bowl, and of the corners of the triangle, whose side is 7 cm."""
+SIZE = {BOOK: (0.22, 0.16), WHITE: (0.13, 0.13)}
+HEIGHT = {CIRCLE: 0.03, TRIANGLE: 0.03, BOOK: 0.03, WHITE: 0.06, BOWL: 0.045}
+WORKSPACE = ((0.36, 0.66), (-0.24, 0.24))
+"""x and y in which the circle and the triangle have their centres."""
+SIGHT = ((0.22, 0.78), (-0.34, 0.34))
+"""x and y in which every object lies as a whole: what the camera sees and the arm does not touch."""
+START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))
+"""Where the hand starts."""
+RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028
+"""Radius in metres of the circle's way around the bowl."""
+APART = 0.002
+"""Metres between objects, at least."""
+
+Points = NDArray[np.float64]
+"""Corners ``(n, 2)`` of a convex outline, counter-clockwise."""
+
+
+def outline(name: str, x: float, y: float, yaw: float) -> Points:
+    """An object from above; circles are polygons of 24 corners."""
+    if name in SIZE:
+        length, width = SIZE[name]
+        corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return corners @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
+    count = 3 if name == TRIANGLE else 24
+    angles = yaw + 2 * math.pi * np.arange(count) / count
+    return RADIUS[name] * np.stack((np.cos(angles), np.sin(angles)), axis=-1) + (x, y)
+
+
+def _normals(points: Points) -> Points:
+    along = np.roll(points, -1, axis=0) - points
+    return np.stack((along[:, 1], -along[:, 0]), axis=-1) / np.linalg.norm(along, axis=-1, keepdims=True)
+
+
+def gap(one: Points, other: Points) -> float:
+    """Metres between two outlines; less where corner faces corner, negative where they overlap."""
+    sides = []
+    for a, b in ((one, other), (other, one)):
+        normals = _normals(a)
+        sides.append(((b @ normals.T).min(axis=0) - (a @ normals.T).max(axis=0)).max())
+    return float(max(sides))
+
+
+def within(one: Points, other: Points) -> bool:
+    """Whether an outline lies inside another one."""
+    normals = _normals(other)
+    return bool(((one @ normals.T).max(axis=0) <= (other @ normals.T).max(axis=0) + 1e-9).all())
+
+
+def outlines(scene: NDArray[np.float32]) -> dict[str, Points]:
+    """The objects that a scene has, by name."""
+    return {name: outline(name, *map(float, scene[columns][1:])) for name, columns in COLUMNS.items() if scene[columns][0] > 0.5}
+
+
+def support(scene: NDArray[np.float32], name: str) -> float:
+    """Height in metres of what an object stands on: the book's for what lies on it, else the table's."""
+    placed = outlines(scene)
+    on_book = name in (CIRCLE, TRIANGLE) and BOOK in placed and within(placed[name], placed[BOOK])
+    return HEIGHT[BOOK] if on_book else 0.0
+
+
+def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
+    """A scene as an array, checked.
+
+    Raises:
+        UserError: for another size, numbers that are not finite, no circle, objects that overlap (circle and triangle may lie on
+            the book, as a whole), that leave the workspace, or a hand that starts elsewhere.
+    """
+    found = np.asarray(scene, dtype=np.float32)
+    if found.shape != (SCENE,):
+        raise UserError(f"table-top scene: expected {SCENE} numbers, found shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise UserError("table-top scene: expected finite numbers, found others")
+    for name, columns in COLUMNS.items():
+        if found[columns][0] not in (0, 1) or (name == CIRCLE and not found[columns][0]):
+            expected = "1" if name == CIRCLE else "0 or 1"
+            raise UserError(f"table-top scene: {name}, present: expected {expected}, found {found[columns][0]:g}")
+    placed = outlines(found)
+    for name, points in placed.items():
+        free = name in (CIRCLE, TRIANGLE)
+        where = found[COLUMNS[name]][None, 1:3] if free else points
+        for axis, values, (low, high) in zip("xy", where.T, WORKSPACE if free else SIGHT, strict=True):
+            if values.min() < low - 1e-6 or values.max() > high + 1e-6:
+                outside = values.min() if values.min() < low else values.max()
+                raise UserError(f"table-top scene: {name} leaves the workspace: expected {axis} {low}..{high}, found {outside:.3f}")
+    names = list(placed)
+    for number, name in enumerate(names):
+        for other in names[:number]:
+            _expect_apart(name, other, placed)
+    for axis, value, (low, high) in zip(("x", "y", "z", "yaw"), found[HAND], START, strict=True):
+        if not low - 1e-6 <= value <= high + 1e-6:
+            raise UserError(f"table-top scene: hand: expected {axis} {low}..{high}, found {value:.3f}")
+    return found
+
+
+def _expect_apart(name: str, other: str, placed: Mapping[str, Points]) -> None:
+    if name == BOOK and other in (CIRCLE, TRIANGLE) and within(placed[other], placed[BOOK]):
+        return  # it lies on the book
+    if (distance := gap(placed[name], placed[other])) < APART:
+        raise UserError(f"table-top scene: {other} and {name} overlap: expected {APART} m between them, found {distance:.3f}")
+
+
+Rng = np.random.Generator
+_Placed = dict[str, tuple[float, float, float]]
+"""x, y and yaw by name."""
+PRESENT = 0.7
+"""How often an object that a task does not need is there, where it fits, so that the picture does not tell the task."""
+TRIES = 30
+"""Places that are tried for it."""
+
+
+def _anywhere(rng: Rng, around: tuple[tuple[float, float], ...] = WORKSPACE) -> tuple[float, float]:
+    return float(rng.uniform(*around[0])), float(rng.uniform(*around[1]))
+
+
+def _yaw(rng: Rng, name: str) -> float:
+    return float(rng.uniform(-0.4, 0.4)) if name in SIZE else float(rng.uniform(-math.pi, math.pi))
+
+
+def _pick(target: str) -> Callable[[Rng], _Placed]:
+    def draw(rng: Rng) -> _Placed:
+        return {name: (*_anywhere(rng), _yaw(rng, name)) for name in (CIRCLE, target)}
+
+    return draw
+
+
+def _pair(rng: Rng, near: float, far: float) -> _Placed:
+    """Circle and triangle so far apart, in any direction."""
+    x, y = _anywhere(rng)
+    angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(near, far)
+    other = (x + distance * math.cos(angle), y + distance * math.sin(angle))
+    return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(other[0]), float(other[1]), _yaw(rng, TRIANGLE))}
+
+
+def _push(rng: Rng) -> _Placed:
+    return _pair(rng, 0.12, 0.24)
+
+
+def _around(rng: Rng) -> _Placed:
+    """The bowl between circle and triangle, with room for the circle's way on the side where it is shorter."""
+    while True:
+        placed = _pair(rng, 0.23, 0.30)
+        start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
+        along = (end - start) / np.linalg.norm(end - start)
+        across = np.array([-along[1], along[0]])
+        beside = rng.uniform(-0.02, 0.02)
+        bowl = (start + end) / 2 + rng.uniform(-0.02, 0.02) * along + beside * across
+        farthest = bowl - np.sign(beside) * RING * across
+        if all(low <= value <= high for value, (low, high) in zip(farthest, WORKSPACE, strict=True)):
+            return {**placed, BOWL: (float(bowl[0]), float(bowl[1]), 0.0)}
+
+
+def _on_book(rng: Rng) -> _Placed:
+    placed = _pair(rng, 0.09, 0.15)
+    middle = np.mean([placed[name][:2] for name in (CIRCLE, TRIANGLE)], axis=0) + rng.uniform(-0.03, 0.03, 2)
+    return {**placed, BOOK: (float(middle[0]), float(middle[1]), _yaw(rng, BOOK))}
+
+
+NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
+    TO_BOOK: _pick(BOOK),
+    TO_WHITE: _pick(WHITE),
+    BESIDE_BOWL: _pick(BOWL),
+    PUSH: _push,
+    AROUND_BOWL: _around,
+    PUSH_ON_BOOK: _on_book,
+}
+"""What a task needs, at random, whether it fits or not."""
+
+
+def _way(placed: _Placed, half_width: float) -> Points:
+    """The stretch that the hand sweeps when it pushes the circle straight to the triangle."""
+    start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
+    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
+    across = np.array([-along[1], along[0]]) * half_width
+    behind = start - 0.09 * along
+    return np.stack((behind - across, end - across, end + across, behind + across))
+
+
+def _clear(task: str, placed: _Placed) -> bool:
+    """Whether what a task needs can be done: its own objects are where they should, and no other is in the way."""
+    shapes = {name: outline(name, *pose) for name, pose in placed.items()}
+    needed = set(NEEDED[task](np.random.default_rng(0)))
+    on_book = task == PUSH_ON_BOOK
+    if on_book and not (within(shapes[CIRCLE], shapes[BOOK]) and within(shapes[TRIANGLE], shapes[BOOK])):
+        return False
+    for name, shape in shapes.items():
+        room = 0.10 if name == WHITE else 0.06
+        for other, points in shapes.items():
+            if name == other or (on_book and BOOK in (name, other) and {name, other} & {CIRCLE, TRIANGLE}):
+                continue
+            near = room if CIRCLE in (name, other) or {BOOK, WHITE, BOWL} >= {name, other} else 0.03
+            if {CIRCLE, TRIANGLE} == {name, other} and TRIANGLE in needed:
+                near = 0.02  # as the task says
+            if {CIRCLE, BOWL} == {name, other} and task == AROUND_BOWL:
+                near = 0.03
+            if other == BOWL and task == BESIDE_BOWL:
+                near = 0.10  # the circle is put down there
+            if gap(shape, points) < near:
+                return False
+        if task in (PUSH, PUSH_ON_BOOK, AROUND_BOWL) and name not in needed:
+            half = 0.17 if task == AROUND_BOWL else 0.10 if name == WHITE else 0.06
+            if gap(shape, _way(placed, half)) < 0:
+                return False
+    return True
+
+
+def draw_scene(task: str, rng: Rng) -> NDArray[np.float32]:
+    """A scene of a task: what it needs, and other objects where they fit."""
+    while True:
+        placed = NEEDED[task](rng)
+        hand = [float(rng.uniform(*limits)) for limits in START]
+        if _clear(task, placed) and _stands(placed, hand):
+            break
+    for name in OBJECTS:
+        if name in placed or rng.uniform() > PRESENT:
+            continue
+        for _ in range(TRIES):
+            more = {**placed, name: (*_anywhere(rng), _yaw(rng, name))}
+            if _clear(task, more) and _stands(more, hand):
+                placed = more
+                break
+    return scene_of(placed, hand)
+
+
+def scene_of(
+    placed: Mapping[str, tuple[float, float, float]], hand: Sequence[float] = (0.42, 0.0, 0.2, 0.0)
+) -> NDArray[np.float32]:
+    """The numbers of a scene, which nobody has checked.
+
+    Args:
+        placed: x, y and yaw of the objects that it has.
+        hand: x, y, z and yaw.
+    """
+    scene = np.zeros(SCENE, dtype=np.float32)
+    for name, pose in placed.items():
+        scene[COLUMNS[name]] = (1, *pose)
+    scene[HAND] = hand
+    return scene
+
+
+def _stands(placed: _Placed, hand: Sequence[float]) -> bool:
+    try:
+        check(scene_of(placed, hand))
+    except UserError:
+        return False
+    return True
+
+
+def scenes(task: str, count: int, seed: int) -> Tensor:
+    """Scenes of a task ``(count, 24)``; fewer of the same seed are the first of more.
+
+    Raises:
+        UserError: for an unknown task.
+    """
+    expect_task(task)
+    drawn = [draw_scene(task, np.random.default_rng([seed, task_key(task), number])) for number in range(count)]
+    return torch.from_numpy(np.stack(drawn))

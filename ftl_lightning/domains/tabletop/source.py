@@ -1,0 +1,138 @@
+"""Demonstrations of the scripted experts."""
+
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+from ftl_lightning.demonstrations.cache import cached
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate, padded
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import Split
+from ftl_lightning.domains.tabletop import environment, experts, success, world
+from ftl_lightning.domains.tabletop import scenes as scene_settings
+from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.experts import Episode, perform
+from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
+from ftl_lightning.domains.tabletop.tasks import TRAINING_CONCEPTS, expect_task
+from ftl_lightning.errors import UserError
+from ftl_lightning.seeding import VALIDATION_SEED, task_key
+
+_LOG = logging.getLogger(__name__)
+
+NAME = "tabletop"
+STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
+STATE_UNITS = ("m",) * 4
+MOST = 4
+"""Episodes that are tried at most for each that is kept."""
+FORM = 1
+"""Of the experts; what is cached of another one is not used."""
+_SETTINGS = {
+    f"{module.__name__.rpartition('.')[2]}.{name}": value
+    for module in (environment, experts, scene_settings, success, world)
+    for name, value in sorted(vars(module).items())
+    if name.isupper() and isinstance(value, int | float | str | tuple | dict | world.Camera) and name not in ("FEATURES", "NEEDED")
+}
+"""What decides a demonstration besides task, count and seed."""
+
+Job = tuple[str, int, int]
+"""Task, seed and number of an episode."""
+_ENVIRONMENT: list[TableTopEnvironment] = []
+"""The one of this process."""
+
+
+def _scene(job: Job) -> np.ndarray:
+    task, seed, number = job
+    return draw_scene(task, np.random.default_rng([seed, task_key(task), number]))
+
+
+def _episode(job: Job) -> Episode | None:
+    """What the expert did; nothing where the simulator raised an error."""
+    task, seed, number = job
+    if not _ENVIRONMENT:
+        _ENVIRONMENT.append(TableTopEnvironment())
+    try:
+        return perform(_ENVIRONMENT[0], task, _scene(job), np.random.default_rng([seed, task_key(task), number, 1]))
+    except Exception as error:  # whatever the simulator raises: the other episodes go on
+        _LOG.warning("table-top %r, episode %d: %r; it counts as rejected", task, number, error)
+        _ENVIRONMENT.pop().close()
+        return None
+
+
+def _episodes(jobs: list[Job], workers: int) -> Iterator[Episode | None]:
+    if workers == 1:
+        yield from map(_episode, jobs)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(_episode, jobs)
+
+
+def demonstrations(task: str, count: int, seed: int, workers: int, progress: Callable[[], None]) -> Demonstrations:
+    """The first ``count`` successful episodes of a task, in the order of their numbers, whatever the number of workers.
+
+    Args:
+        task: known.
+        count: demonstrations.
+        seed: decides scenes, and styles and noise of the expert.
+        workers: processes.
+        progress: called after each successful episode.
+
+    Raises:
+        UserError: if too few episodes succeed.
+    """
+    kept: list[tuple[Job, Episode]] = []
+    jobs = [(task, seed, number) for number in range(MOST * count)]
+    tried = 0
+    for job, episode in zip(jobs, _episodes(jobs, workers), strict=False):
+        tried += 1
+        if episode is not None and episode.success:
+            kept.append((job, episode))
+            progress()
+        if len(kept) == count:
+            break
+    else:
+        raise UserError(f"table-top {task!r}: expected {count} successful episodes of {tried}, found {len(kept)}")
+    states, lengths = padded([torch.from_numpy(episode.commands) for _, episode in kept])
+    return Demonstrations(
+        states=states,
+        lengths=lengths,
+        domain=NAME,
+        state_names=STATE_NAMES,
+        state_units=STATE_UNITS,
+        concepts=(task,) * count,
+        observed={
+            IMAGE: padded([torch.from_numpy(episode.images) for _, episode in kept])[0],
+            POSE: padded([torch.from_numpy(episode.poses) for _, episode in kept])[0],
+        },
+        per_step=tuple(FEATURES),
+        scenes=torch.from_numpy(np.stack([_scene(job) for job, _ in kept])),
+        provenance={"generator": NAME, "seed": seed, "count": count, "tried": tried, "rejected": tried - count},
+    )
+
+
+class Expert:
+    """Episodes of the scripted experts that succeeded, from the cache if they are there."""
+
+    def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        own = seed if name == "train" else VALIDATION_SEED + seed
+        return concatenate([self.draw(task, count, own) for task in TRAINING_CONCEPTS])
+
+    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        settings = {"domain": NAME, "task": expect_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
+        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress))
+
+    def starts(self, task: str, count: int, seed: int) -> InitialStates:
+        """New scenes ``(count, 24)``, and what is seen there."""
+        return initial_states(scenes(task, count, seed))
+
+
+def initial_states(drawn: torch.Tensor) -> InitialStates:
+    """Scenes ``(scene, 24)`` and what is seen where they start."""
+    env = TableTopEnvironment()
+    try:
+        seen = [env.reset(options={"scene": scene.numpy()})[0] for scene in drawn]
+    finally:
+        env.close()
+    return InitialStates({name: torch.from_numpy(np.stack([one[name] for one in seen])) for name in FEATURES}, drawn)

@@ -1,0 +1,220 @@
+"""Bodies of the table-top in pybullet, and its two cameras."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftl_lightning.domains.agent.bodies import bowl
+from ftl_lightning.domains.physics import Simulator, pybullet
+from ftl_lightning.domains.tabletop.scenes import (
+    BOOK,
+    BOWL,
+    CIRCLE,
+    COLUMNS,
+    HEIGHT,
+    OBJECTS,
+    RADIUS,
+    SIZE,
+    TRIANGLE,
+    WHITE,
+    support,
+)
+
+STEP = 1 / 240
+"""Seconds of a step of the simulation."""
+MASS = {CIRCLE: 0.06, TRIANGLE: 0.15, BOOK: 0.35, WHITE: 0.0, BOWL: 0.0}
+"""kg; what has none stays where it is."""
+FRICTION = {CIRCLE: 0.5, TRIANGLE: 0.6, BOOK: 0.5, WHITE: 0.6, BOWL: 0.6}
+TABLE_FRICTION, FINGER_FRICTION = 0.5, 0.9
+COLOUR = {
+    CIRCLE: (0.10, 0.60, 0.20),
+    TRIANGLE: (0.95, 0.50, 0.05),
+    BOOK: (0.20, 0.30, 0.65),
+    WHITE: (0.97, 0.97, 0.97),
+    BOWL: (0.50, 0.15, 0.60),
+}
+TABLE_COLOUR = (0.62, 0.55, 0.47)
+MARGIN = 0.001
+"""Metres around the triangle's hull, at which the simulator lets it touch others."""
+MOVING = (CIRCLE, TRIANGLE, BOOK)
+WALLS = 12
+"""Boxes of which the bowl's wall is made for collisions; it is drawn round."""
+
+ARM = tuple(range(7))
+FINGERS = (9, 10)
+TIP = 11
+"""The link between the fingertips, 7 mm above their ends."""
+REST = (0.0, 0.1, 0.0, -2.4, 0.0, 2.5, 0.785)
+"""Joint angles from which the arm finds to where it starts."""
+
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+"""Position, and quaternion with its real part last."""
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Numbers by which the simulator knows them.
+
+    Attributes:
+        robot: the arm.
+        objects: by name, those that the scene has.
+    """
+
+    robot: int
+    objects: dict[str, int]
+
+
+def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bodies:
+    """Build a scene from nothing: what the simulator did before leaves no trace.
+
+    Args:
+        client: the simulator.
+        scene: checked.
+        arm_drawn: whether pictures show the arm; without it they take a twentieth of the time.
+    """
+    client.resetSimulation()
+    client.setGravity(0, 0, -9.81)
+    client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
+    _box(client, (0.9, 1.0, 0.04), (0.5, 0.0, -0.02), TABLE_COLOUR, 0.0, TABLE_FRICTION)
+    # Without its own shapes those for collisions are drawn, which load quicker; these are made invisible.
+    flags = 0 if arm_drawn else pybullet.URDF_IGNORE_VISUAL_SHAPES
+    robot: int = client.loadURDF(_panda(), [0, 0, 0], useFixedBase=True, flags=flags)
+    for link in () if arm_drawn else range(-1, client.getNumJoints(robot)):
+        client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
+    for finger in FINGERS:
+        client.changeDynamics(robot, finger, lateralFriction=FINGER_FRICTION)
+    objects = {name: _object(client, scene, name) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
+    return Bodies(robot, objects)
+
+
+def _panda() -> str:
+    import pybullet_data
+
+    return str(Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf")
+
+
+def turned(yaw: float) -> tuple[float, float, float, float]:
+    """Quaternion of an object that is turned about the vertical."""
+    return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+def downward(yaw: float) -> tuple[float, float, float, float]:
+    """Quaternion of the hand that points down."""
+    return math.cos(yaw / 2), math.sin(yaw / 2), 0.0, 0.0
+
+
+def _box(
+    client: Simulator,
+    size: tuple[float, float, float],
+    place: tuple[float, float, float],
+    colour: tuple[float, ...],
+    mass: float,
+    friction: float,
+    yaw: float = 0.0,
+) -> int:
+    half = [edge / 2 for edge in size]
+    body: int = client.createMultiBody(
+        mass,
+        client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half),
+        client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1]),
+        place,
+        turned(yaw),
+    )
+    client.changeDynamics(body, -1, lateralFriction=friction)
+    return body
+
+
+def _object(client: Simulator, scene: NDArray[np.float32], name: str) -> int:
+    x, y, yaw = map(float, scene[COLUMNS[name]][1:])
+    height, colour = HEIGHT[name], [*COLOUR[name], 1]
+    place = (x, y, support(scene, name) + height / 2)
+    if name in SIZE:
+        return _box(client, (*SIZE[name], height), place, COLOUR[name], MASS[name], FRICTION[name], yaw)
+    if name == CIRCLE:
+        shape = client.createCollisionShape(pybullet.GEOM_CYLINDER, radius=RADIUS[name], height=height)
+        seen = client.createVisualShape(pybullet.GEOM_CYLINDER, radius=RADIUS[name], length=height, rgbaColor=colour)
+    elif name == TRIANGLE:
+        vertices = _prism(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN)  # corners move by 2 when sides move by 1
+        shape = client.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices)
+        seen = client.createVisualShape(
+            pybullet.GEOM_MESH, vertices=_prism(RADIUS[name], height / 2), indices=_PRISM_SIDES, rgbaColor=colour
+        )
+    else:
+        shape = _bowl_shape(client)
+        vertices, triangles = bowl(RADIUS[name], height / 2, 0.006)
+        upright = [[a, -c, b] for a, b, c in vertices]  # that mesh stands on y
+        seen = client.createVisualShape(pybullet.GEOM_MESH, vertices=upright, indices=triangles, rgbaColor=colour)
+    body: int = client.createMultiBody(MASS[name], shape, seen, place, turned(yaw))
+    client.changeDynamics(body, -1, lateralFriction=FRICTION[name])
+    if name == TRIANGLE:
+        client.changeDynamics(body, -1, collisionMargin=MARGIN)
+    return body
+
+
+def _prism(radius: float, half: float) -> list[list[float]]:
+    corners = [(radius * math.cos(angle), radius * math.sin(angle)) for angle in (0, 2 * math.pi / 3, 4 * math.pi / 3)]
+    return [[x, y, z] for z in (-half, half) for x, y in corners]
+
+
+_PRISM_SIDES = [0, 2, 1, 3, 4, 5, 0, 1, 4, 0, 4, 3, 1, 2, 5, 1, 5, 4, 2, 0, 3, 2, 3, 5]
+
+
+def _bowl_shape(client: Simulator) -> int:
+    half, thickness, radius = HEIGHT[BOWL] / 2, 0.006, RADIUS[BOWL]
+    angles = [2 * math.pi * number / WALLS for number in range(WALLS)]
+    walls = [[thickness / 2, radius * math.tan(math.pi / WALLS), half]] * WALLS
+    places = [[(radius - thickness / 2) * math.cos(angle), (radius - thickness / 2) * math.sin(angle), 0.0] for angle in angles]
+    shape: int = client.createCollisionShapeArray(
+        shapeTypes=[pybullet.GEOM_BOX] * (WALLS + 1),
+        halfExtents=[*walls, [radius / 2, radius / 2, thickness / 2]],
+        collisionFramePositions=[*places, [0.0, 0.0, thickness / 2 - half]],
+        collisionFrameOrientations=[*(turned(angle) for angle in angles), turned(0.0)],
+    )
+    return shape
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera that stands still.
+
+    Attributes:
+        eye, target, up: metres.
+        angle: its field of view in degrees, from bottom to top.
+        size: height and width of its pictures.
+    """
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+    angle: float
+    size: tuple[int, int]
+
+    def _matrices(self) -> tuple[list[float], list[float]]:
+        view = pybullet.computeViewMatrix(self.eye, self.target, self.up)
+        return view, pybullet.computeProjectionMatrixFOV(self.angle, self.size[1] / self.size[0], 0.1, 3.0)
+
+    def picture(self, client: Simulator, shadow: bool = False) -> NDArray[np.uint8]:
+        """``(height, width, 3)``, by pybullet's software renderer."""
+        height, width = self.size
+        view, lens = self._matrices()
+        seen = client.getCameraImage(
+            width, height, view, lens, lightDirection=[0.3, -0.6, 1.5], shadow=int(shadow), renderer=pybullet.ER_TINY_RENDERER
+        )
+        rgba: NDArray[np.uint8] = np.asarray(seen[2], dtype=np.uint8).reshape(height, width, 4)
+        return np.ascontiguousarray(rgba[..., :3])
+
+    def pixels(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where places ``(n, 3)`` are in a picture: column and row ``(n, 2)``."""
+        view, lens = (np.array(matrix).reshape(4, 4).T for matrix in self._matrices())
+        clip = np.concatenate((places, np.ones((len(places), 1))), axis=-1) @ (lens @ view).T
+        seen = clip[:, :2] / clip[:, 3:]
+        return (np.array([1, 1]) + seen * (1, -1)) / 2 * (self.size[1], self.size[0])
+
+
+OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))
+"""What a model sees."""
+FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))
+"""What people see in films."""

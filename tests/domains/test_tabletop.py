@@ -1,0 +1,325 @@
+"""The table-top: scenes, physics, success rules, experts, demonstrations and closed loop."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.tabletop import DOMAIN, experts, source
+from ftl_lightning.domains.tabletop.domain import act
+from ftl_lightning.domains.tabletop.environment import ACTION, IMAGE, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.scenes import (
+    BOOK,
+    BOWL,
+    CIRCLE,
+    COLUMNS,
+    HAND,
+    SCENE,
+    TRIANGLE,
+    WHITE,
+    check,
+    gap,
+    outline,
+    scene_of,
+    scenes,
+    support,
+    within,
+)
+from ftl_lightning.domains.tabletop.success import judge, judged
+from ftl_lightning.domains.tabletop.tasks import (
+    AROUND_BOWL,
+    BESIDE_BOWL,
+    PUSH,
+    PUSH_ON_BOOK,
+    TASKS,
+    TO_BOOK,
+    TO_WHITE,
+    TRAINING_CONCEPTS,
+)
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
+
+LOOP = DOMAIN.closed_loop
+assert LOOP is not None
+APART = {CIRCLE: (0.45, 0.0, 0.0), TRIANGLE: (0.60, 0.0, 0.0)}
+
+
+@pytest.fixture
+def env() -> Iterator[TableTopEnvironment]:
+    made = TableTopEnvironment()
+    yield made
+    made.close()
+
+
+# Scenes
+
+
+def test_outlines() -> None:
+    circle, triangle = outline(CIRCLE, 0, 0, 0), outline(TRIANGLE, 0, 0, 0.3)
+    assert np.linalg.norm(triangle[0] - triangle[1]) == pytest.approx(0.07)
+    assert gap(circle, circle + np.array([0.06, 0])) == pytest.approx(0.01, abs=5e-4)
+    assert gap(outline(BOOK, 0, 0, 0), outline(BOOK, 0.2, 0, 0)) == pytest.approx(-0.02)
+    turned = outline(BOOK, 0, 0, math.pi / 2)
+    assert np.abs(turned).max(axis=0).tolist() == pytest.approx([0.08, 0.11])
+    assert within(circle, turned)
+    assert not within(circle + np.array([0.07, 0]), turned)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_scenes_of_a_task_can_be_built_and_repeat(task: str) -> None:
+    drawn = scenes(task, 6, 3)
+    assert drawn.shape == (6, SCENE)
+    assert torch.equal(drawn[:4], scenes(task, 4, 3))
+    assert not torch.equal(drawn, scenes(task, 6, 4))
+    for scene in drawn.numpy():
+        assert check(scene) is not None
+        assert support(scene, CIRCLE) == (0.03 if task == PUSH_ON_BOOK else 0.0)
+
+
+def test_objects_that_a_task_does_not_need_are_there_too() -> None:
+    present = {task: scenes(task, 20, 0)[:, 0:20:4].mean(dim=0) for task in TRAINING_CONCEPTS}
+    assert all((0.1 < present[PUSH][number] < 0.95) for number in (2, 3, 4))
+    assert present[TO_BOOK][1] > 0.1
+    assert present[TO_WHITE][2] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("scene", "expected"),
+    [
+        (np.zeros(23), r"expected 24 numbers, found shape \(23,\)"),
+        (np.full(24, np.nan), "expected finite numbers"),
+        (scene_of({TRIANGLE: (0.5, 0, 0)}), "green circle, present: expected 1, found 0"),
+        (scene_of({CIRCLE: (0.45, 0, 0), TRIANGLE: (0.47, 0, 0)}), "green circle and orange triangle overlap"),
+        (scene_of({CIRCLE: (0.45, 0, 0), BOOK: (0.57, 0, 0)}), "green circle and book overlap"),
+        (scene_of({CIRCLE: (0.45, 0, 0), WHITE: (0.45, 0, 0)}), "green circle and white surface overlap"),
+        (scene_of({CIRCLE: (0.45, 0.3, 0)}), r"green circle leaves the workspace: expected y -0.24..0.24, found 0.300"),
+        (scene_of({CIRCLE: (0.45, 0, 0), BOWL: (0.77, 0, 0)}), r"purple bowl leaves the workspace: expected x 0.22..0.78"),
+        (scene_of({CIRCLE: (0.45, 0, 0)}, (0.42, 0, 0.5, 0)), r"hand: expected z 0.17..0.23, found 0.500"),
+    ],
+)
+def test_bad_scenes_are_told_in_one_line(scene: np.ndarray, expected: str, env: TableTopEnvironment) -> None:
+    with pytest.raises(UserError, match=expected) as told:
+        env.reset(options={"scene": scene})
+    assert "\n" not in str(told.value)
+
+
+def test_unknown_tasks_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "tabletop", "--task", "push green circle to book"]) == 2
+    assert "table-top task: expected one of 'pick green circle to book'" in capsys.readouterr().err
+
+
+# Physics
+
+
+def _run(env: TableTopEnvironment, scene: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    env.reset(options={"scene": scene})
+    for action in actions:
+        seen, *_, told = env.step(action)
+    return np.stack(told["trace"]), seen[IMAGE]
+
+
+def test_an_episode_is_a_function_of_scene_and_actions() -> None:
+    first, second = TableTopEnvironment(), TableTopEnvironment()
+    scene = scene_of(APART)
+    places = [(0.42 + 0.012 * step, 0.002 * step, max(0.2 - 0.02 * step, 0.014), 0.0) for step in range(25)]
+    actions = np.array(places, dtype=np.float32)
+    trace, image = _run(first, scene, actions)
+    _run(second, scenes(AROUND_BOWL, 1, 0)[0].numpy(), actions[:10])
+    again, same = _run(second, scene, actions)
+    assert np.array_equal(trace, again)
+    assert np.array_equal(image, same)
+    first._built = 200  # its simulator is started anew
+    assert np.array_equal(trace, _run(first, scene, actions)[0])
+    first.close()
+    second.close()
+
+
+def test_the_hand_goes_where_it_is_told_and_objects_rest(env: TableTopEnvironment) -> None:
+    seen, told = env.reset(
+        options={"scene": scene_of({**APART, BOOK: (0.5, 0.2, 0.1), WHITE: (0.4, -0.2, 0), BOWL: (0.6, -0.2, 0)})}
+    )
+    assert seen[POSE][:3] == pytest.approx([0.42, 0, 0.2], abs=1e-3)
+    first = told["trace"][0]
+    for _ in range(12):
+        seen, *_, told = env.step(np.array([0.5, 0.1, 0.15, 0.0], dtype=np.float32))
+    assert seen[POSE][:3] == pytest.approx([0.5, 0.1, 0.15], abs=3e-3)
+    assert seen[POSE][7] < 0.01
+    assert np.abs(told["trace"][-1][9:] - first[9:]).max() < 1e-3
+    assert not any(told[name] for name in ("touched", "lifted", "released"))
+    assert seen[IMAGE].shape == (3, 64, 64)
+    assert seen[IMAGE].dtype == np.uint8
+
+
+def test_the_camera_sees_the_objects_and_not_the_arm(env: TableTopEnvironment) -> None:
+    image = env.reset(options={"scene": scene_of({CIRCLE: (0.45, 0.1, 0)})})[0][IMAGE].astype(int)
+    green = (image[1] > image[0] + 40) & (image[1] > image[2] + 40)
+    rows, columns = green.nonzero()
+    assert 10 < len(rows) < 60
+    assert (rows.mean(), columns.mean()) == (pytest.approx(32 + 0.05 * 91, abs=2), pytest.approx(32 - 0.1 * 91, abs=2))
+    bright = (image.min(axis=0) > 190).sum()
+    assert bright == 0
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.full(4, np.nan)])
+def test_bad_actions_are_told(action: np.ndarray, env: TableTopEnvironment) -> None:
+    env.reset(options={"scene": scene_of(APART)})
+    with pytest.raises(UserError, match=f"expected {ACTION} finite numbers"):
+        env.step(action)
+
+
+def test_a_simulator_that_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pybullet.connect", lambda *_: -1)
+    with pytest.raises(UserError, match="table-top: the physics simulator does not start"):
+        TableTopEnvironment()
+
+
+# Success
+
+
+def _told(circle: tuple[float, float, float], **more: Any) -> dict[str, Any]:
+    found = {
+        "circle": np.array(circle),
+        "triangle": np.array([0.6, 0.0, 0.015]),
+        "book": 0.0,
+        "book place": np.array([0.5, 0.1, 0.015]),
+    }
+    return {**found, "touched": False, "lifted": True, "released": True, **more}
+
+
+PLACED = scene_of(
+    {CIRCLE: (0.4, -0.1, 0), BOOK: (0.5, 0.1, 0), WHITE: (0.6, -0.15, 0), BOWL: (0.45, -0.2, 0), TRIANGLE: (0.6, 0, 0)}
+)
+
+
+@pytest.mark.parametrize(
+    ("task", "told", "expected"),
+    [
+        (TO_BOOK, _told((0.5, 0.1, 0.045)), True),
+        (TO_BOOK, _told((0.5, 0.19, 0.045)), False),
+        (TO_BOOK, _told((0.5, 0.1, 0.015)), False),
+        (TO_BOOK, _told((0.5, 0.1, 0.045), released=False), False),
+        (TO_BOOK, _told((0.5, 0.1, 0.045), lifted=False), False),
+        (TO_WHITE, _told((0.65, -0.15, 0.075)), True),
+        (TO_WHITE, _told((0.68, -0.15, 0.075)), False),
+        (BESIDE_BOWL, _told((0.55, -0.2, 0.015)), True),
+        (BESIDE_BOWL, _told((0.61, -0.2, 0.015)), False),
+        (PUSH, _told((0.55, 0, 0.015), touched=True), True),
+        (PUSH, _told((0.55, 0, 0.015)), False),
+        (PUSH, _told((0.55, 0, 0.045), touched=True), False),
+        (PUSH_ON_BOOK, _told((0.55, 0, 0.045), touched=True, triangle=np.array([0.6, 0, 0.045])), True),
+        (PUSH_ON_BOOK, _told((0.55, 0, 0.015), touched=True), False),
+        (PUSH, {}, False),
+    ],
+)
+def test_success_is_judged_by_poses(task: str, told: dict[str, Any], expected: bool) -> None:
+    assert judged(task, PLACED, told) is expected
+
+
+def test_a_moved_book_is_told_and_a_failed_episode_is_no_success() -> None:
+    infos = [_told((0.55, 0, 0.015), touched=True), _told((0.55, 0, 0.015), touched=True, book=0.021), {}]
+    starts = InitialStates({}, torch.from_numpy(np.stack([PLACED] * 3)))
+    found = judge(PUSH, Rollout(starts, {}, torch.tensor([True, False, False]), infos))
+    assert found["success"].tolist() == [False, True, False]
+    assert found["book moved"].tolist() == [False, True, False]
+
+
+# Experts
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_experts_succeed(task: str, env: TableTopEnvironment) -> None:
+    for number, scene in enumerate(scenes(task, 3, 11).numpy()):
+        episode = experts.perform(env, task, scene, np.random.default_rng(number))
+        assert episode.success
+        assert episode.commands[0].tolist() == pytest.approx([*scene[HAND][:3], 0.08])
+        assert np.linalg.norm(np.diff(episode.commands[:, :3], axis=0), axis=-1).max() < 0.0201
+        assert np.median(np.abs(episode.commands[:, :3] - episode.poses[:, :3])) < 0.005
+        assert len(episode.images) == len(episode.commands)
+
+
+def test_pushing_at_the_height_of_the_table_moves_the_book(env: TableTopEnvironment) -> None:
+    scene = scenes(PUSH_ON_BOOK, 1, 1)[0].numpy()
+    assert not experts.perform(env, PUSH_ON_BOOK, scene, np.random.default_rng(0), height=experts.PUSH_HEIGHT).success
+    assert env._told()["book"] > 0.02
+
+
+# Demonstrations
+
+
+def test_demonstrations_with_images_go_through_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert main(["generate", "tabletop", "--task", PUSH_ON_BOOK, "--count", "2", "--out", "demos.safetensors"]) == 0
+    read = Demonstrations.load(tmp_path / "demos.safetensors")
+    assert read.features == dict(DOMAIN.observed)
+    assert read.observed[IMAGE].dtype == torch.uint8
+    assert read.states.shape[2] == ACTION
+    assert read.scenes is not None
+    monkeypatch.setattr(source, "perform", lambda *_: pytest.fail("made again"))
+    again = DOMAIN.source(None).draw(PUSH_ON_BOOK, 2, 0)
+    assert again.hash == read.hash
+    # What is seen in the beginning is what the environment shows in the same scene.
+    starts = source.initial_states(read.scenes)
+    assert torch.equal(starts.observed[IMAGE], read.observed[IMAGE][:, 0])
+    assert torch.equal(starts.observed[POSE], read.observed[POSE][:, 0])
+
+
+def test_a_simulator_that_raises_costs_its_episode_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = source.perform
+    calls: list[str] = []
+
+    def fragile(*arguments: Any) -> experts.Episode:
+        calls.append("")
+        if len(calls) == 1:
+            raise RuntimeError("the simulator broke")
+        return kept(*arguments)
+
+    monkeypatch.setattr(source, "perform", fragile)
+    made = source.demonstrations(PUSH_ON_BOOK, 1, 5, 1, lambda: None)
+    assert made.provenance["rejected"] == 1
+
+
+# Closed loop
+
+
+def test_hand_made_plans_in_closed_loop() -> None:
+    assert LOOP is not None
+    starts = source.initial_states(torch.from_numpy(np.stack([scene_of(APART)] * 2)))
+    push = [(0.39, 0.0, 0.06)] * 9 + [(0.39, 0.0, 0.014)] * 4 + [(0.39 + 0.01 * step, 0.0, 0.014) for step in range(40)]
+    plan = torch.tensor([(*place, 0.0) for place in push])
+    still = plan[:1].repeat(len(plan), 1)
+    follower = PlanFollower(fixed_plans(torch.stack([plan, still])), act, 200)
+    rollout = roll_out(LOOP, starts, follower)
+    assert DOMAIN.judge(PUSH, rollout)["success"].tolist() == [True, False]
+    assert set(rollout.observed) == {POSE}
+    assert LOOP.film is not None
+    frames = LOOP.film(rollout.take(0, 1), torch.stack(follower.followed[0]))
+    assert 2 < len(frames) <= 60
+    assert frames[0].shape == (240, 320, 3)
+    assert (frames[0] == (255, 0, 90)).all(axis=-1).any()  # the plan
+    figure = DOMAIN.show.picture(torch.stack([plan, still]), [True, False], "two plans", starts)
+    assert len(figure.axes) == 2
+
+
+def test_reference_lines() -> None:
+    assert LOOP is not None
+    starts = DOMAIN.source(None).starts(PUSH_ON_BOOK, 2, 1)
+    assert starts is not None
+    expert = LOOP.policies["expert (oracle)"](PUSH_ON_BOOK, starts, None, 0)
+    assert expert is not None
+    assert DOMAIN.judge(PUSH_ON_BOOK, roll_out(LOOP, starts, expert))["success"].all()
+    assert LOOP.policies["table-height push"](PUSH, starts, None, 0) is None
+    assert LOOP.policies["straight push"](TO_BOOK, starts, None, 0) is None
+
+
+def test_every_description_has_an_embedding() -> None:
+    from ftl_lightning.concepts.encoder import load_encoder
+
+    assert len(load_encoder("table", DOMAIN.concepts.table)(DOMAIN.concepts.descriptions)) == len(TASKS)
+    assert [int(columns.start) for columns in COLUMNS.values()] == [0, 4, 8, 12, 16]
