@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: as on the command line, without the program's name.
 
     Returns:
-        Exit code: 0, or 2 for a mistake of the user's, told in one line on standard error.
+        Exit code: 0; 2 for a mistake of the user's, or 130 where the user stopped it, told in one line on standard error.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     # Nothing is ever unpickled, whatever a library's default is.
@@ -57,9 +57,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ArgumentError as error:
         print(f"error: {_one_line(str(error), arguments)}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return _interrupted()
     except SystemExit as stop:  # after --help and --print_config
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning's way
+            return _interrupted()
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     return 0
+
+
+def _interrupted() -> int:
+    print("interrupted: what was written before is whole", file=sys.stderr)
+    return 130
 
 
 def _one_line(message: str, arguments: list[str]) -> str:

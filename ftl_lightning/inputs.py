@@ -23,8 +23,8 @@ def _model(path: str) -> None:
 
 
 def _checkpoint(path: str) -> None:
-    if path not in ("last", "best") and not Path(path).is_file():
-        raise UserError(f"ckpt_path: expected a checkpoint file, 'last' or 'best', found {path!r}, which does not exist")
+    if path != "last" and not Path(path).is_file():
+        raise UserError(f"ckpt_path: expected a checkpoint file or 'last', found {path!r}, which does not exist")
 
 
 def _demonstrations(path: str) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
-import torch
 from jsonargparse import Namespace, set_parsing_settings
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -15,6 +14,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.trainer import Trainer
 from ftl_lightning.training_bar import TrainingBar, accuracies
 
@@ -63,29 +63,36 @@ class CommandLine(LightningCLI):
         """Say where the run was logged."""
         print(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
+    def before_fit(self) -> None:
+        """Find the last checkpoint, if it is asked for."""
+        self._find_last()
+
+    before_invert = before_fit
+
     def before_validate(self) -> None:
         """A checkpoint is needed; Lightning would evaluate random weights."""
-        self._need_checkpoint()
+        self._find_last()
+        if not self.config_init[self._verb].get("ckpt_path"):
+            raise UserError(f"ckpt_path: {self._verb} expected a checkpoint file, found none; give --ckpt_path FILE")
 
-    def before_test(self) -> None:
-        """The same."""
-        self._need_checkpoint()
+    before_test = before_validate
 
-    def _need_checkpoint(self) -> None:
-        if not self.config[self.config.subcommand].get("ckpt_path"):
-            raise UserError(f"ckpt_path: {self.config.subcommand} expected a checkpoint file, found none; give --ckpt_path FILE")
+    def _find_last(self) -> None:
+        """Put the path of the last checkpoint in place of its name; a run that has none yet starts anew and says so."""
+        options = self.config_init[self._verb]
+        if options.get("ckpt_path") == "last":
+            options["ckpt_path"] = last_checkpoint(self.trainer)
+            if options["ckpt_path"] is None and self._verb in ("fit", "invert"):
+                print(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
 
     def _parse_ckpt_path(self) -> None:
         # Lightning would let the checkpoint's hyper-parameters, class included, override configuration and command line.
         # Here the configuration rules, and a checkpoint of another class is refused.
         path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
-        if path and path not in ("last", "best"):
+        if path and path != "last":
             if not Path(path).is_file():
-                raise UserError(f"ckpt_path: expected a checkpoint file, 'last' or 'best', found {path!r}, which does not exist")
-            try:
-                torch.load(path, weights_only=True, map_location="cpu")
-            except Exception as error:  # torch raises several kinds, none of its own
-                raise UserError(f"{path}: expected a checkpoint, found a damaged or foreign file") from error
+                raise UserError(f"ckpt_path: expected a checkpoint file or 'last', found {path!r}, which does not exist")
+            read_checkpoint(path)
 
 
 class _Inversion(CommandLine):

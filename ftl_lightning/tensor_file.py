@@ -120,6 +120,17 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
     return tensors, header
 
 
+def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
+    """Refuse numbers that are none.
+
+    Raises:
+        UserError: naming the first tensor that holds one.
+    """
+    for name, value in tensors.items():
+        if not value.isfinite().all():
+            raise UserError(f"{where}: expected finite numbers, found others in {name!r}; {advice}")
+
+
 def bytes_hash(content: bytes) -> str:
     """First 16 hexadecimal digits of the SHA-256."""
     return hashlib.sha256(content).hexdigest()[:16]

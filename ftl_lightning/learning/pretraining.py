@@ -28,10 +28,11 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import expect_finite
 
 
 class Pretraining(pl.LightningModule, ABC):
@@ -80,6 +81,9 @@ class Pretraining(pl.LightningModule, ABC):
         self.guidance = guidance
         self.model: ConceptModel
         self.raw: ConceptModel
+        self._validated = False
+        self._random: Random | None = None
+        self._from = 0
 
     @abstractmethod
     def build(
@@ -167,6 +171,24 @@ class Pretraining(pl.LightningModule, ABC):
             self.model.eval()
         return self
 
+    def on_train_start(self) -> None:
+        """Look at what was restored, if anything."""
+        check_restored(self, self._from)
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Let a resumed run draw what the unbroken one draws: dropout takes from the global generators.
+
+        Here and not earlier, since beginning to iterate a loader draws from them too.
+        """
+        self._validated = False
+        if self._random is not None:
+            self._random.restore(self.device)
+            self._random = None
+
+    def on_validation_start(self) -> None:
+        """Take note that a checkpoint from now on is one after validation."""
+        self._validated = True
+
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
         loss = self.losses(self.raw, batch, draw).mean()
@@ -239,12 +261,23 @@ class Pretraining(pl.LightningModule, ABC):
         return self.model.named_embeddings()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint."""
+        """Sign the checkpoint, and keep where the global generators stand.
+
+        Raises:
+            UserError: if a parameter is not finite; the checkpoint that is there stays.
+        """
+        found = checkpoint["state_dict"]
+        expect_finite(found, f"training: step {self.global_step}", "nothing was saved of it; lower model.learning_rate")
         sign(self, checkpoint, self._signature())
+        loop = self.trainer.fit_loop
+        validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
+        Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module or of a model of another form."""
         check_signature(self, checkpoint, self._signature())
+        check_parameters(checkpoint["state_dict"], self)
+        self._random, self._from = Random.read(checkpoint), checkpoint["global_step"]
 
     def _signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
