@@ -96,7 +96,7 @@ def _dispatch(arguments: list[str]) -> None:
     elif verb == "--version":
         print(__version__)
     elif verb in COMMANDS:
-        inputs.check_inputs(arguments[1:], inputs.COMMANDS)
+        inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli
 
         commands = importlib.import_module("ftl_lightning.commands")

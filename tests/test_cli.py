@@ -1,6 +1,8 @@
 """The command line: help, configuration files, and every mistake of a user's as one clear line with exit code 2."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -397,3 +399,57 @@ def test_modes_and_tolerances_that_are_none_are_one_clear_line(
     told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", option)
     assert expected in told
     assert not list(Path().rglob("concepts"))
+
+
+# Outputs, and Ctrl-C
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key"),
+    [
+        (["generate", "object_rearrangement", "--count=1000000000", "--out=pipe.safetensors"], "out"),
+        (["sample", "--pretrained=object_rearrangement", "--out=pipe.safetensors"], "out"),
+        (["sample", "--pretrained=object_rearrangement", "--figure=pipe.safetensors"], "figure"),
+        (["sample", "--pretrained=object_rearrangement", "--animation", "link"], "animation"),
+        (["encode", "object_rearrangement", "--out=folder"], "out"),
+        (["report", "--out=pipe.safetensors"], "out"),
+        (["fit", "--config", PRETRAINING, "--model.output=pipe.safetensors"], "model.output"),
+        (["test", "--config", PRETRAINING, "--evaluation.results=link"], "evaluation.results"),
+        (["invert", "--config", INVERSION, "--evaluation.results=folder"], "evaluation.results"),
+    ],
+)
+def test_outputs_that_are_no_files_are_refused_before_any_work(
+    arguments: list[str], key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo("pipe.safetensors")
+    Path("folder").mkdir()
+    Path("link").symlink_to("pipe.safetensors")
+    told = error(capsys, *arguments)
+    assert told.startswith(f"error: {key}: ")
+    assert "or nothing there, found a " in told
+    assert told.count("\n") == 1
+    assert Path("pipe.safetensors").is_fifo()
+    assert len(list(Path().iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["generate", "object_rearrangement", "--count=1"], ["fit", "--config", PRETRAINING, *TINY, "--trainer.max_steps=9"]],
+)
+def test_ctrl_c_is_one_line_and_130(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from ftl_lightning.learning import PretrainingModule
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PretrainingModule, "training_step", stop)
+    monkeypatch.setattr(Demonstrations, "save", stop)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert main(arguments) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)  # Lightning ignores it from then on
+    assert capsys.readouterr().err == "interrupted: what was written before is whole\n"
+    assert not list(Path().rglob("*.safetensors"))

@@ -14,7 +14,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import atomic, expect_finite
+from ftl_lightning.tensor_file import atomic, expect_finite, visible
 
 _KEY = "belongs_to"
 _RANDOM = "random"
@@ -111,8 +111,8 @@ def _is_whole(path: Path) -> bool:
 
 
 def _beside(path: Path) -> list[Path]:
-    """Other checkpoints of the folder; hidden files are what a killed run left half-written."""
-    return [other for other in path.parent.glob("*.ckpt") if other.name != path.name and not other.name.startswith(".")]
+    """Other checkpoints of the folder."""
+    return [other for other in visible(path.parent, "*.ckpt") if other.name != path.name]
 
 
 def last_checkpoint(trainer: pl.Trainer) -> Path | None:
@@ -143,9 +143,7 @@ def check_parameters(found: Mapping[str, Any], module: pl.LightningModule, optio
             raise UserError(f"ckpt_path: key 'state_dict', {name!r}: {shapes}; it is damaged")
     # Losses that a concept has not reached yet are infinite.
     own = [name for name, _ in module.named_parameters() if name in found] if optional else list(found)
-    expect_finite(
-        {name: found[name] for name in numbers if name in found}, "ckpt_path: key 'state_dict'", "take an older checkpoint"
-    )
+    expect_finite({name: found[name] for name in own}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
 
 
 def check_restored(module: pl.LightningModule, step: int) -> None:
