@@ -9,6 +9,8 @@ from argparse import ArgumentError
 from collections.abc import Sequence
 from typing import Any
 
+from omegaconf.errors import OmegaConfBaseException
+
 from ftl_lightning import inputs
 from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError
@@ -53,6 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _dispatch(arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OmegaConfBaseException as error:
+        print(f"error: configuration: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
     except ArgumentError as error:
         print(f"error: {_one_line(str(error), arguments)}", file=sys.stderr)

@@ -49,6 +49,8 @@ def _written(key: str, expect: Callable[[str, str], None] = expect_file) -> Chec
     def check(path: str) -> None:
         if not path.startswith("minari:"):
             expect(path, key)
+        if key == "out" and path.endswith(".npz"):
+            raise UserError(f"{key}: expected a name that ends in .safetensors, which is what is written, found {path!r}")
 
     return check
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 from jsonargparse import Namespace, set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
@@ -15,6 +16,7 @@ from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
+from ftl_lightning.ranges import expect_range
 from ftl_lightning.trainer import Trainer
 from ftl_lightning.training_bar import TrainingBar, accuracies
 
@@ -33,6 +35,21 @@ class CommandLine(LightningCLI):
         """One seed for everything, unless a configuration says otherwise, and the evaluator's options."""
         parser.add_lightning_class_args(Evaluator, "evaluation")
         parser.set_defaults({"seed_everything": 0, "trainer.enable_model_summary": False})
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse them, and refuse a seed that numpy does not take."""
+        super().parse_arguments(parser, args)
+        verb = self.config.get("subcommand")
+        seed = (self.config[verb] if verb else self.config).get("seed_everything")
+        if isinstance(seed, int) and not isinstance(seed, bool):
+            expect_range("seed_everything", seed, 0, 2**32 - 1)
+
+    def instantiate_classes(self) -> None:
+        """Build everything; Lightning logs the seeds of model and data as one."""
+        super().instantiate_classes()
+        model, data = (getattr(one, "hparams", {}).get("seed") for one in (self.model, self.datamodule))
+        if model is not None and data is not None and model != data:
+            raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
         """The trainer, with our progress bar in place of Lightning's."""
@@ -162,6 +179,8 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
         raise UserError(
             f"{error.filename or 'output'}: {error.strerror or error}; choose a place that exists, is writable and has room"
         ) from error
+    except MisconfigurationException as error:
+        raise UserError(f"trainer: {' '.join(str(error).split())[:200]}") from error
     except Exception as error:
         if mistake := mistake_behind(error):
             raise mistake from None

@@ -10,6 +10,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
+from ftl_lightning.ranges import expect_range
 
 
 class Trainer(pl.Trainer):
@@ -30,6 +31,12 @@ class Trainer(pl.Trainer):
         """As Lightning's, for what learns."""
         if isinstance(model, Adaptation) and not model.learns:
             raise UserError(f"verb: expected invert (model.class_path: {type(model).__name__} learns nothing), found fit")
+        for key, length in (("max_steps", self.max_steps), ("max_epochs", self.max_epochs)):
+            if length == 0:
+                raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
+        if self.limit_train_batches == 0:
+            raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
+        expect_range("trainer.gradient_clip_val", self.gradient_clip_val or 0, 0)
         with self._restoring():
             super().fit(model, *arguments, **options)
 

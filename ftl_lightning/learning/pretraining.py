@@ -31,6 +31,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.ranges import expect_range
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import expect_finite
 
@@ -43,7 +44,7 @@ class Pretraining(pl.LightningModule, ABC):
 
     Args:
         learning_rate: of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
-        warmup_steps: of the learning rate.
+        warmup_steps: of the learning rate; 0 for none.
         weight_decay: of AdamW.
         ema_decay: of the running average; it starts lower.
         guidance: weight omega with which training concepts are generated in evaluation.
@@ -52,6 +53,9 @@ class Pretraining(pl.LightningModule, ABC):
         perturb: learn from presents that the view perturbs, here and in inversion.
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and what is random in the loss as a function of the step.
+
+    Raises:
+        UserError: at construction, for a value out of its range.
     """
 
     method: str
@@ -77,6 +81,15 @@ class Pretraining(pl.LightningModule, ABC):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
+        for name, value, most in (
+            ("learning_rate", learning_rate, math.inf),
+            ("warmup_steps", warmup_steps, math.inf),
+            ("weight_decay", weight_decay, math.inf),
+            ("ema_decay", ema_decay, 1),
+            ("seed", seed, math.inf),
+        ):
+            expect_range(f"model.{name}", value, 0, most)
+        expect_range("model.guidance", guidance)
         self.seed = seed
         self.guidance = guidance
         self.model: ConceptModel
@@ -221,7 +234,7 @@ class Pretraining(pl.LightningModule, ABC):
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with warm-up and cosine decay."""
         total = int(self.trainer.estimated_stepping_batches)
-        warmup = min(self.hparams["warmup_steps"], max(total // 10, 1))
+        warmup = max(min(self.hparams["warmup_steps"], total // 10), 1)
         optimizer = torch.optim.AdamW(
             self.raw.parameters(),
             lr=self.hparams["learning_rate"],
@@ -394,6 +407,10 @@ class PretrainingModule(Pretraining):
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         if not 0 <= code_share <= 1:
             raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
+        expect_range("model.condition_dropout", condition_dropout, 0, 1)
+        expect_range("model.code_noise", code_noise, 0)
+        for name, count in (("diffusion_steps", diffusion_steps), ("code_knots", code_knots), ("code_size", code_size)):
+            expect_range(f"model.{name}", count, 1)
         self.codes = Codes(code_share, code_knots, code_size, code_noise) if code_share else None
 
     def build(
