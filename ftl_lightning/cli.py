@@ -9,6 +9,8 @@ from argparse import ArgumentError
 from collections.abc import Sequence
 from typing import Any
 
+from omegaconf.errors import OmegaConfBaseException
+
 from ftl_lightning import inputs
 from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError
@@ -44,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: as on the command line, without the program's name.
 
     Returns:
-        Exit code: 0, or 2 for a mistake of the user's, told in one line on standard error.
+        Exit code: 0; 2 for a mistake of the user's, or 130 where the user stopped it, told in one line on standard error.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     # Nothing is ever unpickled, whatever a library's default is.
@@ -54,12 +56,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OmegaConfBaseException as error:
+        print(f"error: configuration: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
     except ArgumentError as error:
         print(f"error: {_one_line(str(error), arguments)}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return _interrupted()
     except SystemExit as stop:  # after --help and --print_config
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning's way
+            return _interrupted()
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     return 0
+
+
+def _interrupted() -> int:
+    print("interrupted: what was written before is whole", file=sys.stderr)
+    return 130
 
 
 def _one_line(message: str, arguments: list[str]) -> str:
@@ -87,7 +101,7 @@ def _dispatch(arguments: list[str]) -> None:
     elif verb == "--version":
         print(__version__)
     elif verb in COMMANDS:
-        inputs.check_inputs(arguments[1:], inputs.COMMANDS)
+        inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli
 
         commands = importlib.import_module("ftl_lightning.commands")

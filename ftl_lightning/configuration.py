@@ -39,7 +39,7 @@ def find(path: str | Path) -> Path:
 
 def _near(path: str | Path) -> str:
     """What the nearest folder holds, to help with a wrong name; nothing for the current folder."""
-    parent = next(parent for parent in Path(path).parents if shipped(parent).is_dir())
+    parent = next((parent for parent in Path(path).parents if shipped(parent).is_dir()), Path())  # an empty name has none
     folder = shipped(parent)
     there = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() or entry.suffix == ".yaml")
     return f"; {parent} holds {', '.join(there)}" if there and folder.resolve() != Path.cwd() else ""

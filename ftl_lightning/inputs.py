@@ -1,4 +1,4 @@
-"""Input files that a command line names, looked for before anything slow is imported."""
+"""Files that a command line names, looked at before anything slow is imported: what is read is there, what is written no device."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,6 +8,7 @@ from typing import Any
 from ftl_lightning.configuration import configurations, load
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import pretrained_folder, shipped_models
+from ftl_lightning.targets import expect_file, expect_folder
 
 Check = Callable[[str], None]
 """Raises a :class:`UserError` for a path where nothing is that could be meant."""
@@ -23,8 +24,8 @@ def _model(path: str) -> None:
 
 
 def _checkpoint(path: str) -> None:
-    if path not in ("last", "best") and not Path(path).is_file():
-        raise UserError(f"ckpt_path: expected a checkpoint file, 'last' or 'best', found {path!r}, which does not exist")
+    if path != "last" and not Path(path).is_file():
+        raise UserError(f"ckpt_path: expected a checkpoint file or 'last', found {path!r}, which does not exist")
 
 
 def _demonstrations(path: str) -> None:
@@ -44,18 +45,45 @@ def _file(kind: str) -> Check:
     return check
 
 
+def _written(key: str, expect: Callable[[str, str], None] = expect_file) -> Check:
+    def check(path: str) -> None:
+        if not path.startswith("minari:"):
+            expect(path, key)
+        if key == "out" and path.endswith(".npz"):
+            raise UserError(f"{key}: expected a name that ends in .safetensors, which is what is written, found {path!r}")
+
+    return check
+
+
 TRAINER: Mapping[str, Check] = {
     "model.pretrained": _model,
     "data.demonstrations": _demonstrations,
     "ckpt_path": _checkpoint,
+    "model.output": _written("model.output", expect_folder),
+    "evaluation.results": _written("evaluation.results"),
 }
 """Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
-COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _file("demonstrations")}
-"""Of the others."""
+_COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _file("demonstrations")}
+_OUT: Mapping[str, Check] = {"out": _written("out")}
+_FOLDER: Mapping[str, Check] = {"out": _written("out", expect_folder)}
+_WRITTEN: Mapping[str, Mapping[str, Check]] = {
+    "generate": _OUT,
+    "encode": _OUT,
+    "sample": {**_OUT, "figure": _written("figure"), "animation": _written("animation")},
+    "ablate": {"results": _written("results")},
+    "report": {**_FOLDER, "readme": _file("Markdown")},
+    "prepare": _FOLDER,
+    "study": _FOLDER,
+}
+
+
+def command_checks(verb: str) -> Mapping[str, Check]:
+    """Those of a verb that needs no trainer."""
+    return {**_COMMANDS, **_WRITTEN.get(verb, {})}
 
 
 def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
-    """Refuse a command line, its configuration files included, that names input files that are not there.
+    """Refuse a command line, its configuration files included, that names input files that are not there or outputs that are none.
 
     Args:
         arguments: those of a verb, without it.

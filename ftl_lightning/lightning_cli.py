@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
-import torch
 from jsonargparse import Namespace, set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
+from ftl_lightning.ranges import expect_range
 from ftl_lightning.trainer import Trainer
 from ftl_lightning.training_bar import TrainingBar, accuracies
 
@@ -33,6 +35,21 @@ class CommandLine(LightningCLI):
         """One seed for everything, unless a configuration says otherwise, and the evaluator's options."""
         parser.add_lightning_class_args(Evaluator, "evaluation")
         parser.set_defaults({"seed_everything": 0, "trainer.enable_model_summary": False})
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse them, and refuse a seed that numpy does not take."""
+        super().parse_arguments(parser, args)
+        verb = self.config.get("subcommand")
+        seed = (self.config[verb] if verb else self.config).get("seed_everything")
+        if isinstance(seed, int) and not isinstance(seed, bool):
+            expect_range("seed_everything", seed, 0, 2**32 - 1)
+
+    def instantiate_classes(self) -> None:
+        """Build everything; Lightning logs the seeds of model and data as one."""
+        super().instantiate_classes()
+        model, data = (getattr(one, "hparams", {}).get("seed") for one in (self.model, self.datamodule))
+        if model is not None and data is not None and model != data:
+            raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
         """The trainer, with our progress bar in place of Lightning's."""
@@ -63,29 +80,36 @@ class CommandLine(LightningCLI):
         """Say where the run was logged."""
         print(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
+    def before_fit(self) -> None:
+        """Find the last checkpoint, if it is asked for."""
+        self._find_last()
+
+    before_invert = before_fit
+
     def before_validate(self) -> None:
         """A checkpoint is needed; Lightning would evaluate random weights."""
-        self._need_checkpoint()
+        self._find_last()
+        if not self.config_init[self._verb].get("ckpt_path"):
+            raise UserError(f"ckpt_path: {self._verb} expected a checkpoint file, found none; give --ckpt_path FILE")
 
-    def before_test(self) -> None:
-        """The same."""
-        self._need_checkpoint()
+    before_test = before_validate
 
-    def _need_checkpoint(self) -> None:
-        if not self.config[self.config.subcommand].get("ckpt_path"):
-            raise UserError(f"ckpt_path: {self.config.subcommand} expected a checkpoint file, found none; give --ckpt_path FILE")
+    def _find_last(self) -> None:
+        """Put the path of the last checkpoint in place of its name; a run that has none yet starts anew and says so."""
+        options = self.config_init[self._verb]
+        if options.get("ckpt_path") == "last":
+            options["ckpt_path"] = last_checkpoint(self.trainer)
+            if options["ckpt_path"] is None and self._verb in ("fit", "invert"):
+                print(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
 
     def _parse_ckpt_path(self) -> None:
         # Lightning would let the checkpoint's hyper-parameters, class included, override configuration and command line.
         # Here the configuration rules, and a checkpoint of another class is refused.
         path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
-        if path and path not in ("last", "best"):
+        if path and path != "last":
             if not Path(path).is_file():
-                raise UserError(f"ckpt_path: expected a checkpoint file, 'last' or 'best', found {path!r}, which does not exist")
-            try:
-                torch.load(path, weights_only=True, map_location="cpu")
-            except Exception as error:  # torch raises several kinds, none of its own
-                raise UserError(f"{path}: expected a checkpoint, found a damaged or foreign file") from error
+                raise UserError(f"ckpt_path: expected a checkpoint file or 'last', found {path!r}, which does not exist")
+            read_checkpoint(path)
 
 
 class _Inversion(CommandLine):
@@ -155,6 +179,8 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
         raise UserError(
             f"{error.filename or 'output'}: {error.strerror or error}; choose a place that exists, is writable and has room"
         ) from error
+    except MisconfigurationException as error:
+        raise UserError(f"trainer: {' '.join(str(error).split())[:200]}") from error
     except Exception as error:
         if mistake := mistake_behind(error):
             raise mistake from None

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.errors import UserError
+from ftl_lightning.targets import expect_file
 
 _HEADER = "ftl_lightning"
 FORMAT = 1
@@ -30,10 +31,13 @@ def cache_folder() -> Path:
 def atomic(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name in the same folder, renamed to ``path`` when the block ends well and removed when it does not.
 
+    A symbolic link stays one: the file that it leads to is replaced. Temporary names are hidden ones (see :func:`visible`).
+
     Raises:
-        UserError: where the folder cannot be written or the disk is full.
+        UserError: where the folder cannot be written or the disk is full, or ``path`` is there and no file.
     """
-    path = Path(path)
+    expect_file(path)
+    path = Path(path).resolve() if Path(path).is_symlink() else Path(path)
     temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,6 +54,15 @@ def atomic(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """Paths below a folder that match, in their order, without hidden ones and those in hidden folders.
+
+    Hidden are the temporary names of :func:`atomic`, which a process that was killed leaves behind.
+    """
+    found = sorted(folder.glob(pattern))
+    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
 
 def _umask() -> int:
@@ -118,6 +131,17 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
         expected = " or ".join(map(str, versions))
         raise UserError(f"{path}: key 'format': expected {expected}, found {header.get('format')!r}; it is of another version")
     return tensors, header
+
+
+def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
+    """Refuse numbers that are none.
+
+    Raises:
+        UserError: naming the first tensor that holds one.
+    """
+    for name, value in tensors.items():
+        if not value.isfinite().all():
+            raise UserError(f"{where}: expected finite numbers, found others in {name!r}; {advice}")
 
 
 def bytes_hash(content: bytes) -> str:

@@ -1,11 +1,16 @@
 """Lightning's trainer with one more verb."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import lightning.pytorch as pl
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.checkpoint import WholeCheckpoints
+from ftl_lightning.ranges import expect_range
 
 
 class Trainer(pl.Trainer):
@@ -17,11 +22,48 @@ class Trainer(pl.Trainer):
 
     verb = "fit"
 
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
+            self.strategy.checkpoint_io = WholeCheckpoints()
+
     def fit(self, model: pl.LightningModule, *arguments: Any, **options: Any) -> None:
         """As Lightning's, for what learns."""
         if isinstance(model, Adaptation) and not model.learns:
             raise UserError(f"verb: expected invert (model.class_path: {type(model).__name__} learns nothing), found fit")
-        super().fit(model, *arguments, **options)
+        for key, length in (("max_steps", self.max_steps), ("max_epochs", self.max_epochs)):
+            if length == 0:
+                raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
+        if self.limit_train_batches == 0:
+            raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
+        expect_range("trainer.gradient_clip_val", self.gradient_clip_val or 0, 0)
+        with self._restoring():
+            super().fit(model, *arguments, **options)
+
+    def validate(self, *arguments: Any, **options: Any) -> Any:
+        """As Lightning's."""
+        with self._restoring():
+            return super().validate(*arguments, **options)
+
+    def test(self, *arguments: Any, **options: Any) -> Any:
+        """As Lightning's."""
+        with self._restoring():
+            return super().test(*arguments, **options)
+
+    @contextmanager
+    def _restoring(self) -> Iterator[None]:
+        """Tell in one line what Lightning and torch raise, each in its own way, of a checkpoint that they cannot restore."""
+        try:
+            yield
+        except UserError:
+            raise
+        except Exception as error:
+            if not self._checkpoint_connector._loaded_checkpoint:  # which is let go of as soon as all of it is restored
+                raise
+            told = " ".join(f"{type(error).__name__}: {error}".split())[:150]
+            raise UserError(
+                f"{self.ckpt_path}: expected a checkpoint of a run like this one, found one that cannot be restored ({told})"
+            ) from error
 
     def invert(self, model: Adaptation, datamodule: pl.LightningDataModule, ckpt_path: str | None = None) -> None:
         """Learn the concepts, write them to files, then generate and judge.

@@ -1,6 +1,8 @@
 """The command line: help, configuration files, and every mistake of a user's as one clear line with exit code 2."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -397,3 +399,164 @@ def test_modes_and_tolerances_that_are_none_are_one_clear_line(
     told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", option)
     assert expected in told
     assert not list(Path().rglob("concepts"))
+
+
+# Outputs, and Ctrl-C
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key"),
+    [
+        (["generate", "object_rearrangement", "--count=1000000000", "--out=pipe.safetensors"], "out"),
+        (["sample", "--pretrained=object_rearrangement", "--out=pipe.safetensors"], "out"),
+        (["sample", "--pretrained=object_rearrangement", "--figure=pipe.safetensors"], "figure"),
+        (["sample", "--pretrained=object_rearrangement", "--animation", "link"], "animation"),
+        (["encode", "object_rearrangement", "--out=folder"], "out"),
+        (["report", "--out=pipe.safetensors"], "out"),
+        (["fit", "--config", PRETRAINING, "--model.output=pipe.safetensors"], "model.output"),
+        (["test", "--config", PRETRAINING, "--evaluation.results=link"], "evaluation.results"),
+        (["invert", "--config", INVERSION, "--evaluation.results=folder"], "evaluation.results"),
+    ],
+)
+def test_outputs_that_are_no_files_are_refused_before_any_work(
+    arguments: list[str], key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo("pipe.safetensors")
+    Path("folder").mkdir()
+    Path("link").symlink_to("pipe.safetensors")
+    told = error(capsys, *arguments)
+    assert told.startswith(f"error: {key}: ")
+    assert "or nothing there, found a " in told
+    assert told.count("\n") == 1
+    assert Path("pipe.safetensors").is_fifo()
+    assert len(list(Path().iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["generate", "object_rearrangement", "--count=1"], ["fit", "--config", PRETRAINING, *TINY, "--trainer.max_steps=9"]],
+)
+def test_ctrl_c_is_one_line_and_130(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from ftl_lightning.learning import PretrainingModule
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PretrainingModule, "training_step", stop)
+    monkeypatch.setattr(Demonstrations, "save", stop)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert main(arguments) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)  # Lightning ignores it from then on
+    assert capsys.readouterr().err == "interrupted: what was written before is whole\n"
+    assert not list(Path().rglob("*.safetensors"))
+
+
+# Options out of their ranges
+
+SHORT = [*TINY, "--trainer.max_steps=2", "--data.steps_per_epoch=1", "--evaluation.samples=2", "--evaluation.figures=0"]
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--seed_everything=-1",
+        "--seed_everything=99999999999",
+        "--model.seed=-1",
+        "--model.seed=1",
+        "--model.warmup_steps=-1",
+        "--trainer.max_steps=0",
+        "--trainer.max_steps=-5",
+        "--trainer.max_epochs=0",
+        "--trainer.limit_train_batches=0",
+        "--trainer.gradient_clip_val=-1",
+        "--trainer.devices=0",
+        "--model.learning_rate=-1",
+        "--model.learning_rate=.nan",
+        "--model.weight_decay=-1",
+        "--model.condition_dropout=2",
+        "--model.ema_decay=5",
+        "--model.guidance=.inf",
+        "--model.diffusion_steps=0",
+        "--model.code_knots=0",
+        "--model.denoiser_args.hidden_dim=0",
+        "--model.denoiser_args.depth=0",
+        "--model.denoiser_args.condition_dim=-1",
+        "--model.denoiser_args.dropout=2",
+        "--data.seed=-1",
+        "--evaluation.seed=-1",
+        "--evaluation.figures=-1",
+    ],
+)
+def test_options_of_fit_out_of_their_ranges_are_one_line(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    told = error(capsys, "fit", "--config", PRETRAINING, *SHORT, option)
+    assert told.count("\n") == 1
+    assert option[2:].split("=")[0].split(".")[-1] in told
+    assert not list(Path().rglob("*.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("method", "option"),
+    [("bc", "hidden_dim"), ("bc", "plan_horizon"), ("cvae", "hidden_dim"), ("cvae", "latent_dim")],
+)
+def test_sizes_of_baselines_out_of_their_ranges_are_one_line(method: str, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    configuration = str(CONF / "baseline" / method / "object_rearrangement.yaml")
+    told = error(capsys, "fit", "--config", configuration, *SHORT[1:], f"--model.{option}=0")
+    assert told == f"error: model.{option}: expected 1 or more, found 0\n"
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--model.learning_rate=-1",
+        "--model.weight_learning_rate=.inf",
+        "--model.adapter_learning_rate=-1",
+        "--model.initial_spread=-1",
+        "--model.initial_omega=.nan",
+        "--model.omega=.nan",
+        "--model.training_omega=.nan",
+        "--model.seed=-1",
+        "--data.seed=-1",
+        "--trainer.max_epochs=0",
+    ],
+)
+def test_options_of_invert_out_of_their_ranges_are_one_line(tiny: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    more = ["--data.suite=validation", "--data.steps=1", "--evaluation.samples=1", "--evaluation.steps=2"]
+    told = error(capsys, "invert", "--config", INVERSION, f"--model.pretrained={tiny}", *more, option)
+    assert told.count("\n") == 1
+    assert option[2:].split("=")[0].split(".")[-1] in told
+    assert not list(Path().rglob("*.safetensors"))
+
+
+def test_no_warm_up_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "--config", PRETRAINING, *SHORT, "--model.warmup_steps=0"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"model: {a: \xff\xfe}\n", "odd.yaml: expected a configuration file (YAML)"),
+        (b"a: \x00\n", "odd.yaml: expected a configuration file (YAML)"),
+        (b"trainer: {max_steps: '${unknown}'}\n", "configuration: Interpolation key"),
+    ],
+)
+def test_odd_configuration_files_are_one_line(content: bytes, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("odd.yaml").write_bytes(content)
+    told = error(capsys, "fit", "--config", PRETRAINING, "--config", "odd.yaml")
+    assert expected in told
+    assert told.count("\n") == 1
+
+
+def test_an_empty_name_of_a_configuration_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("ablation.yaml").write_text("stages: [{verb: fit, config: ''}]\nresults: r.csv\n")
+    assert error(capsys, "ablate", "--config", "ablation.yaml").count("\n") == 1
+
+
+@pytest.mark.parametrize("verb", [["generate", "object_rearrangement"], ["sample", "--pretrained=object_rearrangement"]])
+def test_no_file_is_written_under_a_name_that_tells_another_form(verb: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    told = error(capsys, *verb, "--count=1", "--out=x.npz")
+    assert told == "error: out: expected a name that ends in .safetensors, which is what is written, found 'x.npz'\n"
+    assert not list(Path().iterdir())

@@ -11,7 +11,7 @@ from torch import Tensor
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import FORMAT, load_tensors, save_tensors
+from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
 
 KIND = "concept"
 VERSIONS = (FORMAT, 2, 3)
@@ -102,8 +102,24 @@ class Concept:
         each = component.unflatten(0, (self.knots, -1))
         return {"" if self.knots == 1 else f", knot {knot}": own for knot, own in enumerate(each, start=1)}
 
+    def expect_finite(self, where: str) -> None:
+        """Refuse a concept of numbers that are none, or of such a loss.
+
+        Raises:
+            UserError: naming ``where`` and the first of them.
+        """
+        modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
+        factors = {} if self.adapter is None else self.adapter.tensors()
+        found = {"loss": torch.tensor(self.origin.loss), "embeddings": self.embeddings, "weights": self.weights, **modes, **factors}
+        expect_finite(found, where, "lower model.learning_rate")
+
     def save(self, path: str | Path) -> None:
-        """Write a safetensors file with a JSON header."""
+        """Write a safetensors file with a JSON header.
+
+        Raises:
+            UserError: for numbers that are not finite.
+        """
+        self.expect_finite(str(path))
         tensors = {"embeddings": self.embeddings, "weights": self.weights}
         header = {**asdict(self.origin), "components": len(self.weights)}
         form = 3 if self.knots > 1 or self.adapter is not None else FORMAT if self.modes is None else 2

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.concepts.hashing import HashingEncoder
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors
+from ftl_lightning.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors, visible
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
@@ -74,7 +74,7 @@ class TransformerEncoder:
     @property
     def identity(self) -> str:
         folder = Path(self.name)
-        weights = sorted(folder.glob("*.safetensors")) if folder.is_dir() else []
+        weights = visible(folder, "*.safetensors") if folder.is_dir() else []
         # A folder is known by its weights, so that the same model at another path is the same encoder.
         return f"{self.label}@{file_hash(weights[0])}" if weights else f"{self.name}@{self.revision}"
 

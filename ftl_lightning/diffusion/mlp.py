@@ -8,6 +8,7 @@ from ftl_lightning.concepts.composition import Context
 from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
+from ftl_lightning.ranges import expect_range
 
 
 class MLPDenoiser(nn.Module):
@@ -43,6 +44,14 @@ class MLPDenoiser(nn.Module):
         super().__init__()
         if time_dim < 4 or time_dim % 2:
             raise UserError(f"denoiser_args.time_dim: expected an even number from 4 up, found {time_dim}")
+        for name, value in (
+            ("hidden_dim", hidden_dim),
+            ("depth", depth),
+            ("condition_dim", condition_dim),
+            ("initial_dim", initial_dim),
+        ):
+            expect_range(f"denoiser_args.{name}", value, 1)
+        expect_range("denoiser_args.dropout", dropout, 0, 1)
         self.time_dim = time_dim
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, condition_dim), nn.SiLU())

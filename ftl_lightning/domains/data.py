@@ -20,6 +20,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.errors import UserError
+from ftl_lightning.ranges import expect_range
 from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
 
 
@@ -116,6 +117,7 @@ class PretrainingData(pl.LightningDataModule):
         for name, value in counts.items():
             if value < 1:
                 raise UserError(f"data.{name}: expected 1 or more, found {value}")
+        expect_range("data.seed", seed, 0)
         if balance is not None and not 0 <= balance <= 1:
             raise UserError(f"data.balance: expected a number from 0 to 1, found {balance}")
         self.balance = balance
@@ -279,6 +281,7 @@ class InversionData(pl.LightningDataModule):
         if steps < 1 or demonstrations_per_concept < 1:
             found = f"{steps} and {demonstrations_per_concept}"
             raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {found}")
+        expect_range("data.seed", seed, 0)
         self.seed = seed
         self.steps = steps
         self.root = None if root is None else Path(root)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import atomic
+from ftl_lightning.tensor_file import atomic, visible
 from ftl_lightning.version import __version__
 
 METHOD, REFERENCE = "method", "reference"
@@ -146,7 +146,7 @@ def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
 
 def _files(folder: Path) -> list[Path]:
     """Results files below a folder, ``invert_2`` before ``invert_10``."""
-    return sorted(folder.rglob("*.csv"), key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path)])
+    return sorted(visible(folder, "**/*.csv"), key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path)])
 
 
 def _parts(path: Path) -> list[str]:

@@ -21,7 +21,16 @@ from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import FORMAT, bytes_hash, file_hash, load_tensors, save_tensors, serialise, write_text
+from ftl_lightning.tensor_file import (
+    FORMAT,
+    bytes_hash,
+    expect_finite,
+    file_hash,
+    load_tensors,
+    save_tensors,
+    serialise,
+    write_text,
+)
 
 KIND = "generative model"
 CONFIG, WEIGHTS, EXAMPLES = "config.json", "model.safetensors", "demonstrations.safetensors"
@@ -308,9 +317,13 @@ class ConceptModel(nn.Module, ABC):
         """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision.
 
         Where there are examples, they are written too.
+
+        Raises:
+            UserError: before anything is written, for weights that are not finite or too large for half precision.
         """
-        folder = Path(folder)
-        save_tensors(folder / WEIGHTS, KIND, self._stored(), {"domain": self.config.domain})
+        folder, stored = Path(folder), self._stored()
+        expect_finite(stored, str(folder), "nothing was written; train it anew")
+        save_tensors(folder / WEIGHTS, KIND, stored, {"domain": self.config.domain})
         if self.examples is not None:
             self.examples.save(folder / EXAMPLES)
         header = {"format": VERSION, "hash": self.hash, "kind": self.kind}

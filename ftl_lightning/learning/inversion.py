@@ -218,7 +218,11 @@ class Inversion(nn.Module):
 
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
-        """The concepts by name: of each run, the restart with the lowest loss on common noise."""
+        """The concepts by name: of each run, the restart with the lowest loss on common noise.
+
+        Raises:
+            UserError: for a concept that is not finite.
+        """
         restarts = self.settings.restarts
         # Where there were fewer steps than a round has, there is no best one yet.
         source = self if self.stopping is None or not self.stopping.rounds else self.stopping
@@ -241,6 +245,7 @@ class Inversion(nn.Module):
                 self.settings.knots,
                 adapter.copied() if (adapter := self.adapter(whole)) else None,
             )
+            found[name].expect_finite(f"inversion: concept {name!r}")
         return found
 
     def _final(self, embeddings: Tensor, weights: Tensor) -> Tensor:

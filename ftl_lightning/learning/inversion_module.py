@@ -12,10 +12,15 @@ from ftl_lightning.domains.paper import FINE_TUNED, WITH_ADAPTER, WITH_KNOTS, WI
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.baselines.additive import AdditiveModel
-from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.checkpoint import check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import Inversion, check_settings
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.ranges import expect_range
+from ftl_lightning.tensor_file import expect_finite
+
+OWN = "inversion."
+"""Names of all that a checkpoint holds begin so."""
 
 
 class InversionModule(Adaptation):
@@ -66,9 +71,12 @@ class InversionModule(Adaptation):
     ) -> None:
         super().__init__(pretrained, 1.0 if omega == "learned" else omega, output)
         self.save_hyperparameters()
+        if training_omega is not None:
+            expect_range("model.training_omega", training_omega)
         self.settings = InversionSettings(**{field.name: self.hparams[field.name] for field in fields(InversionSettings)})
         check_settings(self.model, self.settings)
         self.inversion: Inversion
+        self._from = 0
 
     @property
     def method(self) -> str:
@@ -96,6 +104,10 @@ class InversionModule(Adaptation):
             with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
                 super().configure_model()
                 self.inversion = Inversion(self.model, self.demonstrations, self.settings)
+
+    def on_train_start(self) -> None:
+        """Look at what was restored, if anything."""
+        check_restored(self, self._from)
 
     def training_step(self, step: int) -> Tensor:
         losses = self.inversion.step_losses(self.global_step)
@@ -126,13 +138,16 @@ class InversionModule(Adaptation):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Sign the checkpoint and leave the frozen model out; its folder is a hyper-parameter."""
         sign(self, checkpoint, self._signature())
-        own = {key: value for key, value in checkpoint["state_dict"].items() if key.startswith("inversion.")}
+        own = {key: value for key, value in checkpoint["state_dict"].items() if key.startswith(OWN)}
         checkpoint["state_dict"] = own
+        parameters = dict(self.inversion.named_parameters())
+        expect_finite(parameters, f"inversion: step {self.global_step}", "nothing was saved of it; lower model.learning_rate")
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module, model, concepts or kind of weights."""
         check_signature(self, checkpoint, self._signature())
-        self._found = {}
+        check_parameters(checkpoint["state_dict"], self, OWN)
+        self._found, self._from = {}, checkpoint["global_step"]
 
     def _signature(self) -> dict[str, Any]:
         """Settings that must match before a checkpoint is loaded."""

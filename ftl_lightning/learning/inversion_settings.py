@@ -5,6 +5,7 @@ from typing import Literal
 
 from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.errors import UserError
+from ftl_lightning.ranges import expect_range
 
 EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
@@ -77,6 +78,11 @@ class InversionSettings:
         for name in ("components", "restarts", "samples", "mode_samples", "knots"):
             if (value := getattr(self, name)) < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
+        for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate", "initial_spread", "seed"):
+            expect_range(f"model.{name}", getattr(self, name), 0)
+        expect_range("model.initial_omega", self.initial_omega)
+        if self.omega != "learned":
+            expect_range("model.omega", self.omega)
         if isinstance(self.modes, int) and self.modes < 1:
             raise UserError(f"model.modes: expected 1 or more, 'each' or 'auto', found {self.modes}")
         if isinstance(self.modes, str) and self.modes not in ("each", "auto"):

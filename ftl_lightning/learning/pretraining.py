@@ -28,10 +28,12 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.checkpoint import check_signature, sign
+from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.ranges import expect_range
 from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import expect_finite
 
 
 class Pretraining(pl.LightningModule, ABC):
@@ -42,7 +44,7 @@ class Pretraining(pl.LightningModule, ABC):
 
     Args:
         learning_rate: of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
-        warmup_steps: of the learning rate.
+        warmup_steps: of the learning rate; 0 for none.
         weight_decay: of AdamW.
         ema_decay: of the running average; it starts lower.
         guidance: weight omega with which training concepts are generated in evaluation.
@@ -51,6 +53,9 @@ class Pretraining(pl.LightningModule, ABC):
         perturb: learn from presents that the view perturbs, here and in inversion.
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and what is random in the loss as a function of the step.
+
+    Raises:
+        UserError: at construction, for a value out of its range.
     """
 
     method: str
@@ -76,10 +81,22 @@ class Pretraining(pl.LightningModule, ABC):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
+        for name, value, most in (
+            ("learning_rate", learning_rate, math.inf),
+            ("warmup_steps", warmup_steps, math.inf),
+            ("weight_decay", weight_decay, math.inf),
+            ("ema_decay", ema_decay, 1),
+            ("seed", seed, math.inf),
+        ):
+            expect_range(f"model.{name}", value, 0, most)
+        expect_range("model.guidance", guidance)
         self.seed = seed
         self.guidance = guidance
         self.model: ConceptModel
         self.raw: ConceptModel
+        self._validated = False
+        self._random: Random | None = None
+        self._from = 0
 
     @abstractmethod
     def build(
@@ -167,6 +184,24 @@ class Pretraining(pl.LightningModule, ABC):
             self.model.eval()
         return self
 
+    def on_train_start(self) -> None:
+        """Look at what was restored, if anything."""
+        check_restored(self, self._from)
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Let a resumed run draw what the unbroken one draws: dropout takes from the global generators.
+
+        Here and not earlier, since beginning to iterate a loader draws from them too.
+        """
+        self._validated = False
+        if self._random is not None:
+            self._random.restore(self.device)
+            self._random = None
+
+    def on_validation_start(self) -> None:
+        """Take note that a checkpoint from now on is one after validation."""
+        self._validated = True
+
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
         loss = self.losses(self.raw, batch, draw).mean()
@@ -199,7 +234,7 @@ class Pretraining(pl.LightningModule, ABC):
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with warm-up and cosine decay."""
         total = int(self.trainer.estimated_stepping_batches)
-        warmup = min(self.hparams["warmup_steps"], max(total // 10, 1))
+        warmup = max(min(self.hparams["warmup_steps"], total // 10), 1)
         optimizer = torch.optim.AdamW(
             self.raw.parameters(),
             lr=self.hparams["learning_rate"],
@@ -239,12 +274,23 @@ class Pretraining(pl.LightningModule, ABC):
         return self.model.named_embeddings()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint."""
+        """Sign the checkpoint, and keep where the global generators stand.
+
+        Raises:
+            UserError: if a parameter is not finite; the checkpoint that is there stays.
+        """
+        found = checkpoint["state_dict"]
+        expect_finite(found, f"training: step {self.global_step}", "nothing was saved of it; lower model.learning_rate")
         sign(self, checkpoint, self._signature())
+        loop = self.trainer.fit_loop
+        validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
+        Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module or of a model of another form."""
         check_signature(self, checkpoint, self._signature())
+        check_parameters(checkpoint["state_dict"], self)
+        self._random, self._from = Random.read(checkpoint), checkpoint["global_step"]
 
     def _signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
@@ -361,6 +407,10 @@ class PretrainingModule(Pretraining):
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         if not 0 <= code_share <= 1:
             raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
+        expect_range("model.condition_dropout", condition_dropout, 0, 1)
+        expect_range("model.code_noise", code_noise, 0)
+        for name, count in (("diffusion_steps", diffusion_steps), ("code_knots", code_knots), ("code_size", code_size)):
+            expect_range(f"model.{name}", count, 1)
         self.codes = Codes(code_share, code_knots, code_size, code_noise) if code_share else None
 
     def build(

@@ -12,7 +12,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import file_hash
+from ftl_lightning.tensor_file import file_hash, visible
 
 LISTING = "films.json"
 TRAINING, NEW = "training", "new"
@@ -118,7 +118,7 @@ def _drawn(available: int, count: int, seed: int, what: str) -> list[int]:
 
 
 def _named(folder: Path) -> list[dict[str, Any]]:
-    paths = sorted(folder.glob("*/*.safetensors"))
+    paths = visible(folder, "*/*.safetensors")
     if not paths:
         raise UserError(
             f"{folder}: expected {LISTING} or files METHOD/CONCEPT.safetensors, found neither; make them with: sample --out"

@@ -1,3 +1,4 @@
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import atomic, file_hash, save_tensors
+from ftl_lightning.tensor_file import atomic, file_hash, save_tensors, write_text
 
 
 def demonstrations(states: torch.Tensor, **changes: object) -> Demonstrations:
@@ -137,10 +138,33 @@ def test_nothing_half_written_is_left_behind(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_a_clear_error() -> None:
-    if not Path("/dev/full").exists():
-        pytest.skip("needs /dev/full, which this system lacks")
+    if not Path("/dev/full").is_char_device():  # whoever wrote to it as root may have put a file there
+        pytest.skip("needs the device /dev/full, which this system lacks")
     with pytest.raises(UserError, match="No space left on device"), atomic("file.txt"):
         Path("/dev/full").write_text("x")
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("pipe")
+    (tmp_path / "null").symlink_to("/dev/null")
+    for name, found in (("pipe", "a device"), ("folder", "a folder"), ("link", "a device"), ("null", "a device")):
+        with pytest.raises(UserError, match=f"{name}: expected a file or nothing there, found {found}"):
+            write_text(tmp_path / name, "x")
+    assert (tmp_path / "pipe").is_fifo()
+    assert Path("/dev/null").is_char_device()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "link", "null", "pipe"]
+
+
+def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to("elsewhere/file")
+    for text in ("made", "replaced"):
+        write_text(tmp_path / "link", text)
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / "elsewhere" / "file").read_text() == text
+    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["file"]
 
 
 def test_an_unwritable_folder_is_a_clear_error(tmp_path: Path) -> None:

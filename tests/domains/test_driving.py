@@ -299,9 +299,26 @@ def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(expert, "drive", drive)
     found = generation.demonstrations("merge", 2, 0, 1, lambda: None)
     assert (found.provenance["driven"], found.provenance["rejected"]) == (4, 2)
+    assert not generation.shard("merge", generation.episode_seed(0, 0)).exists()  # next time it is driven again
+    assert generation.shard("merge", generation.episode_seed(0, 1)).exists()
     monkeypatch.setattr(expert, "drive", lambda *_: (whole, False))
     with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
         generation.demonstrations("exit", 1, 0, 1, lambda: None)
+
+
+@pytest.mark.parametrize("failure", [MemoryError(), OSError(24, "Too many open files")])
+def test_a_machine_that_fails_decides_nothing(failure: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    def fail(name: str, seed: int) -> tuple[np.ndarray, bool]:
+        raise failure
+
+    with monkeypatch.context() as broken:
+        broken.setattr(expert, "drive", fail)
+        with pytest.raises(UserError, match=r"driving 'merge', seed \d+: the machine failed"):
+            generation.demonstrations("merge", 1, 0, 1, lambda: None)
+    monkeypatch.setattr(expert, "drive", lambda *_: (np.ones((3, 5, 7), dtype=np.float32), True))
+    assert generation.demonstrations("merge", 1, 0, 1, lambda: None).provenance["rejected"] == 0
 
 
 @pytest.mark.parametrize(("name", "seconds"), [("merge", 1.0), ("intersection", 0.5)])

@@ -23,6 +23,7 @@ from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettin
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
+from tests.conftest import CONF
 
 
 def learn(tiny: Path, data: InversionData | None = None, **options: object) -> InversionModule:
@@ -417,3 +418,14 @@ def test_modes_learn_from_noised_demonstrations_of_a_number_of_their_own(tiny: P
     assert same.modes is not None
     assert alike(found.embeddings, same.embeddings)
     assert alike(found.modes.embeddings, same.modes.embeddings) == (samples == 8)
+
+
+def test_a_concept_that_is_not_finite_is_not_learned(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--data.suite=validation", "--data.steps=1", "--model.learning_rate=1e30", "--evaluation.samples=1"]
+    arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+    for tolerance in ("null", "0.01"):
+        more = [f"--model.tolerance={tolerance}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+        assert main([*arguments, *options, *more]) == 2
+        assert "inversion: concept" in (told := capsys.readouterr().err)
+        assert "expected finite numbers, found others in 'loss'; lower model.learning_rate" in told
+    assert not list(Path().rglob("concepts"))

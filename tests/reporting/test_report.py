@@ -5,7 +5,7 @@ import pytest
 
 from ftl_lightning.cli import main
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.results import Row, append_rows, read_rows
+from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.reporting.comparison import comparison_table
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END
@@ -158,3 +158,19 @@ def test_every_published_number_belongs_to_a_task_or_setting() -> None:
         assert published.setting in {setting for setting, _ in tasks}
         assert not published.task or (published.setting, published.task) in tasks
         assert 0 <= published.value <= 1
+
+
+def test_what_a_killed_process_left_is_no_result(tmp_path: Path) -> None:
+    append_rows(tmp_path / "r.csv", [row("new concept", "one", 1.0)])
+    whole = (tmp_path / "r.csv").read_text()
+    (tmp_path / ".r.csv.abcd.csv").write_text(whole)
+    (tmp_path / ".r.csv.efgh.csv").write_text(whole[:70])
+    (tmp_path / ".hidden").mkdir()
+    (tmp_path / ".hidden" / "r-checkpoint.csv").write_text(whole)
+    assert len(read_rows(tmp_path)) == len(read_study(tmp_path)) == 1
+
+
+def test_a_missing_file_to_update_is_told_before_anything_is_written(capsys: pytest.CaptureFixture[str], results: Path) -> None:
+    assert main(["report", f"--results={results}", "--out=report", "--readme=missing.md"]) == 2
+    assert capsys.readouterr().err == "error: missing.md: expected a Markdown file, found nothing\n"
+    assert not Path("report").exists()

@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+import signal
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,7 +42,13 @@ def shard(name: str, seed: int) -> Path:
 
 
 def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
-    """Observations ``(time, 5, 7)`` of the expert and whether it succeeded, from the cache if they are there."""
+    """Observations ``(time, 5, 7)`` of the expert and whether it succeeded, from the cache if they are there.
+
+    Kept is what the rules of the scenario decide. An episode at which the simulation fails counts as rejected this time alone.
+
+    Raises:
+        UserError: where the machine fails, which says nothing of the episode.
+    """
     path = shard(name, seed)
     if path.is_file():
         try:
@@ -51,9 +58,11 @@ def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
             path.unlink()  # damaged from outside: driven again
     try:
         seen, succeeded = expert.drive(name, seed)
+    except (MemoryError, OSError) as error:
+        raise UserError(f"driving {name!r}, seed {seed}: the machine failed ({error!r}); run it again, it goes on here") from error
     except Exception as error:  # whatever the simulation raises: the other episodes go on
-        _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected", name, seed, error)
-        seen, succeeded = np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
+        _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected and is not kept", name, seed, error)
+        return np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
     save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
     return seen, succeeded
 
@@ -79,7 +88,8 @@ def _episodes(name: str, seeds: list[int], workers: int) -> Iterator[tuple[np.nd
     if workers == 1:
         yield from map(_made, jobs)
         return
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+    # Ctrl-C is for this process, which then ends the others.
+    with multiprocessing.get_context("spawn").Pool(workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         yield from pool.imap(_made, jobs)
 
 

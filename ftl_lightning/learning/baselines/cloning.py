@@ -18,6 +18,7 @@ from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
 from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.ranges import expect_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +146,9 @@ class CloningPretraining(Pretraining):
     ) -> None:
         super().__init__(**options)
         self.save_hyperparameters()
+        expect_range("model.hidden_dim", hidden_dim, 1)
+        if plan_horizon is not None:
+            expect_range("model.plan_horizon", plan_horizon, 1)
         self.stride = stride
 
     def build(

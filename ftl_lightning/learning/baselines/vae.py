@@ -16,6 +16,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
 from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.ranges import expect_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +104,9 @@ class VAEPretraining(Pretraining):
     def __init__(self, latent_dim: int = 20, hidden_dim: int = 512, beta: float = 1.0, **options: Any) -> None:
         super().__init__(**options)
         self.save_hyperparameters()
+        expect_range("model.latent_dim", latent_dim, 1)
+        expect_range("model.hidden_dim", hidden_dim, 1)
+        expect_range("model.beta", beta, 0)
 
     def build(
         self,
