@@ -298,6 +298,19 @@ class Pretraining(pl.LightningModule, ABC):
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
 
 
+def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
+    """Refuse training concepts without demonstrations, for methods whose concepts are demonstrations.
+
+    Raises:
+        UserError: naming the first one.
+    """
+    if absent := [text for text in concepts if text not in set(shown)]:
+        raise UserError(
+            f"data: expected a demonstration of each of {len(concepts)} training concepts, found none of {len(absent)}, such as "
+            f"{absent[0]!r}; this method cannot do without"
+        )
+
+
 def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
     """Refuse concepts that the text encoder cannot tell apart, such as those that differ in capitals alone.
 

@@ -1,6 +1,6 @@
 """A small skeleton, motions of it, and folders of made-up recordings: no recorded motion comes with the project."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -91,13 +91,14 @@ def recordings(trials: Mapping[str, tuple[str, NDArray[np.float32]]], kind: str 
     )
 
 
-def folder(path: Path) -> Path:
-    """A folder of recordings of a few concepts, new ones among them."""
+def folder(path: Path, concepts: Sequence[str] = ()) -> Path:
+    """A folder of recordings of a few concepts, new ones among them, and of others that are asked for."""
     trials = {f"02_{number:02}": ("walk", motion(60 + 10 * number, number)) for number in range(1, 6)}
     trials |= {f"03_{number:02}": ("walk, veer left", motion(50, 10 + number)) for number in (1, 2)}
     trials |= {"03_03": ("basketball - forward dribble, 90-degree right turns, crossover dribble", motion(40, 20))}
     trials |= {"13_29": ("jumping jacks, side twists, bend over, squats", motion(1148, 30))}
     trials |= {"13_30": ("jumping jacks, side twists, squats, jog", motion(617, 31))}
+    trials |= {f"05_{number:02}": (text, motion(40, number)) for number, text in enumerate(concepts)}
     path.mkdir(parents=True, exist_ok=True)
     recordings(trials).save(path / FILE)
     return path

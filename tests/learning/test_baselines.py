@@ -13,6 +13,7 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED
+from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
@@ -26,6 +27,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
+from tests.domains.mocap_samples import folder
 
 AGENT = {"domain": "agent", "state_dim": 13, "observed": {OBSERVED: FEATURE}, "encoder": "e"}
 DOMAIN = load_domain("agent")
@@ -157,6 +159,7 @@ TINY = {
     "object_rearrangement": ["--data.samples_per_concept=20", "--data.validation_per_concept=2", "--data.batch_size=32"],
     "agent": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
     "driving": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
+    "mocap": ["--data.batch_size=8"],
 }
 SMALL = {
     "bc": ["--model.hidden_dim=16"],
@@ -171,7 +174,8 @@ FITS = sorted(path for path in (CONF / "baseline").glob("*/*.yaml") if path.pare
 def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
     method, domain = path.parent.name, path.stem
     members = ["--model.members=2"] if (method, domain) == ("bc", "object_rearrangement") else []
-    options = [*TINY[domain], *SMALL[method], *members, *QUIET, "--data.steps_per_epoch=2", "--trainer.max_steps=2"]
+    recorded = [f"--data.root={folder(tmp_path / 'recordings', TRAINING_CONCEPTS)}"] if domain == "mocap" else []
+    options = [*TINY[domain], *recorded, *SMALL[method], *members, *QUIET, "--data.steps_per_epoch=2", "--trainer.max_steps=2"]
     assert main(["fit", "--config", str(path), *options, "--model.output=made"]) == 0
     model = load_model("made")
     assert load_model("made").hash == model.hash
@@ -184,7 +188,7 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
         drives = load_domain(domain).source(None).split("train", 2, 0).select("merge")
         replace(drives, concepts=(goal,) * len(drives)).save("drives.safetensors")
         demonstrations = ["--data.demonstrations=drives.safetensors"]
-    adapt = [*demonstrations, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
+    adapt = [*demonstrations, *recorded, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
     executed = [] if domain == "object_rearrangement" else ["--evaluation.closed_loop=false"]
     config = path.parent / "invert" / path.name
     assert (
@@ -209,6 +213,16 @@ def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pyte
     config = str(CONF / "baseline" / "in_context" / "invert" / "agent.yaml")
     assert main(["invert", "--config", config, f"--model.pretrained={tiny}"]) == 2
     assert "expected a model of kind in-context, found diffusion" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("method", ["cvae", "in_context"])
+def test_a_method_whose_concepts_are_demonstrations_asks_for_one_of_each(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = str(CONF / "baseline" / method / "mocap.yaml")
+    options = [f"--data.root={folder(tmp_path / 'few')}", "--trainer.max_steps=1", *QUIET]
+    assert main(["fit", "--config", config, *options]) == 2
+    assert "expected a demonstration of each of 82 training concepts, found none of 78, such as" in capsys.readouterr().err
 
 
 def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.learning.pretraining import Pretraining, expect_shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,6 +223,7 @@ class InContextPretraining(Pretraining):
         # Roads are hidden from whole prompts, as they are from a present in each of two windows.
         self._hidden = model.prompts(data.training, hide=True) if config.perturb else self._prompts
         texts = data.training.concepts
+        expect_shown(config.training_concepts, texts)
         self._own = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
         model.training_embeddings.copy_(self._prompts[[own[0] for own in self._own]])
         windows = data.first_windows()

@@ -15,7 +15,7 @@ from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
-from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.learning.pretraining import Pretraining, expect_shown
 from ftl_lightning.ranges import expect_range
 
 
@@ -118,6 +118,7 @@ class VAEPretraining(Pretraining):
     ) -> VAEModel:
         latent = self.hparams["latent_dim"]
         config = VAEConfig(**dict(shared) | {"concept_dim": latent, "hidden_dim": self.hparams["hidden_dim"]})
+        expect_shown(config.training_concepts, data.training.concepts)
         self._first = data.first_windows()
         return VAEModel(config, data.domain, normalization, torch.zeros(len(embeddings), latent), initial_normalization)
 
