@@ -2,10 +2,9 @@
 
 import copy
 import math
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from ftl_lightning.domains.paper import OURS
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
+from ftl_lightning.learning.codes import Codes
 from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.ranges import expect_range
@@ -156,7 +156,8 @@ class Pretraining(pl.LightningModule, ABC):
             "metrics": dict(data.metrics),
             "training": {
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
-                "data": {key: value for key, value in data.hparams.items() if not key.startswith("_")},
+                # Where somebody's recordings lie says nothing of the model.
+                "data": {key: value for key, value in data.hparams.items() if key != "root" and not key.startswith("_")},
                 "max_steps": self.trainer.max_steps,
             },
         }
@@ -326,48 +327,6 @@ def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
             )
 
 
-@dataclass(frozen=True)
-class Codes:
-    """Rough codes of behaviour, which are added to the texts of some samples in pretraining.
-
-    A code is a random linear projection of how far the plan has come from its first state, at each of several knots, with noise. It
-    is as long as a text's embedding on average, and half of the samples with a code have no text.
-
-    Attributes:
-        share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept.
-        knots: times.
-        size: numbers of a code at a knot.
-        noise: standard deviation of what is added to the numbers, which have unit variance.
-    """
-
-    share: float
-    knots: int
-    size: int
-    noise: float
-
-    def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
-        """Concepts ``(batch, knots * n)``.
-
-        Args:
-            texts: ``(batch, n)``, the empty one where it was removed.
-            removed: where it was ``(batch,)``.
-            clean: plans ``(batch, horizon, state)``, normalised.
-            draw: of what is random.
-        """
-        count, width, device = *texts.shape, clean.device
-        times = torch.linspace(0, clean.shape[1] - 1, self.knots, device=device).round().long()
-        fixed = generator("cpu", zlib.crc32(b"codes"))
-        mixing = torch.randn(clean.shape[2], self.size, generator=fixed).to(device)
-        directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
-        way = (clean[:, times] - clean[:, :1]) @ mixing  # (batch, knot, size)
-        numbers = way / way.square().mean().sqrt().clamp(min=1e-6)
-        numbers = numbers + self.noise * torch.randn(numbers.shape, generator=draw, device=device)
-        told = (torch.rand(count, generator=draw, device=device) < self.share) & ~removed
-        alone = told & (torch.rand(count, generator=draw, device=device) < 0.5)
-        text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
-        return (text[:, None] + told[:, None, None] * (numbers @ directions)).flatten(1)
-
-
 class PretrainingModule(Pretraining):
     """Trains a denoiser on a domain's pairs of behaviour and concept.
 
@@ -384,8 +343,9 @@ class PretrainingModule(Pretraining):
         loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
             weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
         code_share: of the samples are also told a rough code of their own behaviour, which varies over the window, see
-            :class:`Codes`: so the network has seen concepts that do, and concepts that no text names. 0 is the paper's form.
-        code_knots, code_size, code_noise: see :class:`Codes`.
+            :class:`~ftl_lightning.learning.codes.Codes`: so the network has seen concepts that do, and concepts that no text
+            names. 0 is the paper's form.
+        code_knots, code_size, code_noise: see there.
         compile: compile the denoiser for training (worth it on GPUs).
     """
 

@@ -179,6 +179,7 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
     assert main(["fit", "--config", str(path), *options, "--model.output=made"]) == 0
     model = load_model("made")
     assert load_model("made").hash == model.hash
+    assert "root" not in model.config.training["data"]  # no model says where its maker's recordings lay
     concept = model.concept(model.config.training_concepts[0])
     assert concept.isfinite().all()
     assert concept.any()  # a VAE's and a transformer's are made after the fit, not left at zero

@@ -142,6 +142,7 @@ class VAEPretraining(Pretraining):
         model.training_embeddings.copy_(mean)
 
     def on_validation_start(self) -> None:
+        super().on_validation_start()
         self._represent()
 
     def on_test_start(self) -> None:

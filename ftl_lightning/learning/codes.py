@@ -1,0 +1,51 @@
+"""Rough codes of behaviour, from which a denoiser learns in pretraining that concepts may vary over a plan."""
+
+import zlib
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.seeding import generator
+
+
+@dataclass(frozen=True)
+class Codes:
+    """Rough codes of behaviour, which are added to the texts of some samples in pretraining.
+
+    A code is a random linear projection of how far the plan has come from its first state, at each of several knots, with noise. It
+    is as long as a text's embedding on average, and half of the samples with a code have no text.
+
+    Attributes:
+        share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept.
+        knots: times.
+        size: numbers of a code at a knot.
+        noise: standard deviation of what is added to the numbers, which have unit variance.
+    """
+
+    share: float
+    knots: int
+    size: int
+    noise: float
+
+    def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
+        """Concepts ``(batch, knots * n)``.
+
+        Args:
+            texts: ``(batch, n)``, the empty one where it was removed.
+            removed: where it was ``(batch,)``.
+            clean: plans ``(batch, horizon, state)``, normalised.
+            draw: of what is random.
+        """
+        count, width, device = *texts.shape, clean.device
+        times = torch.linspace(0, clean.shape[1] - 1, self.knots, device=device).round().long()
+        fixed = generator("cpu", zlib.crc32(b"codes"))
+        mixing = torch.randn(clean.shape[2], self.size, generator=fixed).to(device)
+        directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
+        way = (clean[:, times] - clean[:, :1]) @ mixing  # (batch, knot, size)
+        numbers = way / way.square().mean().sqrt().clamp(min=1e-6)
+        numbers = numbers + self.noise * torch.randn(numbers.shape, generator=draw, device=device)
+        told = (torch.rand(count, generator=draw, device=device) < self.share) & ~removed
+        alone = told & (torch.rand(count, generator=draw, device=device) < 0.5)
+        text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
+        return (text[:, None] + told[:, None, None] * (numbers @ directions)).flatten(1)
