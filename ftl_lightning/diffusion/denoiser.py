@@ -20,17 +20,30 @@ class Sizes:
         state_dim: columns of a state.
         concept_dim: columns of a concept embedding.
         observed: features that it is conditioned on, by name; empty where there are none.
+        image_dim: numbers that are read of the observed images, which stand behind the observed vectors.
     """
 
     horizon: int
     state_dim: int
     concept_dim: int
     observed: Mapping[str, Feature] = field(default_factory=dict)
+    image_dim: int = 0
+
+    @property
+    def measured_dim(self) -> int:
+        """Columns of the observed vectors one after another."""
+        return sum(feature.size for feature in self._vectors)
 
     @property
     def vector_dim(self) -> int:
-        """Columns of the observed vectors one after another."""
-        return sum(feature.size for feature in self._vectors)
+        """The same with what is read of the images behind them: all that a network is given."""
+        return self.measured_dim + self.image_dim
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Where each observed vector stands in those, by name."""
+        placed = dict(zip((name for name, feature in self.observed.items() if feature.kind == "vector"), self._placed, strict=True))
+        return {name: slice(start, start + feature.size) for name, (start, feature) in placed.items()}
 
     @property
     def entities(self) -> tuple[tuple[int, ...], ...]:

@@ -16,6 +16,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, Observed, expect_features
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN, own_domain
@@ -58,6 +59,8 @@ class ModelConfig(Sizes):
         encoder: identity of the text encoder.
         view: name of the domain's view that the model sees behaviour with; empty for as it is.
         perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
+        image_encoder: arguments of the observed images' encoders, see :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`.
+        feature_dropout: of observed vectors by name, how often each is hidden (0 after normalisation) in training.
         metrics: of a user's own data, what plans are judged by, see :mod:`ftl_lightning.domains.from_file`.
         training: how it was trained, for the record.
     """
@@ -67,6 +70,8 @@ class ModelConfig(Sizes):
     encoder: str
     view: str = ""
     perturb: bool = False
+    image_encoder: Mapping[str, Any] = field(default_factory=dict)
+    feature_dropout: Mapping[str, float] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
@@ -166,7 +171,7 @@ class ConceptModel(nn.Module, ABC):
         self.view = find_view(domain, config.view)
         if config.perturb and (self.view is None or self.view.perturb is None):
             raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
-        refuse_images(config.observed)
+        self.images = ImageEncoders(config.observed, config.image_encoder) if config.image_dim else None
         self.normalization = normalization
         self.initial_normalization = initial_normalization
         self.register_buffer("empty", embeddings[0].clone())
@@ -289,19 +294,51 @@ class ConceptModel(nn.Module, ABC):
         states = self.normalization.decode(normalised)
         return states if self.view is None else self.view.decode(states, observed)
 
-    def vector(self, observed: Observed) -> Tensor | None:
-        """The observed vectors ``(batch, m)`` as the network sees them, one after another; ``None`` where it observes none.
+    def vector(self, observed: Observed, of_images: Tensor | None = None) -> Tensor | None:
+        """What is observed as the network sees it: vectors one after another, then what is read of images ``(batch, m)``.
+
+        Args:
+            observed: features by name, in the domain's units.
+            of_images: what :meth:`of_images` read, where it has been read before.
+
+        Returns:
+            ``None`` where nothing is observed.
 
         Raises:
             UserError: if a feature is missing or of another shape.
         """
-        if self.initial_normalization is None:
+        if not self.config.observed:
             return None
+        seen = self._seen(observed)
+        parts = []
+        if self.initial_normalization is not None:
+            vectors = self.initial_normalization.encode(joined_vectors(seen, self.config.observed))
+            parts.append(self._dropped(vectors) if self.training else vectors)
+        if self.images is not None:
+            parts.append(self.images(seen) if of_images is None else of_images)
+        return torch.cat(parts, dim=-1)
+
+    def of_images(self, observed: Observed) -> Tensor | None:
+        """What is read of observed images ``(batch, n)``, for methods that look at them once and at vectors often; ``None`` where
+        none is observed.
+        """
+        found: Tensor | None = None if self.images is None else self.images(self._seen(observed))
+        return found
+
+    def _seen(self, observed: Observed) -> Observed:
         if self.view is not None:
             expect_features(observed, self.domain.observed)
             observed = self.view.observe(observed)
         expect_features(observed, self.config.observed)
-        return self.initial_normalization.encode(joined_vectors(observed, self.config.observed))
+        return observed
+
+    def _dropped(self, vectors: Tensor) -> Tensor:
+        """The same where some of the vectors are hidden."""
+        for name, share in self.config.feature_dropout.items():
+            kept = torch.ones_like(vectors)
+            kept[:, self.config.columns[name]] = (torch.rand(len(vectors), 1, device=vectors.device) >= share).float()
+            vectors = vectors * kept
+        return vectors
 
     @property
     def hash(self) -> str:
@@ -354,7 +391,7 @@ class ConceptModel(nn.Module, ABC):
                 f"{weights}: expected the hash {expected_hash} that {CONFIG} names, found {found}; copy both files again"
             )
         blank = torch.zeros(config.state_dim)
-        initial = torch.zeros(config.vector_dim)
+        initial = torch.zeros(config.measured_dim)
         examples = Demonstrations.load(Path(folder) / EXAMPLES) if config.domain == OWN else None
         domain = (
             load_domain(config.domain)
@@ -366,7 +403,7 @@ class ConceptModel(nn.Module, ABC):
             domain,
             Normalization(blank, blank),
             torch.zeros(1 + len(config.training_concepts), config.concept_dim),
-            Normalization(initial, initial) if config.vector_dim else None,
+            Normalization(initial, initial) if config.measured_dim else None,
         )
         model.examples = examples
         try:
@@ -374,16 +411,6 @@ class ConceptModel(nn.Module, ABC):
         except RuntimeError as error:
             raise UserError(f"{weights}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()})") from error
         return model.requires_grad_(False).eval()
-
-
-def refuse_images(features: Mapping[str, Feature]) -> None:
-    """Images are kept in files, but no model reads them.
-
-    Raises:
-        UserError: naming the first one.
-    """
-    if images := [name for name, feature in features.items() if feature.kind == "image"]:
-        raise UserError(f"key 'observed/{images[0]}': expected vectors, found images, for which there is no encoder yet")
 
 
 def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:

@@ -16,10 +16,11 @@ from torch import Tensor
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion import PAPER_SIZE
 from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.diffusion.prediction import loss_weights
 from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.data import Batch, PretrainingData
@@ -29,7 +30,7 @@ from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.codes import Codes
-from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors, refuse_images
+from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.seeding import generator
@@ -53,6 +54,10 @@ class Pretraining(pl.LightningModule, ABC):
         perturb: learn from presents that the view perturbs, here and in inversion.
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
         seed: decides initial weights, and what is random in the loss as a function of the step.
+        image_encoder: arguments of the observed images' encoders, see
+            :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`; its defaults for ``None``.
+        feature_dropout: of observed vectors by name, the probability with which each is hidden in training; none for ``None``.
+            The published code hides the pose of a robot's hand with 0.4.
 
     Raises:
         UserError: at construction, for a value out of its range.
@@ -78,6 +83,8 @@ class Pretraining(pl.LightningModule, ABC):
         perturb: bool = False,
         output: str | None = None,
         seed: int = 0,
+        image_encoder: Mapping[str, Any] | None = None,
+        feature_dropout: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
@@ -90,6 +97,9 @@ class Pretraining(pl.LightningModule, ABC):
         ):
             expect_range(f"model.{name}", value, 0, most)
         expect_range("model.guidance", guidance)
+        self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
+        for name, share in self.feature_dropout.items():
+            expect_range(f"model.feature_dropout.{name}", share, 0, 1)
         self.seed = seed
         self.guidance = guidance
         self.model: ConceptModel
@@ -143,6 +153,8 @@ class Pretraining(pl.LightningModule, ABC):
             windows = data.every_window()
             states, seen = windows.states[:, :: self.stride], view.observe(windows.observed)
             states = view.encode(states, windows.observed)
+        with torch.device("meta"):  # for its size alone
+            image_dim = ImageEncoders(features, self.image_encoder).size
         shared = {
             "domain": data.domain_name,
             "horizon": data.horizon,
@@ -153,6 +165,9 @@ class Pretraining(pl.LightningModule, ABC):
             "encoder": data.encoder.identity,
             "view": self.hparams["view"],
             "perturb": self.hparams["perturb"],
+            "image_dim": image_dim,
+            "image_encoder": self.image_encoder,
+            "feature_dropout": expect_dropout(self.feature_dropout, features),
             "metrics": dict(data.metrics),
             "training": {
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
@@ -167,9 +182,8 @@ class Pretraining(pl.LightningModule, ABC):
             resolution = data.domain.plans.resolution
             normalization = Normalization.fit(states, view.scales if view else (), resolution)
             beside = None
-            refuse_images(features)
-            if features:
-                sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
+            sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
+            if sizes.measured_dim:
                 beside = Normalization.fit(joined_vectors(seen, features), sizes.entities, resolution)
                 if sizes.state_columns and (view is None or view.same_columns):  # else plans have another scale
                     beside.share(sizes.state_columns, normalization)
@@ -295,8 +309,22 @@ class Pretraining(pl.LightningModule, ABC):
 
     def _signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
-        different = ("training", "training_concepts", "perturb", "metrics")
+        different = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
+
+
+def expect_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
+    """The probabilities themselves.
+
+    Raises:
+        UserError: for a name that is no observed vector's.
+    """
+    vectors = [name for name, feature in features.items() if feature.kind == "vector"]
+    for name in shares:
+        if name not in vectors:
+            told = f"one of {', '.join(vectors)}" if vectors else "nothing, as no vector is observed"
+            raise UserError(f"model.feature_dropout: expected {told}, found {name!r}")
+    return dict(shares)
 
 
 def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
@@ -338,6 +366,7 @@ class PretrainingModule(Pretraining):
         condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
             (the published code draws once a batch).
         learning_rate, warmup_steps, weight_decay, ema_decay, guidance, view, perturb, output, seed: see :class:`Pretraining`.
+        image_encoder, feature_dropout: likewise.
         prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
             which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
@@ -374,8 +403,22 @@ class PretrainingModule(Pretraining):
         compile: bool = False,
         output: str | None = None,
         seed: int = 0,
+        image_encoder: Mapping[str, Any] | None = None,
+        feature_dropout: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(learning_rate, warmup_steps, weight_decay, ema_decay, guidance, view, perturb, output, seed)
+        super().__init__(
+            learning_rate,
+            warmup_steps,
+            weight_decay,
+            ema_decay,
+            guidance,
+            view,
+            perturb,
+            output,
+            seed,
+            image_encoder,
+            feature_dropout,
+        )
         self.save_hyperparameters()
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         if not 0 <= code_share <= 1:

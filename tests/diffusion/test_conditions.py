@@ -145,11 +145,6 @@ def test_features_may_come_in_any_order_and_others_do_not_matter() -> None:
         net.vector({OBSERVED: world, "speed": torch.zeros(3, 3)})
 
 
-def test_images_are_refused_as_long_as_there_is_no_encoder_for_them() -> None:
-    with pytest.raises(UserError, match="key 'observed/photo': expected vectors, found images"):
-        model(*NETWORKS[0][:2], photo=Feature((3, 8, 8), "image"))
-
-
 def test_a_name_that_is_no_encoder() -> None:
     with pytest.raises(UserError, match="initial_encoder: expected one of flat, entities, set, found 'deep'"):
         condition_encoder("deep", Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8)

@@ -347,14 +347,6 @@ def test_new_demonstrations_of_other_columns_are_refused(fitted: Path) -> None:
         trainer(max_epochs=1).invert(module, InversionData("own", demonstrations="wide.npz", steps=2))
 
 
-@pytest.mark.parametrize("beside", [{}, {"observed/wind": np.zeros((12, 2))}])
-def test_a_model_of_observed_images_is_refused_before_it_learns(tmp_path: Path, beside: dict[str, np.ndarray]) -> None:
-    file = write(tmp_path / "seen.npz", **{"observed/view": np.zeros((12, 3, 8, 8), np.uint8)}, **beside)
-    module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8}, output="model")
-    with pytest.raises(UserError, match=r"key 'observed/view': expected vectors, found images"):
-        trainer(max_steps=1).fit(module, datamodule=OwnData(file, batch_size=4, steps_per_epoch=1, encoder="hashing"))
-
-
 def test_new_demonstrations_without_what_is_observed_are_refused(tmp_path: Path) -> None:
     file = write(tmp_path / "windy.npz", **{"observed/wind": np.zeros((12, 2))})
     module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8}, output="model")

@@ -11,6 +11,7 @@ from ftl_lightning.domains.tabletop.policies import POLICIES
 from ftl_lightning.domains.tabletop.source import NAME, STATE_NAMES, STATE_UNITS, Expert
 from ftl_lightning.domains.tabletop.success import judge
 from ftl_lightning.domains.tabletop.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.tabletop.views import VIEWS
 
 HORIZON = 32
 """States in a plan; the paper's number."""
@@ -38,6 +39,7 @@ DOMAIN = Domain(
     ),
     source=lambda root: Expert(),
     observed=FEATURES,
+    views=VIEWS,
     headline="closed loop success",
     show=Show(deferred(f"{RENDERING}:render")),
     closed_loop=ClosedLoop(

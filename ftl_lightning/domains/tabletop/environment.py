@@ -14,8 +14,11 @@ from ftl_lightning.domains.tabletop.world import ARM, FINGERS, FRONT, OVERHEAD, 
 from ftl_lightning.errors import UserError
 
 IMAGE, POSE = "image", "pose"
-FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,))}
-"""The overhead camera's picture, without the arm; measured place (m), quaternion (real part last) and opening (m) of the hand."""
+FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,), state=(0, 1, 2, 7))}
+"""The overhead camera's picture, without the arm; measured place (m), quaternion (real part last) and opening (m) of the hand.
+
+Place and opening are what a plan starts from, but for the millimetres by which the arm lags behind what it is told.
+"""
 ACTION = 4
 """Place of the hand (m) and opening of the gripper (m): what plans consist of."""
 MAX_STEPS = 160

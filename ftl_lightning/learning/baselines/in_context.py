@@ -19,6 +19,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
 
 
@@ -179,6 +180,8 @@ class InContextPretraining(Pretraining):
         prompts: most demonstrations that are given; each step and concept draws one to so many.
         plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
         stride: see :class:`~ftl_lightning.learning.baselines.transitions.StepConfig`; ``data.horizon`` is one more.
+        images: folder of our pretrained model, whose image encoders are used as they are, where images are observed:
+            demonstrations are read before training.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
 
@@ -194,10 +197,16 @@ class InContextPretraining(Pretraining):
         prompts: int = 5,
         plan_horizon: int | None = None,
         stride: int = 1,
+        images: str | None = None,
         **options: Any,
     ) -> None:
         super().__init__(**options)
         self.save_hyperparameters()
+        if images is not None:
+            source = GenerativeModel.load(images)
+            if source.images is None:
+                raise UserError(f"model.images: expected a model that observes images, found {images}, which does not")
+            self.image_encoder, self._images = dict(source.config.image_encoder), source.images.state_dict()
         if prompts < 1:
             raise UserError(f"model.prompts: expected 1 or more, found {prompts}")
         self.stride = stride
@@ -210,15 +219,19 @@ class InContextPretraining(Pretraining):
         embeddings: Tensor,
         initial_normalization: Normalization | None,
     ) -> InContextModel:
-        if initial_normalization is None:
+        if not shared["observed"]:
             raise UserError(f"data.class_path: expected a domain with observed features, found {data.domain.name}: nothing follows")
         own = {name: self.hparams[name] for name in ("tokens", "bins", "width", "layers", "heads", "stride")}
-        sizes = Sizes(**{key: shared[key] for key in ("horizon", "state_dim", "concept_dim", "observed")})
+        sizes = Sizes(**{key: shared[key] for key in ("horizon", "state_dim", "concept_dim", "observed", "image_dim")})
+        if sizes.image_dim and self.hparams["images"] is None:
+            raise UserError("model.images: expected the folder of a model that reads these images, found none")
         size = own["tokens"] * (sizes.vector_dim + sizes.state_dim)
         horizon = self.hparams["plan_horizon"] or data.domain.plans.horizon
         config = InContextConfig(**dict(shared) | own | {"concept_dim": size, "horizon": horizon})
         expect_window(config, data)
         model = InContextModel(config, data.domain, normalization, torch.zeros(len(embeddings), size), initial_normalization)
+        if model.images is not None:
+            take_images(model.images, self._images, self.hparams["images"])
         self._prompts = model.prompts(data.training)
         # Roads are hidden from whole prompts, as they are from a present in each of two windows.
         self._hidden = model.prompts(data.training, hide=True) if config.perturb else self._prompts
@@ -249,3 +262,16 @@ class InContextPretraining(Pretraining):
         index = nn.utils.rnn.pad_sequence(queries, batch_first=True, padding_value=-1)
         logits = model.follow(memory, given, observed[index])[index >= 0]
         return functional.cross_entropy(logits.movedim(-1, 1), target[index[index >= 0]], reduction="none").mean(dim=1)
+
+
+def take_images(encoders: nn.Module, weights: Mapping[str, Tensor], folder: str) -> None:
+    """Give image encoders the weights of a trained model's, which stay as they are.
+
+    Raises:
+        UserError: for a model that observes other images.
+    """
+    try:
+        encoders.load_state_dict(weights)
+    except RuntimeError as error:
+        raise UserError(f"model.images: expected a model that observes the same images, found {folder}") from error
+    encoders.requires_grad_(False)

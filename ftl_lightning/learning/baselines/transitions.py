@@ -62,7 +62,8 @@ def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], obse
     """
     config = model.config
     assert isinstance(config, StepConfig)
-    first = model.decode(predict(model.vector(observed)), observed)
+    images = model.of_images(observed)  # those of the start: what follows is imagined, and no picture shows it
+    first = model.decode(predict(model.vector(observed, images)), observed)
     if config.horizon == 1 or (config.horizon, config.stride) == (2, 1):
         return first
     ((name, columns),) = [(name, feature.state) for name, feature in model.domain.observed.items() if feature.state]
@@ -70,7 +71,7 @@ def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], obse
     states = [observed[name][:, columns], first[:, -1]]
     while len(states) < 1 + -(-(config.horizon - 1) // config.stride):
         present[name][:, columns] = states[-1]
-        states.append(model.decode(predict(model.vector(present)), present)[:, -1])
+        states.append(model.decode(predict(model.vector(present, images)), present)[:, -1])
     coarse = torch.stack(states, dim=1)
     at = torch.arange(config.horizon, device=coarse.device) / config.stride
     before = at.long().clamp(max=len(states) - 2)

@@ -1,0 +1,206 @@
+"""What a network reads of an image: a few numbers, trained with the rest of it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ftl_lightning.demonstrations.features import Feature, Observed
+from ftl_lightning.errors import UserError
+from ftl_lightning.ranges import expect_range
+
+GROUPS = 8
+"""Of group normalisation, which replaces batch normalisation: that keeps statistics beside the weights, which no running average
+of weights holds (Chi et al., 2023)."""
+RESNET18 = "resnet18"
+NETWORKS = ("small", RESNET18)
+HEADS = ("keypoints", "grid")
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions with group normalisation (He et al., 2016).
+
+    Args:
+        inputs, outputs: channels.
+        stride: of the first convolution.
+    """
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        self.norms = nn.ModuleList(nn.GroupNorm(GROUPS, outputs) for _ in range(2))
+        self.skip = nn.Conv2d(inputs, outputs, 1, stride, bias=False) if stride > 1 or inputs != outputs else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, inputs, height, width)`` to ``(batch, outputs, height / stride, width / stride)``."""
+        hidden = functional.relu(self.norms[0](self.first(x)))
+        out: Tensor = functional.relu(self.norms[1](self.second(hidden)) + self.skip(x))
+        return out
+
+
+class SpatialSoftmax(nn.Module):
+    """Where in the image each channel is largest, and how large (Levine et al., 2016).
+
+    Args:
+        channels: of the feature map.
+        keypoints: how many.
+    """
+
+    def __init__(self, channels: int, keypoints: int) -> None:
+        super().__init__()
+        self.maps = nn.Conv2d(channels, keypoints, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to column, row (-1 to 1) and height of each keypoint ``(batch, 3 * keypoints)``."""
+        maps = self.maps(x)
+        height, width = maps.shape[2:]
+        share = maps.flatten(2).softmax(dim=-1).unflatten(-1, (height, width))
+        column = share.sum(dim=2) @ torch.linspace(-1, 1, width, device=x.device)
+        row = share.sum(dim=3) @ torch.linspace(-1, 1, height, device=x.device)
+        return torch.cat((column, row, (share * maps).sum(dim=(2, 3)).tanh()), dim=-1)
+
+
+class Grid(nn.Module):
+    """All of the last feature map, with fewer channels.
+
+    Args:
+        channels: of the feature map.
+        kept: channels that are kept.
+        height, width: of the feature map.
+    """
+
+    def __init__(self, channels: int, kept: int, height: int, width: int) -> None:
+        super().__init__()
+        self.kept = nn.Conv2d(channels, kept, 1)
+        self.size = kept * height * width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to ``(batch, size)``."""
+        out: Tensor = self.kept(x).flatten(1)
+        return out
+
+
+def _small(channels: int, widths: Sequence[int], height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
+    """A residual network whose feature map is a quarter of the image in each direction, and that map's shape."""
+    first, *rest = widths
+    layers: list[nn.Module] = [nn.Conv2d(channels, first, 5, 2, padding=2, bias=False), nn.GroupNorm(GROUPS, first), nn.ReLU()]
+    before = first
+    for number, after in enumerate(rest):
+        layers.append(ResidualBlock(before, after, 1 if number else 2))
+        before = after
+    halvings = 2 if rest else 1
+    for _ in range(halvings):
+        height, width = -(-height // 2), -(-width // 2)
+    return nn.Sequential(*layers), (before, height, width)
+
+
+class _ResNet18(nn.Module):
+    """ResNet-18 of ``transformers``, from scratch, with group normalisation."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        from transformers import ResNetConfig, ResNetModel  # seconds of import that the small network does not need
+
+        sizes = [64, 128, 256, 512]
+        self.network = ResNetModel(
+            ResNetConfig(num_channels=channels, embedding_size=64, hidden_sizes=sizes, depths=[2] * 4, layer_type="basic")
+        )
+        for module in list(self.network.modules()):
+            for name, child in module.named_children():
+                if isinstance(child, nn.BatchNorm2d):
+                    setattr(module, name, nn.GroupNorm(GROUPS, child.num_features))
+        self.network.pooler = nn.Identity()  # type: ignore[assignment]
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.network(x).last_hidden_state
+        return out
+
+
+class ImageEncoder(nn.Module):
+    """Features of one image, from scratch: a residual network with group normalisation, and keypoints or the final grid of it.
+
+    Args:
+        shape: of the image, ``(channels, height, width)``.
+        network: ``'small'``, or ``'resnet18'`` (11 million weights).
+        widths: channels of the small network's first convolution and of its residual blocks, multiples of 8; its map is a quarter
+            of the image in each direction.
+        head: ``'keypoints'`` (spatial softmax), or ``'grid'``, all of the last map, which suits ResNet-18, whose map is small.
+        keypoints: how many; of the grid, how many channels.
+        crop: pixels by which each side is smaller after cropping: at random in training, in the middle else; 0 for none.
+
+    Raises:
+        UserError: for a value that is none.
+    """
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        network: str = "small",
+        widths: Sequence[int] = (16, 32, 32),
+        head: str = "keypoints",
+        keypoints: int = 32,
+        crop: int = 0,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (("network", network, NETWORKS), ("head", head, HEADS)):
+            if value not in known:
+                raise UserError(f"model.image_encoder.{name}: expected one of {', '.join(known)}, found {value!r}")
+        if not widths or any(width < GROUPS or width % GROUPS for width in widths):
+            raise UserError(f"model.image_encoder.widths: expected multiples of {GROUPS}, found {list(widths)}")
+        channels, height, width = shape
+        expect_range("model.image_encoder.keypoints", keypoints, 1)
+        expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
+        self.crop = crop
+        height, width = height - crop, width - crop
+        if network == RESNET18:
+            self.network: nn.Module = _ResNet18(channels)
+            size = (512, -(-height // 32), -(-width // 32))
+        else:
+            self.network, size = _small(channels, widths, height, width)
+        self.head = SpatialSoftmax(size[0], keypoints) if head == "keypoints" else Grid(size[0], keypoints, *size[1:])
+        self.size = 3 * keypoints if isinstance(self.head, SpatialSoftmax) else self.head.size
+        """Numbers that are read of an image."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` uint8 to ``(batch, size)``."""
+        height, width = (side - self.crop for side in images.shape[2:])
+        if self.crop and self.training:
+            top, left = torch.randint(self.crop + 1, (2, len(images), 1), device=images.device)
+            rows, columns = (first + torch.arange(side, device=images.device) for first, side in ((top, height), (left, width)))
+            every = torch.arange(len(images), device=images.device)[:, None, None]
+            images = images[every, :, rows[:, :, None], columns[:, None]].movedim(-1, 1)
+        elif self.crop:
+            middle = self.crop // 2
+            images = images[:, :, middle : middle + height, middle : middle + width]
+        out: Tensor = self.head(self.network(images.float() / 127.5 - 1))
+        return out
+
+
+class ImageEncoders(nn.Module):
+    """An :class:`ImageEncoder` for each observed image, whose features stand one after another.
+
+    Args:
+        observed: features by name, of which the images are encoded.
+        arguments: of every encoder.
+
+    Raises:
+        UserError: for arguments that it does not take.
+    """
+
+    def __init__(self, observed: Mapping[str, Feature], arguments: Mapping[str, Any]) -> None:
+        super().__init__()
+        self.names = [name for name, feature in observed.items() if feature.kind == "image"]
+        try:
+            encoders = [ImageEncoder(observed[name].shape, **arguments) for name in self.names]
+        except TypeError as error:
+            raise UserError(f"model.image_encoder: expected arguments of an image encoder, found others ({error})") from error
+        self.encoders = nn.ModuleList(encoders)
+        self.size = sum(encoder.size for encoder in encoders)
+        """Numbers that are read of all images."""
+
+    def forward(self, observed: Observed) -> Tensor:
+        """Images by name ``(batch, *shape)`` to ``(batch, size)``."""
+        return torch.cat([encoder(observed[name]) for name, encoder in zip(self.names, self.encoders, strict=True)], dim=-1)

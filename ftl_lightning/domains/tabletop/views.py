@@ -1,0 +1,76 @@
+"""How a model sees the table-top: as it is, and in training also from other sides."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.domains.domain import View
+from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE
+from ftl_lightning.domains.tabletop.world import OVERHEAD
+
+MOVED = "moved"
+SHIFT = 0.03
+"""Metres by which a scene is shifted at most, in x and in y."""
+TURN = 0.5
+"""Radians by which it is turned at most."""
+HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)
+"""Metres of the table from the middle of a picture to its edge."""
+MIDDLE = OVERHEAD.target[:2]
+"""x and y in the middle of a picture."""
+
+
+def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, shifts: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """Behaviour and picture as if the whole scene had been mirrored, turned about the middle of the picture, and shifted.
+
+    The camera looks straight down, so that the picture moves as the table does, but for the few per cent by which what is high
+    looks larger. The hand's yaw, which plans do not command, stays.
+
+    Args:
+        states: ``(sample, horizon, 4)``.
+        observed: ``image`` and ``pose``.
+        mirrored: ``(sample,)`` of bool, left and right exchanged.
+        angles: ``(sample,)`` in radians.
+        shifts: ``(sample, 2)`` in metres, x and y.
+    """
+    cos, sin = angles.cos(), angles.sin()
+    side = torch.where(mirrored, -1.0, 1.0)
+    turned = torch.stack((torch.stack((cos, -sin * side), dim=-1), torch.stack((sin, cos * side), dim=-1)), dim=-2)
+    middle = states.new_tensor(MIDDLE)
+
+    def places(values: Tensor) -> Tensor:
+        """``(sample, ..., columns)`` whose first two columns are x and y."""
+        flat = values.flatten(1, -2) if values.dim() > 2 else values[:, None]
+        xy = (flat[..., :2] - middle) @ turned.transpose(1, 2) + middle + shifts[:, None]
+        return torch.cat((xy, flat[..., 2:]), dim=-1).reshape(values.shape)
+
+    # A pixel at column u and row v (-1 to 1) shows x = -HALF v, y = -HALF u, seen from the middle. Each is taken from where it was.
+    back = turned.transpose(1, 2)
+    offset = (back @ shifts[..., None])[..., 0] / HALF
+    theta = torch.cat((back.flip(1, 2), offset.flip(1)[..., None]), dim=-1)
+    images = observed[IMAGE]
+    grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
+    drawn = functional.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
+    return places(states), {**observed, IMAGE: drawn.round().to(torch.uint8), POSE: places(observed[POSE])}
+
+
+def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
+    if draw is None:  # a new task shows all that a model sees
+        return states, observed
+    drawn = torch.rand((len(states), 4), generator=draw, device=states.device)
+    return moved(states, observed, drawn[:, 0] < 0.5, TURN * (2 * drawn[:, 1] - 1), SHIFT * (2 * drawn[:, 2:] - 1))
+
+
+VIEWS = {
+    MOVED: View(
+        features=FEATURES,
+        observe=lambda observed: observed,
+        encode=lambda states, observed: states,
+        decode=lambda states, observed: states,
+        perturb=_perturb,
+        same_columns=True,
+    )
+}
+"""``moved``: with ``model.perturb``, scenes are mirrored, turned and shifted at random together with what is done in them."""

@@ -1,0 +1,266 @@
+"""What is read of images: by each network, once a plan, trained and averaged with the rest of a model."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.diffusion.image_encoder import ImageEncoder, ImageEncoders, SpatialSoftmax
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.data import InversionData, OwnData
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.baselines.cloning import CloningPretraining
+from ftl_lightning.learning.baselines.in_context import InContextPretraining
+from ftl_lightning.learning.baselines.prompting import InContextAdaptation
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.learning.pretraining import PretrainingModule
+from ftl_lightning.seeding import generator
+from ftl_lightning.trainer import Trainer
+
+SHAPE = (3, 32, 24)
+SIDE, TIME = 16, 6
+
+
+@pytest.mark.parametrize(
+    ("options", "size"),
+    [
+        ({}, 96),
+        ({"widths": [8], "keypoints": 4}, 12),
+        ({"widths": [8, 16], "head": "grid", "keypoints": 2}, 2 * 8 * 6),
+        ({"network": "resnet18", "head": "grid", "keypoints": 4}, 4 * 1 * 1),
+        ({"crop": 4, "head": "grid", "keypoints": 1}, 7 * 5),
+    ],
+)
+def test_sizes(options: dict[str, Any], size: int) -> None:
+    encoder = ImageEncoder(SHAPE, **options)
+    images = torch.randint(256, (5, *SHAPE), dtype=torch.uint8)
+    for training in (True, False):
+        found = encoder.train(training)(images)
+        assert found.shape == (5, size)
+        assert found.isfinite().all()
+    assert encoder.size == size
+    # What a running average of the weights does not hold would be lost in the model that is saved.
+    assert not list(encoder.buffers())
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in encoder.modules())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"network": "vit"}, "model.image_encoder.network: expected one of small, resnet18, found 'vit'"),
+        ({"head": "mean"}, "model.image_encoder.head: expected one of keypoints, grid, found 'mean'"),
+        ({"widths": [12]}, r"model.image_encoder.widths: expected multiples of 8, found \[12\]"),
+        ({"widths": []}, r"model.image_encoder.widths: expected multiples of 8, found \[\]"),
+        ({"crop": 24}, "model.image_encoder.crop: expected a number from 0 to 23, found 24"),
+        ({"keypoints": 0}, "model.image_encoder.keypoints: expected 1 or more, found 0"),
+        ({"depth": 3}, "model.image_encoder: expected arguments of an image encoder, found others"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        ImageEncoders({"view": Feature(SHAPE, "image")}, options)
+
+
+def test_a_keypoint_is_where_its_map_is_largest() -> None:
+    softmax = SpatialSoftmax(1, 1)
+    nn.init.constant_(softmax.maps.weight, 50.0)
+    maps = torch.zeros(2, 1, 5, 9)
+    maps[0, 0, 0, 8] = maps[1, 0, 3, 2] = 1
+    expected = torch.tensor([[1.0, -1.0], [-0.5, 0.5]])  # column, row
+    torch.testing.assert_close(softmax(maps)[:, :2], expected, atol=1e-4, rtol=0)
+
+
+def test_crops_are_random_in_training_and_in_the_middle_else() -> None:
+    encoder = ImageEncoder((1, 8, 8), widths=[8], crop=2)
+    seen: list[Tensor] = []
+    encoder.network.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    image = torch.arange(64, dtype=torch.uint8).reshape(1, 1, 8, 8)
+    encoder.eval()(image)
+    torch.testing.assert_close(seen[0], image[:, :, 1:7, 1:7].float() / 127.5 - 1)
+    torch.manual_seed(0)
+    encoder.train()(image.expand(200, -1, -1, -1))
+    corners = ((seen[1][:, 0, 0, 0] + 1) * 127.5).round().long()
+    assert set(corners.tolist()) == {8 * row + column for row in range(3) for column in range(3)}
+
+
+# In models: ways to a bright dot or away from it, where the dot is seen in a picture alone
+
+
+def ways(concept: str, count: int, seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    dots = rng.integers(2, SIDE - 2, (count, 2))
+    images = np.zeros((count, 1, SIDE, SIDE), np.uint8)
+    for image, (x, y) in zip(images, dots, strict=True):
+        image[0, y - 1 : y + 2, x - 1 : x + 2] = 255
+    middle = np.full((count, 2), SIDE / 2)
+    goals = dots if concept == "to" else 2 * middle - dots
+    share = np.linspace(0, 1, TIME)[:, None]
+    states = middle[:, None] + (goals - middle)[:, None] * share
+    return {
+        "states": states.astype(np.float32),
+        "observed/view": images,
+        "observed/place": middle.astype(np.float32) + rng.normal(0, 0.1, middle.shape).astype(np.float32),
+        "concepts": np.array([concept] * count),
+    }
+
+
+def write(path: Path, *parts: dict[str, np.ndarray], **more: np.ndarray) -> str:
+    np.savez(path, **{key: np.concatenate([part[key] for part in parts]) for key in parts[0]}, **more)  # type: ignore[arg-type]
+    return str(path)
+
+
+def trainer(**options: Any) -> Trainer:
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
+    return Trainer(accelerator="cpu", default_root_dir="logs", **(quiet | options))
+
+
+SMALL: dict[str, Any] = {"image_encoder": {"widths": [8, 16], "keypoints": 4}, "feature_dropout": {"place": 0.4}}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small model that sees pictures, and beside it the file that it was fitted to."""
+    folder = tmp_path_factory.mktemp("seen")
+    file = write(folder / "ways.npz", ways("to", 300, 0), ways("away", 300, 1))
+    module = PretrainingModule(
+        denoiser_args={"hidden_dim": 64, "depth": 2, "condition_dim": 32},
+        diffusion_steps=20,
+        prediction="clean",
+        loss="clean",
+        learning_rate=3e-3,
+        warmup_steps=20,
+        ema_decay=0.98,
+        output=str(folder / "model"),
+        **SMALL,
+    )
+    trainer(max_steps=600).fit(module, datamodule=OwnData(file, batch_size=64, steps_per_epoch=600, encoder="hashing"))
+    return folder / "model"
+
+
+def error(model: GenerativeModel, concept: str) -> float:
+    """Mean distance in pixels of where new ways end from where the picture says that they should."""
+    new = ways(concept, 40, 7)
+    observed = {name: torch.from_numpy(new[f"observed/{name}"]) for name in ("view", "place")}
+    composition = Composition(model.concept(concept)[None], torch.ones(1))
+    plans = model.sample([composition], 40, Sampling("ddim", 10, 0.1), [generator("cpu", 0)], observed)[0]
+    return float((plans[:, -1] - torch.from_numpy(new["states"][:, -1])).norm(dim=-1).mean())
+
+
+def test_a_model_sees_where_to_go(fitted: Path) -> None:
+    model = load_model(fitted)
+    assert isinstance(model, GenerativeModel)
+    assert model.config.image_dim == 12
+    assert dict(model.config.feature_dropout) == {"place": 0.4}
+    for concept in ("to", "away"):
+        assert error(model, concept) < 1.5  # by chance 5
+    again = GenerativeModel.load(fitted)
+    assert again.hash == model.hash
+
+
+def test_the_encoder_is_part_of_the_running_average(tmp_path: Path) -> None:
+    file = write(tmp_path / "ways.npz", ways("to", 12, 0), ways("away", 12, 1))
+    module = PretrainingModule(
+        denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8},
+        learning_rate=1e-2,
+        warmup_steps=0,
+        output="model",
+        **SMALL,
+    )
+    seen: list[dict[str, Tensor]] = []
+    plain = module.on_train_start
+
+    def begin() -> None:
+        plain()
+        seen.append({name: value.clone() for name, value in module.model.named_parameters()})
+
+    module.on_train_start = begin  # type: ignore[method-assign]
+    trainer(max_steps=3).fit(module, datamodule=OwnData(file, batch_size=8, steps_per_epoch=3, encoder="hashing"))
+    raw, average = dict(module.raw.named_parameters()), dict(module.model.named_parameters())
+    images = [name for name in average if name.startswith("images.")]
+    assert images
+    for name in images:
+        assert not torch.equal(average[name], seen[0][name]), name
+        assert not torch.equal(average[name], raw[name]), name
+
+
+def test_vectors_are_hidden_in_training_alone(fitted: Path) -> None:
+    model = load_model(fitted)
+    new = ways("to", 400, 3)
+    observed = {name: torch.from_numpy(new[f"observed/{name}"]) for name in ("view", "place")}
+    whole = model.vector(observed)
+    torch.manual_seed(0)
+    part = model.train().vector(observed)
+    model.eval()
+    assert whole is not None
+    assert part is not None
+    hidden = (part[:, :2] == 0).all(dim=1)
+    assert 0.3 < hidden.float().mean() < 0.5
+    torch.testing.assert_close(part[~hidden], whole[~hidden])
+    torch.testing.assert_close(part[:, 2:], whole[:, 2:])
+
+
+def test_images_are_read_once_a_plan_and_concepts_are_learned_through_them(fitted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, calls = load_model(fitted), []
+    plain = ImageEncoder.forward
+    monkeypatch.setattr(ImageEncoder, "forward", lambda self, images: calls.append(len(images)) or plain(self, images))  # type: ignore[func-returns-value]
+    assert isinstance(model, GenerativeModel)
+    error(model, "to")
+    assert calls == [40]
+    calls.clear()
+    file = write(fitted.parent / "new.npz", ways("away", 5, 11))
+    module = InversionModule(str(fitted), samples=16, components=1, output="concepts")
+    trainer(max_epochs=1).invert(module, InversionData("own", demonstrations=file, steps=4))
+    # Once a step; the rest is where the learned concept is judged.
+    assert calls.count(16) == 4
+    assert set(calls) == {16, 128}
+    assert Path("concepts/away.safetensors").is_file()
+
+
+def test_mistakes_in_what_is_hidden(fitted: Path) -> None:
+    with pytest.raises(UserError, match=r"model\.feature_dropout\.place: expected a number from 0 to 1, found 2.0"):
+        PretrainingModule(feature_dropout={"place": 2.0})
+    data = OwnData(str(fitted.parent / "ways.npz"), encoder="hashing")
+    with pytest.raises(UserError, match=r"model\.feature_dropout: expected one of place, found 'view'"):
+        trainer(max_steps=1).fit(PretrainingModule(feature_dropout={"view": 0.5}), datamodule=data)
+
+
+def test_cloning_looks_once_and_in_context_learning_takes_a_trained_encoder(fitted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = str(fitted.parent / "ways.npz")
+    cloning = CloningPretraining(hidden_dim=16, output="bc", plan_horizon=2, **SMALL)
+    data = OwnData(file, batch_size=8, steps_per_epoch=2, horizon=2, encoder="hashing")
+    trainer(max_steps=2).fit(cloning, datamodule=data)
+    observed = {name: torch.from_numpy(ways("to", 3, 0)[f"observed/{name}"]) for name in ("view", "place")}
+    model = load_model("bc")
+    calls: list[int] = []
+    plain = ImageEncoder.forward
+    monkeypatch.setattr(ImageEncoder, "forward", lambda self, images: calls.append(len(images)) or plain(self, images))  # type: ignore[func-returns-value]
+    composition = Composition(model.concept("to")[None], torch.ones(1))
+    assert model.sample([composition], 3, Sampling(), [generator("cpu", 0)], observed).shape == (1, 3, 2, 2)
+    assert calls == [3]
+
+    parts = [ways("to", 12, 0), ways("away", 12, 1)]
+    for part in parts:  # at every time, as in-context learning asks for
+        for name in ("observed/view", "observed/place"):
+            part[name] = np.repeat(part[name][:, None], TIME, axis=1)
+    seen = write(Path("seen.npz"), *parts, per_step=np.array(["view", "place"]))
+    options: dict[str, Any] = {"tokens": 3, "bins": 4, "width": 8, "layers": 1, "heads": 2, "prompts": 2, "plan_horizon": 2}
+    data = OwnData(seen, batch_size=8, steps_per_epoch=2, horizon=2, encoder="hashing")
+    with pytest.raises(UserError, match=r"model\.images: expected the folder of a model that reads these images, found none"):
+        trainer(max_steps=2).fit(InContextPretraining(**options), datamodule=data)
+    module = InContextPretraining(**options, images=str(fitted), output="icl")
+    trainer(max_steps=2).fit(module, datamodule=data)
+    source, read = load_model(fitted).images, load_model("icl").images
+    assert source is not None
+    assert read is not None
+    for name, weight in source.state_dict().items():
+        assert torch.equal(read.state_dict()[name], weight), name
+    adaptation = InContextAdaptation("icl", output="prompts")
+    trainer(max_epochs=1).invert(adaptation, InversionData("own", demonstrations=seen, steps=1))
+    assert sorted(path.name for path in Path("prompts").iterdir()) == ["away.safetensors", "to.safetensors"]

@@ -1,0 +1,52 @@
+"""Scenes seen from other sides: picture, pose and plan move together, as the scene itself would."""
+
+import math
+
+import pytest
+import torch
+
+from ftl_lightning.demonstrations.features import take
+from ftl_lightning.domains.tabletop.environment import IMAGE, POSE
+from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, TRIANGLE, scene_of
+from ftl_lightning.domains.tabletop.source import initial_states
+from ftl_lightning.domains.tabletop.views import MOVED, SHIFT, VIEWS, moved
+from ftl_lightning.seeding import generator
+
+PLACED = {CIRCLE: (0.42, 0.12, 0.0), TRIANGLE: (0.55, -0.10, 0.3), BOOK: (0.57, 0.10, 0.2)}
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_moved_scene_looks_as_one_that_was_built_there(mirrored: bool) -> None:
+    angle, shift = 0.3, (-0.02, 0.015)
+    place = torch.tensor([[[x, y, 0.1, 0.0] for x, y, _ in PLACED.values()]])
+    start = initial_states(torch.from_numpy(scene_of(PLACED))[None])
+    plan, seen = moved(place, start.observed, torch.tensor([mirrored]), torch.tensor([angle]), torch.tensor([shift]))
+    there = {
+        name: (float(x), float(y), angle + (-yaw if mirrored else yaw))
+        for (name, (_, _, yaw)), (x, y) in zip(PLACED.items(), plan[0, :, :2], strict=True)
+    }
+    built = initial_states(torch.from_numpy(scene_of(there))[None])
+    off, before = ((one[IMAGE].float() - built.observed[IMAGE].float()).abs().mean() for one in (seen, start.observed))
+    assert off < 0.3 * before  # what is left are edges, and the shift of what is high
+    assert torch.equal(plan[..., 2:], place[..., 2:])
+    hand = start.observed[POSE]
+    x, y = hand[0, 0] - 0.5, -hand[0, 1] if mirrored else hand[0, 1]
+    turned = [0.5 + math.cos(angle) * x - math.sin(angle) * y + shift[0], math.sin(angle) * x + math.cos(angle) * y + shift[1]]
+    torch.testing.assert_close(seen[POSE][0, :2], torch.tensor(turned), atol=1e-5, rtol=0)
+    assert torch.equal(seen[POSE][:, 2:], hand[:, 2:])
+
+
+def test_perturbing_is_random_as_drawn_and_leaves_a_new_task_alone() -> None:
+    perturb = VIEWS[MOVED].perturb
+    assert perturb is not None
+    start = initial_states(torch.from_numpy(scene_of(PLACED))[None])
+    many = take(start.observed, [0] * 50)
+    plans = torch.tensor([0.5, 0.0, 0.1, 0.0]).expand(50, 4, 4)
+    once, again, other = (perturb(plans, many, generator("cpu", seed)) for seed in (0, 0, 1))
+    assert torch.equal(once[0], again[0])
+    assert torch.equal(once[1][IMAGE], again[1][IMAGE])
+    assert not torch.equal(once[0], other[0])
+    # The middle is only shifted.
+    assert 0.8 * SHIFT < (once[0][..., :2] - plans[..., :2]).abs().max() <= SHIFT + 1e-6
+    assert once[1][IMAGE].dtype == torch.uint8
+    assert perturb(plans, many, None)[0] is plans
