@@ -186,7 +186,7 @@ class FewShot:
             found = _padded(values)[0]
             if found.dim() == len(feature.shape) + 2:
                 per_step.append(key)
-            features[key] = found if feature.kind == "vector" else found.to(torch.uint8)
+            features[key] = found.float() if feature.kind == "vector" else found
         return Demonstrations(
             states=padded,
             lengths=lengths,
