@@ -220,9 +220,14 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
 def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
     """Initial states of a file's demonstrations or of the goal; ``None`` where behaviour has none."""
     from ftl_lightning.demonstrations.container import Demonstrations
+    from ftl_lightning.errors import UserError
 
     if options.initial:
-        return Demonstrations.load(options.initial).fitted(domain.observed).initial_states
+        found = Demonstrations.load(options.initial)
+        try:
+            return found.fitted(domain.observed).initial_states
+        except UserError as error:
+            raise UserError(f"{options.initial}: {error}") from None
     task = _start_task(options, domain)
     return domain.source(None).starts(task, options.count, options.seed) if domain.observed else None
 

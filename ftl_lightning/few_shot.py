@@ -186,7 +186,7 @@ class FewShot:
             found = _padded(values)[0]
             if found.dim() == len(feature.shape) + 2:
                 per_step.append(key)
-            features[key] = found if feature.kind == "vector" else found.to(torch.uint8)
+            features[key] = found.float() if feature.kind == "vector" else found
         return Demonstrations(
             states=padded,
             lengths=lengths,
@@ -297,7 +297,9 @@ class FewShot:
     def _starts(self, given: Start | None) -> InitialStates | None:
         if given is None or isinstance(given, InitialStates):
             return given
-        return InitialStates({name: _tensor(values) for name, values in _by_name(given, self.domain.observed).items()})
+        features = self.domain.observed
+        found = {name: _tensor(values) for name, values in _by_name(given, features).items()}
+        return InitialStates({name: own.float() if features[name].kind == "vector" else own for name, own in found.items()})
 
     def evaluate(self, plans: Demonstrations, goal: str) -> dict[str, float]:
         """What the domain's metrics say of plans: shares of right ones, or means, by name.

@@ -124,7 +124,7 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({error})") from error
-    found = header.get("kind")
+    found = header.get("kind") if isinstance(header, dict) else None
     if found != kind:
         raise UserError(f"{path}: expected a {kind} file, found {f'a {found} file' if found else 'a file of other software'}")
     if header.get("format") not in versions:

@@ -144,7 +144,7 @@ def test_a_setting_can_be_another(scenes: FewShot, shown: Demonstrations, capsys
 
 def test_demonstrations_that_do_not_fit_are_told(scenes: FewShot, drives: FewShot) -> None:
     both = scenes.domain.source(None).split("train", 1, 0)
-    world = r"key 'observed/world': expected shape \(52,\) each, found "
+    world = r"key 'observed/world': expected float32 of shape \(52,\) each, found "
     for model, states, observed, message in (
         (scenes, both, None, "states: expected demonstrations of one concept, found those of circle above"),
         (scenes, np.zeros((3, 1, 20)), None, r"states: expected shape \(demo, time, 21\), found \(3, 1, 20\)"),
@@ -157,7 +157,7 @@ def test_demonstrations_that_do_not_fit_are_told(scenes: FewShot, drives: FewSho
             drives,
             np.zeros((2, 9, 13)),
             np.zeros((2, 9, 51)),
-            r"key 'observed/world': expected shape \(52,\) each, found shape \(51,\)",
+            r"key 'observed/world': expected float32 of shape \(52,\) each, found float32 of shape \(51,\)",
         ),
     ):
         with pytest.raises(UserError, match=message):
@@ -279,7 +279,7 @@ def test_plans_start_where_they_are_told_to(drives: FewShot) -> None:
     assert torch.equal(Demonstrations.load("plans.safetensors").initial_states.require_scenes(), starts.require_scenes())
     for observed, message in (
         (None, r"observed: expected where plans start \(world \(52,\)\), found nothing; model.starts\(goal\) draws some"),
-        (np.zeros((2, 51)), r"key 'observed/world': expected shape \(52,\) a sample, found \(51,\)"),
+        (np.zeros((2, 51)), r"key 'observed/world': expected float32 of shape \(52,\) a sample, found float32 of shape \(51,\)"),
         ({"place": np.zeros((2, 52))}, "observed: expected world, found place"),
     ):
         with pytest.raises(UserError, match=message):

@@ -3,23 +3,25 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ftl_lightning.demonstrations.container import VERSION, Demonstrations
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.errors import UserError
 from ftl_lightning.progress import bar
 from ftl_lightning.tensor_file import cache_folder, content_hash
 
 Tell = Callable[[], None]
+FORM = 2
+"""Of demonstrations: what is cached of another one is not used. Compression of images, which came later, changes none."""
 
 
 def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demonstrations]) -> Demonstrations:
     """Read demonstrations from the cache, or make them, with a progress bar, and keep them there.
 
     Args:
-        settings: everything that decides them; a file is named by their hash and that of the container's form.
+        settings: everything that decides them; a file is named by their hash and :data:`FORM`.
         total: how many are made.
         make: makes them; calls its argument after each.
     """
-    path = cache_folder() / f"{settings['domain']}-{content_hash({**settings, 'form': VERSION})}.safetensors"
+    path = cache_folder() / f"{settings['domain']}-{content_hash({**settings, 'form': FORM})}.safetensors"
     if path.is_file():
         try:
             return Demonstrations.load(path)

@@ -1,5 +1,6 @@
 """The container of demonstrations and its file."""
 
+import math
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -16,12 +17,18 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import bytes_hash, load_tensors, save_tensors, serialise
 
 KIND = "demonstrations"
-VERSION = 2
-"""Of the file's form. Form 1, which still loads, had ``initial_states`` in place of observed features and scenes."""
+VERSION = 3
+"""Of the form of a file with images: they are compressed (zlib), 1-D uint8 under their keys, with their shapes by key in the header
+as ``compressed``. Forms 1 and 2 still load."""
+PLAIN = 2
+"""The form of a file without images. Older files of this form hold images that are not compressed; form 1 had ``initial_states`` in
+place of observed features and scenes."""
 _OBSERVED = "observed/"
 """Before the names of observed features in a file."""
 INITIAL = "initial_state"
 """The observed feature that the initial states of form 1 become."""
+MOST_SHRUNK = 1032
+"""zlib makes one byte of so many at most."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,9 @@ class Demonstrations:
             if tuple(feature.shape[: len(leading)]) != leading or feature.dim() <= len(leading):
                 told = ", ".join(map(str, leading))
                 raise UserError(f"key 'observed/{name}': expected shape ({told}, ...), found {tuple(feature.shape)}")
+            if feature.dtype not in (torch.float32, torch.uint8):
+                found = str(feature.dtype).removeprefix("torch.")
+                raise UserError(f"key 'observed/{name}': expected float32, or uint8 for images, found {found}")
         if self.scenes is not None and (self.scenes.dim() != 2 or len(self.scenes) != count):
             raise UserError(f"key 'scenes': expected shape ({count}, scene), found {tuple(self.scenes.shape)}")
         for key, tensor in self.tensors.items():
@@ -102,12 +112,7 @@ class Demonstrations:
     @property
     def features(self) -> dict[str, Feature]:
         """Shape and kind of each observed feature."""
-        return {
-            name: Feature(
-                tuple(values.shape[2 if name in self.per_step else 1 :]), "image" if values.dtype == torch.uint8 else "vector"
-            )
-            for name, values in self.observed.items()
-        }
+        return {name: Feature.of(values, leading=2 if name in self.per_step else 1) for name, values in self.observed.items()}
 
     def select(self, concept: str) -> Self:
         """The demonstrations of one concept."""
@@ -176,11 +181,13 @@ class Demonstrations:
 
     @property
     def hash(self) -> str:
-        """16-digit hash of states, lengths, observed features and scenes."""
+        """16-digit hash of states, lengths, observed features and scenes, whatever the form of a file that holds them."""
         return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:
-        """Write one safetensors file with a JSON header, whole or not at all."""
+        """Write one safetensors file with a JSON header, whole or not at all; images are compressed, see :data:`VERSION`."""
+        images = {_OBSERVED + name: values for name, values in self.observed.items() if values.dtype == torch.uint8}
+        packed = {key: _packed(values) for key, values in images.items()}
         header = {
             "domain": self.domain,
             "state_names": self.state_names,
@@ -188,8 +195,9 @@ class Demonstrations:
             "concepts": self.concepts,
             "per_step": self.per_step,
             "provenance": dict(self.provenance),
+            **({"compressed": {key: list(values.shape) for key, values in images.items()}} if images else {}),
         }
-        save_tensors(path, KIND, self.tensors, header, VERSION)
+        save_tensors(path, KIND, self.tensors | packed, header, VERSION if images else PLAIN)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -203,24 +211,27 @@ class Demonstrations:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
         """
         path = Path(path)
-        tensors, header = _read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, VERSION))
+        tensors, header = _read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, PLAIN, VERSION))
         if "states" not in tensors:
             raise UserError(f"{path}: key 'states': expected (demo, time, state), found only {', '.join(tensors) or 'nothing'}")
         states = tensors["states"]
         demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
-        observed = {name.removeprefix(_OBSERVED): values for name, values in tensors.items() if name.startswith(_OBSERVED)}
-        per_step, scenes = tuple(header.get("per_step", ())), tensors.get("scenes")
-        if (initial := tensors.get("initial_states")) is not None:  # form 1
-            observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()
-            scenes = initial[:, 0] if initial.dim() == 3 else initial
         try:
+            texts = {key: _texts(key, header[key]) for key in _TEXTS if key in header}
+            per_step, scenes = texts.get("per_step", ()), tensors.get("scenes")
+            if header.get("format") == VERSION and demos:
+                tensors |= _unpacked(tensors, header.get("compressed"), per_step)
+            observed = {name.removeprefix(_OBSERVED): values for name, values in tensors.items() if name.startswith(_OBSERVED)}
+            if (initial := tensors.get("initial_states")) is not None:  # form 1
+                observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()
+                scenes = initial[:, 0] if initial.dim() == 3 else initial
             return cls(
                 states=states,
                 lengths=tensors.get("lengths", torch.full((demos,), time)),
                 domain=str(header.get("domain", "")),
-                state_names=tuple(header.get("state_names", map(str, range(columns)))),
-                state_units=tuple(header.get("state_units", ("",) * columns)),
-                concepts=tuple(header.get("concepts", ("",) * demos)),
+                state_names=texts.get("state_names", tuple(map(str, range(columns)))),
+                state_units=texts.get("state_units", ("",) * columns),
+                concepts=texts.get("concepts", ("",) * demos),
                 observed=observed,
                 per_step=per_step,
                 scenes=scenes,
@@ -238,7 +249,7 @@ class Demonstrations:
             features: of the domain, by name.
 
         Raises:
-            UserError: for a feature that is missing or has another shape.
+            UserError: for a feature that is missing or has another type or shape.
         """
         found = self
         if set(self.observed) == {INITIAL} and INITIAL not in features and features:
@@ -253,11 +264,11 @@ class Demonstrations:
             }
             found = replace(self, observed=observed, per_step=tuple(features) if per_step else ())
         for name, feature in features.items():
-            if (own := found.features.get(name)) is None or own.shape != feature.shape:
-                told = "none" if own is None else f"shape {own.shape}"
+            if (own := found.features.get(name)) is None or not own.fits(feature):
+                told = "none" if own is None else own.words
                 if own is not None and own.shape[1:] == feature.shape and name not in found.per_step:
                     told += " (observed at every time? then list it in per_step)"
-                raise UserError(f"key 'observed/{name}': expected shape {feature.shape} each, found {told}")
+                raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {told}")
         return found
 
 
@@ -307,6 +318,68 @@ def _padded(values: Tensor, time: int) -> Tensor:
     """``(demo, time, ...)`` with its last time repeated."""
     last = values[:, -1:].expand(-1, time - values.shape[1], *(-1,) * (values.dim() - 2))
     return torch.cat((values, last), dim=1)
+
+
+_TEXTS = ("state_names", "state_units", "concepts", "per_step")
+"""Keys of a file's header that hold lists of texts."""
+
+
+def _texts(key: str, found: object) -> tuple[str, ...]:
+    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+        raise UserError(f"key {key!r}: expected a list of texts, found {str(found)[:50]}")
+    return tuple(found)
+
+
+def _packed(images: Tensor) -> Tensor:
+    """Images ``(demo, ...)`` uint8, compressed as one ``(byte,)``."""
+    return torch.frombuffer(bytearray(zlib.compress(images.detach().cpu().numpy().tobytes())), dtype=torch.uint8)
+
+
+def _unpacked(tensors: Mapping[str, Tensor], shapes: object, per_step: Sequence[str]) -> dict[str, Tensor]:
+    """The images of a file whose header names their shapes, by key.
+
+    What they need in memory is bounded: their shapes begin as that of the states, and nothing beyond them is decompressed.
+
+    Args:
+        tensors: as they are in the file; states ``(demo, time, state)`` among them.
+        shapes: by key, as the header says.
+        per_step: names of features that are known at every time.
+
+    Raises:
+        UserError: naming the key, if its shape is none that it can have, or its bytes are damaged.
+    """
+    if not isinstance(shapes, dict):
+        raise UserError(f"key 'compressed': expected shapes of images by key, found {str(shapes)[:50]}")
+    found = {}
+    for key, shape in shapes.items():
+        packed = tensors.get(key)
+        if packed is None or not key.startswith(_OBSERVED) or packed.dtype != torch.uint8 or packed.dim() != 1:
+            told = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"
+            raise UserError(f"key {key!r}: expected compressed images, uint8 of shape (byte,) under 'observed/NAME', found {told}")
+        leading = list(tensors["states"].shape[: 2 if key.removeprefix(_OBSERVED) in per_step else 1])
+        numbers = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
+        if not numbers or shape[: len(leading)] != leading or math.prod(shape) > MOST_SHRUNK * len(packed):
+            begin = ", ".join(map(str, leading))
+            raise UserError(
+                f"key {key!r}: expected images of shape ({begin}, ...) that fit into {len(packed)} compressed bytes, "
+                f"found the shape {str(shape)[:50]} in the header; the file is damaged"
+            )
+        content = _decompressed(key, packed.numpy().tobytes(), math.prod(shape))
+        found[key] = torch.from_numpy(np.frombuffer(content, dtype=np.uint8)).reshape(shape)
+    return found
+
+
+def _decompressed(key: str, packed: bytes, size: int) -> bytearray:
+    reader = zlib.decompressobj()
+    try:
+        content = bytearray(reader.decompress(packed, size + 1))  # one more: room to meet the end
+    except zlib.error as error:
+        raise UserError(f"key {key!r}: expected compressed images, found damaged bytes ({error}); take another copy") from error
+    if len(content) != size or not reader.eof or reader.unused_data:
+        more = len(content) > size or reader.unused_data
+        told = "more" if more else f"{len(content)}{'' if reader.eof else ' and no end'}"
+        raise UserError(f"key {key!r}: expected {size} bytes of images, found {told}; the file is damaged: take another copy")
+    return content
 
 
 def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

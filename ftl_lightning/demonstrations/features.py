@@ -39,6 +39,20 @@ class Feature:
         """Numbers in one sample."""
         return math.prod(self.shape)
 
+    @property
+    def words(self) -> str:
+        """Type and shape of one sample, for messages."""
+        return f"{'uint8 images' if self.kind == 'image' else 'float32'} of shape {self.shape}"
+
+    @classmethod
+    def of(cls, values: Tensor, leading: int = 1) -> Self:
+        """What samples ``(sample, *shape)`` are, by their type and what follows the first axes."""
+        return cls(tuple(values.shape[leading:]), "image" if values.dtype == torch.uint8 else "vector")
+
+    def fits(self, expected: "Feature") -> bool:
+        """Whether kind and shape are those of another feature."""
+        return (self.kind, self.shape) == (expected.kind, expected.shape)
+
 
 def take(observed: Observed, rows: Tensor | Sequence[int] | slice | int) -> dict[str, Tensor]:
     """Some of the samples, or one."""
@@ -56,7 +70,7 @@ def joined(parts: Sequence[Observed]) -> dict[str, Tensor]:
 
 
 def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None:
-    """Refuse observations that lack a feature or hold one of another shape.
+    """Refuse observations that lack a feature or hold one of another shape, or bytes for numbers and the other way round.
 
     Raises:
         UserError: naming the feature.
@@ -64,9 +78,9 @@ def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None
     for name, feature in expected.items():
         if name not in observed:
             found = ", ".join(observed) or "none"
-            raise UserError(f"key 'observed': expected the feature {name!r} of shape {feature.shape}, found {found}")
-        if (found_shape := tuple(observed[name].shape[1:])) != feature.shape:
-            raise UserError(f"key 'observed/{name}': expected shape {feature.shape} a sample, found {found_shape}")
+            raise UserError(f"key 'observed': expected the feature {name!r}, {feature.words}, found {found}")
+        if not (own := Feature.of(observed[name])).fits(feature):
+            raise UserError(f"key 'observed/{name}': expected {feature.words} a sample, found {own.words}")
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,10 @@ def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout
         loop: the domain's environment.
         starts: initial states with scenes.
         policy: acts in those episodes that still run.
+
+    Raises:
+        UserError: naming the episode, for a scene that cannot be built.
+        MemoryError, OSError: for what the machine lacks; what else an environment raises costs its episode alone.
     """
     count, kept = len(starts), loop.keeps or tuple(starts.observed)
     observed = {
@@ -49,13 +53,25 @@ def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout
 
 
 def reset(loop: ClosedLoop, scenes: Tensor) -> InitialStates:
-    """What is observed where an environment is reset to scenes ``(episode, scene)``."""
+    """What is observed where an environment is reset to scenes ``(episode, scene)``.
+
+    Raises:
+        UserError: naming the episode, for a scene that cannot be built.
+    """
     environment = loop.environment()
     try:
-        seen = [environment.reset(options={"scene": scene.numpy()})[0] for scene in scenes]
+        seen = [_begun(environment, row, scene) for row, scene in enumerate(scenes)]
     finally:
         environment.close()
     return InitialStates({name: torch.stack([torch.as_tensor(one[name]) for one in seen]) for name in seen[0]}, scenes)
+
+
+def _begun(environment: gymnasium.Env[Any, Any], row: int, scene: Tensor) -> Any:
+    """What is observed where an episode starts."""
+    try:
+        return environment.reset(options={"scene": scene.numpy()})[0]
+    except UserError as error:
+        raise UserError(f"episode {row}: {error}") from error
 
 
 def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy, advance: Advance) -> None:
@@ -65,6 +81,10 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
     # What is seen now, of every feature; a rollout keeps some of them.
     now = {name: values[rows].clone() for name, values in found.starts.observed.items()}
     place = {row: index for index, row in enumerate(rows)}
+
+    def fail(row: int, why: str) -> None:
+        found.failed[row] = True
+        _LOG.warning("episode %d, %s; the episode counts as failed", row, why)
 
     def see(row: int, step: int, seen: Observed) -> None:
         for name, values in now.items():
@@ -76,10 +96,18 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                 found.observed[name][row, step:] = values[place[row]]
 
     try:
+        active = []
         for row in rows:
             environments[row] = loop.environment()
-            see(row, 0, environments[row].reset(options={"scene": scenes[row].numpy()})[0])
-        active = rows
+            try:
+                seen = _begun(environments[row], row, scenes[row])
+            except (UserError, MemoryError, OSError):
+                raise
+            except Exception as error:  # whatever a simulator raises: the other episodes go on
+                fail(row, f"before its first step: {error!r}")
+                continue
+            see(row, 0, seen)
+            active.append(row)
         for step in range(loop.steps):
             advance()
             if not active:
@@ -90,14 +118,14 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
             going = []
             for row, action in zip(active, actions, strict=True):
                 if not np.isfinite(action).all():
-                    found.failed[row] = True
-                    _LOG.warning("episode %d, step %d: the plan is not finite; the episode counts as failed", row, step)
+                    fail(row, f"step {step}: the plan is not finite")
                     continue
                 try:
                     seen, _, terminated, truncated, info = environments[row].step(action)
-                except Exception as error:  # whatever a simulator raises: the other episodes go on
-                    found.failed[row] = True
-                    _LOG.warning("episode %d, step %d: %s; the episode counts as failed", row, step, repr(error))
+                except (MemoryError, OSError):
+                    raise
+                except Exception as error:  # as above
+                    fail(row, f"step {step}: {error!r}")
                     continue
                 see(row, step + 1, seen)
                 found.infos[row].update(info)

@@ -187,7 +187,8 @@ class Evaluator(pl.Callback):
         policy = PlanFollower(make, planner(model, domain.closed_loop), self.replan)
         done = executed(judged, policy, domain)
         firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
-        return [replace(one, followed=torch.stack(policy.followed[first])) for one, first in zip(done, firsts, strict=True)]
+        plans = (policy.followed.get(first) for first in firsts)  # none where the first episode could not begin
+        return [replace(one, followed=None if own is None else torch.stack(own)) for one, own in zip(done, plans, strict=True)]
 
     def real(self, module: Evaluable, judged: Sequence[Judged]) -> list[Real]:
         """The real behaviour that the plans of each task are compared with."""

@@ -29,8 +29,13 @@ def test_samples_are_taken_joined_and_moved_feature_by_feature() -> None:
 @pytest.mark.parametrize(
     ("features", "message"),
     [
-        ({"speed": Feature((1,))}, r"key 'observed': expected the feature 'speed' of shape \(1,\), found place, photo"),
-        ({"place": Feature((3,))}, r"key 'observed/place': expected shape \(3,\) a sample, found \(2,\)"),
+        ({"speed": Feature((1,))}, r"key 'observed': expected the feature 'speed', float32 of shape \(1,\), found place, photo"),
+        (
+            {"place": Feature((3,))},
+            r"key 'observed/place': expected float32 of shape \(3,\) a sample, found float32 of shape \(2,\)",
+        ),
+        ({"photo": Feature((3, 2, 2))}, "expected float32 of shape .* a sample, found uint8 images of shape"),
+        ({"place": Feature((2,), "image")}, "expected uint8 images of shape .* a sample, found float32 of shape"),
     ],
 )
 def test_features_that_are_missing_or_of_another_shape_are_told(features: dict[str, Feature], message: str) -> None:

@@ -141,7 +141,9 @@ def test_features_may_come_in_any_order_and_others_do_not_matter() -> None:
         torch.testing.assert_close(found, expected)
     with pytest.raises(UserError, match="key 'observed': expected the feature 'speed'"):
         net.vector({OBSERVED: world})
-    with pytest.raises(UserError, match=r"key 'observed/speed': expected shape \(2,\) a sample, found \(3,\)"):
+    with pytest.raises(
+        UserError, match=r"key 'observed/speed': expected float32 of shape \(2,\) a sample, found float32 of shape \(3,\)"
+    ):
         net.vector({OBSERVED: world, "speed": torch.zeros(3, 3)})
 
 

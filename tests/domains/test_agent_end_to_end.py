@@ -105,7 +105,11 @@ def test_demonstrations_without_observed_features_are_refused(model: Path, capsy
 
     np.savez("plain.npz", states=np.zeros((2, 150, 13), dtype=np.float32))
     assert main(["invert", *INVERT, f"--model.pretrained={model}", "--data.demonstrations=plain.npz", *QUIET]) == 2
-    assert "key 'observed/world': expected shape (52,) each, found none" in capsys.readouterr().err
+    expected = "plain.npz: key 'observed/world': expected float32 of shape (52,) each, found none"
+    assert expected in capsys.readouterr().err
+    assert main(["sample", f"--pretrained={model}", "--compose=go to bowl", "--initial=plain.npz"]) == 2
+    assert expected in capsys.readouterr().err
+    assert not Path("states.safetensors").exists()
 
 
 def test_demonstrations_whose_first_observations_alone_are_known(model: Path) -> None:

@@ -352,7 +352,8 @@ def test_new_demonstrations_without_what_is_observed_are_refused(tmp_path: Path)
     module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8}, output="model")
     trainer(max_steps=1).fit(module, datamodule=OwnData(file, batch_size=4, steps_per_epoch=1, encoder="hashing"))
     np.savez("calm.npz", states=walks("go between", 2), concepts="calm")
-    with pytest.raises(UserError, match=r"data.demonstrations: key 'observed/wind': expected shape \(2,\) each, found none"):
+    expected = r"data.demonstrations: key 'observed/wind': expected float32 of shape \(2,\) each, found none"
+    with pytest.raises(UserError, match=expected):
         trainer(max_epochs=1).invert(
             InversionModule("model", output="concepts"), InversionData("own", demonstrations="calm.npz", steps=2)
         )

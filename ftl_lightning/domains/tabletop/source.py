@@ -16,7 +16,7 @@ from ftl_lightning.domains.tabletop import scenes as scene_settings
 from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE, TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, perform
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
-from ftl_lightning.domains.tabletop.tasks import TRAINING_CONCEPTS, expect_task
+from ftl_lightning.domains.tabletop.tasks import PUSH, TRAINING_CONCEPTS, expect_task
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import VALIDATION_SEED, task_key
 
@@ -29,6 +29,8 @@ MOST = 4
 """Episodes that are tried at most for each that is kept."""
 FORM = 1
 """Of the experts; what is cached of another one is not used."""
+TIMES = {PUSH: 4}
+"""So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
     for module in (environment, experts, scene_settings, success, world)
@@ -49,12 +51,19 @@ def _scene(job: Job) -> np.ndarray:
 
 
 def _episode(job: Job) -> Episode | None:
-    """What the expert did; nothing where the simulator raised an error."""
+    """What the expert did; nothing where the simulator raised an error.
+
+    Raises:
+        MemoryError, OSError: for what the machine lacks, which would cost every other episode too.
+        UserError: where the simulator does not start.
+    """
     task, seed, number = job
     if not _ENVIRONMENT:
         _ENVIRONMENT.append(TableTopEnvironment())
     try:
         return perform(_ENVIRONMENT[0], task, _scene(job), np.random.default_rng([seed, task_key(task), number, 1]))
+    except (MemoryError, OSError):
+        raise
     except Exception as error:  # whatever the simulator raises: the other episodes go on
         _LOG.warning("table-top %r, episode %d: %r; it counts as rejected", task, number, error)
         _ENVIRONMENT.pop().close()
@@ -116,8 +125,9 @@ class Expert:
     """Episodes of the scripted experts that succeeded, from the cache if they are there."""
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """``count`` demonstrations of every training concept, and more of those in :data:`TIMES`."""
         own = seed if name == "train" else VALIDATION_SEED + seed
-        return concatenate([self.draw(task, count, own) for task in TRAINING_CONCEPTS])
+        return concatenate([self.draw(task, TIMES.get(task, 1) * count, own) for task in TRAINING_CONCEPTS])
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         settings = {"domain": NAME, "task": expect_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
