@@ -11,11 +11,11 @@ from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
 
-MOVED = "moved"
-SHIFT = 0.03
+MOVED, STEPS = "moved", "steps"
+SHIFT = 0.05
 """Metres by which a scene is shifted at most, in x and in y."""
 TURN = 0.5
-"""Radians by which it is turned at most."""
+"""Radians by which half of the scenes are turned at most; the others are turned by any angle."""
 HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)
 """Metres of the table from the middle of a picture to its edge."""
 MIDDLE = OVERHEAD.target[:2]
@@ -59,8 +59,14 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
     if draw is None:  # a new task shows all that a model sees
         return states, observed
-    drawn = torch.rand((len(states), 4), generator=draw, device=states.device)
-    return moved(states, observed, drawn[:, 0] < 0.5, TURN * (2 * drawn[:, 1] - 1), SHIFT * (2 * drawn[:, 2:] - 1))
+    drawn = torch.rand((len(states), 5), generator=draw, device=states.device)
+    most = torch.where(drawn[:, 1] < 0.5, TURN, math.pi)
+    return moved(states, observed, drawn[:, 0] < 0.5, most * (2 * drawn[:, 2] - 1), SHIFT * (2 * drawn[:, 3:] - 1))
+
+
+def _start(observed: Observed) -> Tensor:
+    """The state that a plan starts from ``(sample, 1, 4)``."""
+    return observed[POSE][:, None, list(FEATURES[POSE].state)]
 
 
 VIEWS = {
@@ -71,6 +77,17 @@ VIEWS = {
         decode=lambda states, observed: states,
         perturb=_perturb,
         same_columns=True,
-    )
+    ),
+    STEPS: View(
+        features=FEATURES,
+        observe=lambda observed: observed,
+        encode=lambda states, observed: states - _start(observed),
+        decode=lambda states, observed: states + _start(observed),
+        perturb=_perturb,
+    ),
 }
-"""``moved``: with ``model.perturb``, scenes are mirrored, turned and shifted at random together with what is done in them."""
+"""With ``model.perturb``, scenes are mirrored, turned and shifted at random together with what is done in them.
+
+``moved`` shows states as they are. ``steps`` shows how they differ from where the hand is: methods that go from one state to the
+next need not copy it.
+"""

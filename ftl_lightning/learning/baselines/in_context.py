@@ -19,7 +19,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
 
 
@@ -180,7 +180,7 @@ class InContextPretraining(Pretraining):
         prompts: most demonstrations that are given; each step and concept draws one to so many.
         plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
         stride: see :class:`~ftl_lightning.learning.baselines.transitions.StepConfig`; ``data.horizon`` is one more.
-        images: folder of our pretrained model, whose image encoders are used as they are, where images are observed:
+        images: folder of a trained model of any method, whose image encoders are used as they are, where images are observed:
             demonstrations are read before training.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
@@ -203,7 +203,7 @@ class InContextPretraining(Pretraining):
         super().__init__(**options)
         self.save_hyperparameters()
         if images is not None:
-            source = GenerativeModel.load(images)
+            source = load_model(images)
             if source.images is None:
                 raise UserError(f"model.images: expected a model that observes images, found {images}, which does not")
             self.image_encoder, self._images = dict(source.config.image_encoder), source.images.state_dict()
