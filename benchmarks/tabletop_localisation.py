@@ -2,9 +2,9 @@
 
     python benchmarks/tabletop_localisation.py --pretrained pretrained/tabletop --out results/tabletop_localisation.json
 
-From the features of an image, linear regression (ridge) and a small network each estimate where every object is. They learn from new
-scenes of all tasks, and are tested on others; the encoder stays as it was trained. Errors are distances in centimetres; `middle` is
-the error of always saying the mean place.
+From the features of an image, linear regression (ridge) and a small network each estimate where every object is. They learn from
+new scenes of all tasks, and are tested on others; the encoder stays as it was trained. Errors are distances in centimetres;
+`middle` is the error of always saying the mean place.
 """
 
 import argparse
@@ -33,7 +33,8 @@ def ridge(features: Tensor, places: Tensor) -> nn.Module:
     """A linear layer from ``(scene, n)`` to ``(scene, 2)``, by least squares with a penalty of 1 on standardised features."""
     mean, spread = features.mean(dim=0), features.std(dim=0) + 1e-6
     inputs = torch.cat(((features - mean) / spread, torch.ones(len(features), 1)), dim=1).double()
-    weights = torch.linalg.solve(inputs.T @ inputs + torch.eye(inputs.shape[1], dtype=torch.double), inputs.T @ places.double()).float()
+    penalty = torch.eye(inputs.shape[1], dtype=torch.double)
+    weights = torch.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ places.double()).float()
     layer = nn.Linear(features.shape[1], 2)
     with torch.no_grad():
         layer.weight.copy_((weights[:-1] / spread[:, None]).T)
