@@ -29,6 +29,9 @@ PATIENCE = 10
 SLOWER = 1.4
 """On the book pushes are slower by this factor, which gives more moments to learn from."""
 STRAIGHT_SPEED = 0.009
+NOISE = (0.001, 0.004)
+"""Metres, see :class:`Style`: people's hands wander by millimetres, and only demonstrations that leave the straight way show how to
+come back to it (Laskey et al., 2017)."""
 BESIDE = 0.105
 """Metres between bowl and circle that is put down beside it, centre to centre."""
 
@@ -63,7 +66,7 @@ def style(rng: np.random.Generator) -> Style:
         speed=float(rng.uniform(0.8, 1.2)),
         behind=float(rng.uniform(0.055, 0.08)),
         hover=float(rng.uniform(0.11, 0.16)),
-        noise=float(rng.uniform(0.0003, 0.001)),
+        noise=float(rng.uniform(*NOISE)),
         grasp=rng.uniform(-0.004, 0.004, 2),
         place=rng.uniform(-1, 1, 2),
     )
