@@ -14,11 +14,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
@@ -51,7 +52,10 @@ def load(path: str | Path) -> dict[str, Any]:
     Raises:
         UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
     """
-    found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+    try:
+        found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+    except OmegaConfBaseException as error:
+        raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
 
@@ -68,7 +72,7 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConf
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {names}")
+        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
     for name in names:
         yield from _parts(_beside(path, name), (*above, path))
     yield path, keys
@@ -91,12 +95,49 @@ def _relative(path: Path) -> Path:
 
 def _read(path: Path) -> DictConfig:
     try:
+        if (size := path.stat().st_size) > LONGEST:
+            raise ValueError(f"{size} bytes, more than {LONGEST}")
+        _expect_small(yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader))
         keys = OmegaConf.load(path)
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"{path}: expected a configuration file (YAML), found {' '.join(str(error).split())}") from error
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError, TypeError, LookupError) as error:
+        told = short(str(error), 200)
+        raise UserError(f"{path}: expected a configuration file (YAML), found {told}") from error
     if not isinstance(keys, DictConfig):
         raise UserError(f"{path}: expected a mapping of keys, found a list")
     return keys
+
+
+LONGEST = 1_000_000
+"""Bytes of a configuration file."""
+MOST_VALUES, DEEPEST = 100_000, 40
+"""Values of a configuration file, each alias counted as all that it stands for, and how deep they stand."""
+
+
+def _expect_small(root: yaml.Node | None) -> None:
+    """Refuse a file that a few aliases make huge, or endless.
+
+    Raises:
+        ValueError: saying so.
+    """
+    sizes: dict[int, int] = {}
+
+    def count(node: yaml.Node, left: int) -> int:
+        if not left:
+            raise ValueError(f"values deeper than {DEEPEST}, or an alias of itself")
+        if id(node) not in sizes:
+            parts = [] if isinstance(node, yaml.ScalarNode) else [part for one in node.value for part in _pair(one)]
+            sizes[id(node)] = 1 + sum(count(part, left - 1) for part in parts)
+        if sizes[id(node)] > MOST_VALUES:
+            raise ValueError(f"more than {MOST_VALUES} values, counting what aliases stand for")
+        return sizes[id(node)]
+
+    if root is not None:
+        count(root, DEEPEST)
+
+
+def _pair(found: yaml.Node | tuple[yaml.Node, yaml.Node]) -> tuple[yaml.Node, ...]:
+    """An entry of a list, or key and value of a mapping."""
+    return found if isinstance(found, tuple) else (found,)
 
 
 def configurations(arguments: Sequence[str]) -> list[str]:

@@ -15,14 +15,19 @@ class UserError(Exception):
     """
 
 
-def short(value: object, most: int = 60) -> str:
-    """A text as it is, anything else as Python writes it, in one line of at most so many characters."""
-    try:
-        line = " ".join((value if isinstance(value, str) else repr(value)).split())
-    except (ValueError, RecursionError):  # a number of thousands of digits, or lists too deep
-        line = f"a very large {type(value).__name__}"
+def short(text: str, most: int = 60) -> str:
+    """A text in one line of at most so many characters."""
+    line = " ".join(text.split())
     half = (most - 5) // 2
     return line if len(line) <= most else f"{line[:half]} ... {line[-half:]}"
+
+
+def shown(value: object, most: int = 60) -> str:
+    """Anything as Python writes it, likewise."""
+    try:
+        return short(repr(value), most)
+    except (ValueError, RecursionError):  # a number of thousands of digits, or lists too deep
+        return f"a very large {type(value).__name__}"
 
 
 @contextmanager

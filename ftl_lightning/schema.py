@@ -12,10 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.ranges import LARGEST
 
-LARGEST = 1_000_000
-"""Of a whole number that a file or configuration names: a size or a number of things."""
 FLOAT32 = 3.4e38
 """Of a number with a point."""
 DEEPEST = 40
@@ -97,7 +96,7 @@ def built(kind: Callable[..., T], content: object, key: str, *given: object) -> 
     hints, needed = _arguments(kind)
     names = list(hints)[len(given) :]
     if not isinstance(content, Mapping):
-        raise UserError(f"{_named(key)}: expected a mapping, found {short(content)}")
+        raise UserError(f"{_named(key)}: expected a mapping, found {shown(content)}")
     for name in content:
         if name not in names:
             raise UserError(f"{_named(_joined(key, name))}: expected one of {short(', '.join(names), 120)}, found another key")
@@ -164,4 +163,4 @@ def _named(key: str) -> str:
 
 
 def _mistake(key: str, expected: str, found: object) -> UserError:
-    return UserError(f"{_named(key)}: expected {expected}, found {short(found)}")
+    return UserError(f"{_named(key)}: expected {expected}, found {shown(found)}")

@@ -14,7 +14,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.schema import parse_json
 from ftl_lightning.targets import expect_file
 
@@ -129,11 +129,13 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
         header = parse_json(text)
         found = header.get("kind") if isinstance(header, dict) else None
         if found != kind:
-            raise UserError(f"expected a {kind} file, found {f'a {short(found)} file' if found else 'a file of other software'}")
+            raise UserError(
+                f"expected a {kind} file, found {f'a {short(str(found))} file' if found else 'a file of other software'}"
+            )
         version = header.get("format")
         if type(version) is not int or version not in versions:
             expected = " or ".join(map(str, versions))
-            raise UserError(f"key 'format': expected {expected}, found {short(version)}; it is of another version")
+            raise UserError(f"key 'format': expected {expected}, found {shown(version)}; it is of another version")
         return tensors, header
 
 

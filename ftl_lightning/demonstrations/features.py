@@ -8,7 +8,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.errors import UserError, short
+from ftl_lightning.errors import UserError, shown
 
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
@@ -40,14 +40,14 @@ class Feature:
     def __post_init__(self) -> None:
         widths = {len(entity) for entity in self.entities}
         if len(widths) > 1 or widths == {0}:
-            raise UserError(f"entities: expected as many columns of each, found {short(sorted(widths))}")
+            raise UserError(f"entities: expected as many columns of each, found {shown(sorted(widths))}")
         for name, columns, size in (
             ("entities", [column for entity in self.entities for column in entity], self.size),
             ("attributes", self.attributes, max(widths, default=0)),
             ("state", self.state, self.size),
         ):
             if any(not 0 <= column < size for column in columns):
-                raise UserError(f"{name}: expected columns from 0 to {size - 1}, found {short(columns)}")
+                raise UserError(f"{name}: expected columns from 0 to {size - 1}, found {shown(columns)}")
 
     @property
     def size(self) -> int:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.demonstrations.features import Feature, Observed
-from ftl_lightning.errors import UserError, short
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.schema import built
 
@@ -155,7 +155,7 @@ class ImageEncoder(nn.Module):
         if not widths or any(width < GROUPS or width % GROUPS for width in widths):
             raise UserError(f"model.image_encoder.widths: expected multiples of {GROUPS}, found {list(widths)}")
         if len(shape) != 3 or not 0 < math.prod(shape) <= MOST_PIXELS:
-            raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {short(tuple(shape))}")
+            raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {shown(tuple(shape))}")
         channels, height, width = shape
         expect_range("model.image_encoder.keypoints", keypoints, 1)
         expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)

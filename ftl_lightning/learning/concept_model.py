@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -24,8 +25,8 @@ from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.ranges import expect_range
-from ftl_lightning.schema import LARGEST, built, expect_type, read_json
+from ftl_lightning.ranges import LARGEST, expect_range
+from ftl_lightning.schema import built, expect_type, read_json
 from ftl_lightning.tensor_file import (
     FORMAT,
     bytes_hash,
@@ -278,14 +279,30 @@ class ConceptModel(nn.Module, ABC):
         """Refuse a learned concept that belongs to another model.
 
         Raises:
-            UserError: if encoder, domain or pretrained model differ.
+            UserError: if encoder, domain or pretrained model differ, or its sizes are not those of the model.
         """
         mine = {"encoder": self.config.encoder, "domain": self.config.domain, "pretrained": self.hash}
         for key, expected in mine.items():
             if (found := getattr(concept.origin, key)) != expected:
                 raise UserError(
-                    f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
+                    f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(found)!r}; learn it again"
                 )
+        with about(path):
+            if concept.embeddings.shape[1] != concept.knots * self.config.concept_dim:
+                found = concept.embeddings.shape[1] // concept.knots
+                raise UserError(f"key 'embeddings': expected {self.config.concept_dim} numbers each, found {found}")
+            if concept.knots > 1 and not self.over_time:
+                raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")
+            if concept.adapter is not None:
+                self.expect_adapter(concept.adapter)
+
+    def expect_adapter(self, adapter: LowRank) -> None:
+        """Refuse an adapter that does not fit.
+
+        Raises:
+            UserError: naming what it would change; for a method without adapters, any.
+        """
+        raise UserError(f"key 'adapter': expected none for a model of {self.name}, found one")
 
     def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:
         """What to learn from: behaviour with another present, if the model's configuration says so."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning import diffusion
+from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, Context, batched, composed_epsilon
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
@@ -93,6 +94,9 @@ class GenerativeModel(TextConceptModel):
     def over_time(self) -> bool:
         found: bool = getattr(diffusion, self.config.denoiser).over_time
         return found
+
+    def expect_adapter(self, adapter: LowRank) -> None:
+        adapter.expect_fits(self.denoiser)
 
     @property
     def max_steps(self) -> int:

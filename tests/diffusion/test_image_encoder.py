@@ -62,7 +62,7 @@ def test_sizes(options: dict[str, Any], size: int) -> None:
         ({"keypoints": 0}, "model.image_encoder.keypoints: expected 1 or more, found 0"),
         (
             {"depth": 3},
-            "key .model.image_encoder.depth.: expected one of network, widths, head, keypoints, crop, found another key",
+            "key .model.image_encoder.depth.: expected one of network, widths, head, keypoints, crop",
         ),
     ],
 )

@@ -21,8 +21,7 @@ from ftl_lightning.learning.baselines.transitions import StepConfig, expect_wind
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
-from ftl_lightning.ranges import expect_range
-from ftl_lightning.schema import LARGEST
+from ftl_lightning.ranges import LARGEST, expect_range
 
 
 @dataclass(frozen=True, kw_only=True)
