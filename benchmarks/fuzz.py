@@ -3,8 +3,8 @@
     python benchmarks/fuzz.py --kind config.json --count 1000 --seed 0
 
 Outcomes: ``ok`` (the file is read and used), ``UserError`` (refused in one line of a bearable length), ``other`` (any other
-exception; the first case of each is printed), ``slow`` (more than 5 s), ``memory`` (more than 1 GB beyond what was there before) and
-``crash`` (the process died). A seed and a number give the same file on every machine.
+exception; the first case of each is printed), ``slow`` (more than 5 s), ``memory`` (more than 1 GB more than before) and ``crash``
+(the process died). A seed and a number give the same file on every machine.
 """
 
 import argparse

@@ -129,9 +129,8 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
         header = parse_json(text)
         found = header.get("kind") if isinstance(header, dict) else None
         if found != kind:
-            raise UserError(
-                f"expected a {kind} file, found {f'a {short(str(found))} file' if found else 'a file of other software'}"
-            )
+            told = f"a {short(str(found))} file" if found else "a file of other software"
+            raise UserError(f"expected a {kind} file, found {told}")
         version = header.get("format")
         if type(version) is not int or version not in versions:
             expected = " or ".join(map(str, versions))

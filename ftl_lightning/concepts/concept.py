@@ -136,7 +136,13 @@ class Concept:
         """All that it holds, by name."""
         modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
         factors = {} if self.adapter is None else self.adapter.tensors()
-        return {"loss": torch.tensor(self.origin.loss), "embeddings": self.embeddings, "weights": self.weights, **modes, **factors}
+        return {
+            "loss": torch.tensor(float(self.origin.loss)),
+            "embeddings": self.embeddings,
+            "weights": self.weights,
+            **modes,
+            **factors,
+        }
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.

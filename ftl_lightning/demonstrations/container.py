@@ -405,6 +405,10 @@ def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({told})") from error
     tensors = {}
     for name, array in arrays.items():
+        measured = name.startswith(_OBSERVED) or name in ("states", "lengths", "scenes")
+        if (measured and array.dtype.kind not in "fiub") or (name in (*_TEXTS, "domain") and array.dtype.kind != "U"):
+            told = "numbers" if measured else "texts"
+            raise UserError(f"{path}: key {short(name)!r}: expected an array of {told}, found one of {short(str(array.dtype))}")
         if array.dtype.kind in "fiub":
             # Images stay bytes; everything else that is measured is float32.
             image = array.dtype == np.uint8 and name.startswith(_OBSERVED)

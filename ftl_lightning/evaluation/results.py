@@ -64,6 +64,7 @@ LARGEST_WHOLE = 2**53
 """Of whole numbers, seeds among them."""
 COLUMNS = [field.name for field in fields(Row)]
 _WHOLE = [field.name for field in fields(Row) if field.type is int]
+_MAYBE_EMPTY = ("setting", "task", "variant", "omega", "model_hash")
 _TEXT = {field.name: str for field in fields(Row) if field.type is str}
 _BEFORE_VARIANTS = [name for name in COLUMNS if name not in ("variant", "role")]
 """The columns of files of version 0.1.0 and older."""
@@ -188,7 +189,8 @@ def _bad_cell(table: pd.DataFrame) -> tuple[int, str, str] | None:
         if name == "role":
             good, expected = values.isin((METHOD, REFERENCE)), f"{METHOD} or {REFERENCE}"
         elif name in _TEXT:
-            good, expected = values.notna(), "a text"
+            good = values.notna() & ((values != "") | (name in _MAYBE_EMPTY))
+            expected = "a text"
         elif name in _WHOLE:
             good, expected = numbers.between(0, LARGEST_WHOLE) & (numbers % 1 == 0), f"a whole number up to {LARGEST_WHOLE}"
         else:
