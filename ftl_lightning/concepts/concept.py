@@ -136,13 +136,8 @@ class Concept:
         """All that it holds, by name."""
         modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
         factors = {} if self.adapter is None else self.adapter.tensors()
-        return {
-            "loss": torch.tensor(float(self.origin.loss)),
-            "embeddings": self.embeddings,
-            "weights": self.weights,
-            **modes,
-            **factors,
-        }
+        loss = torch.tensor(float(self.origin.loss))
+        return {"loss": loss, "embeddings": self.embeddings, "weights": self.weights, **modes, **factors}
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.
@@ -202,6 +197,8 @@ class Concept:
             modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed) if several else None
             origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
             learned = cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)
+            if header.get("components", len(learned.weights)) != len(learned.weights):
+                raise UserError(f"key 'components': expected {len(learned.weights)}, found {shown(header['components'])}")
             expect_finite(learned.numbers, "content", "learn it again")
             return learned
 
