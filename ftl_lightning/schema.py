@@ -27,7 +27,7 @@ _LISTS = (tuple, list, collections.abc.Sequence)
 T = TypeVar("T")
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, kind: str = "JSON") -> Any:
     """What a JSON file says.
 
     Raises:
@@ -37,11 +37,15 @@ def read_json(path: Path) -> Any:
     with about(path):
         if (size := path.stat().st_size) > LONGEST_TEXT:
             raise UserError(f"expected at most {LONGEST_TEXT} bytes of JSON, found {size}")
-        return parse_json(path.read_bytes())
+        return parse_json(path.read_bytes(), kind)
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes, kind: str = "JSON") -> Any:
     """What a JSON text says.
+
+    Args:
+        text: of it.
+        kind: what it is expected to be, for messages.
 
     Raises:
         UserError: for damaged text, keys that stand there twice, numbers that are not finite, texts that are no Unicode, or lists
@@ -50,7 +54,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         found = json.loads(text.decode() if isinstance(text, bytes) else text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"expected JSON, found damaged text or too deep a nesting ({short(str(error))})") from error
+        raise UserError(f"expected {kind}, found damaged text or too deep a nesting ({short(str(error))})") from error
     _expect_plain(found, DEEPEST)
     return found
 
