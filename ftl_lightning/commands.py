@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.domain import Domain
 
 
-MOST_SAMPLES, MOST_DRAWN, MOST_WORKERS = 100_000, 1000, 1000
-"""Of samples or demonstrations that one command makes, of those that one figure shows, and of processes."""
+MOST_DEMONSTRATIONS, MOST_SAMPLES, MOST_DRAWN, MOST_WORKERS = 1_000_000, 10_000, 1000, 1000
+"""That one command makes; of samples, which are made in one batch, those that one figure shows too; and of processes."""
 
 
 def generate(
@@ -40,7 +40,7 @@ def generate(
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.errors import UserError
 
-    expect_count("count", count, 1, MOST_SAMPLES)
+    expect_count("count", count, 1, MOST_DEMONSTRATIONS)
     expect_range("seed", seed, 0)
     expect_count("workers", workers, 1, MOST_WORKERS)
     name = out.removeprefix("minari:")

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -54,7 +53,7 @@ def load(path: str | Path) -> dict[str, Any]:
     """
     try:
         found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, RecursionError) as error:
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
@@ -97,7 +96,6 @@ def _read(path: Path) -> DictConfig:
     try:
         if (size := path.stat().st_size) > LONGEST:
             raise ValueError(f"{size} bytes, more than {LONGEST}")
-        _expect_small(yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader))
         keys = OmegaConf.load(path)
     except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError, TypeError, LookupError) as error:
         told = short(str(error), 200)
@@ -107,37 +105,8 @@ def _read(path: Path) -> DictConfig:
     return keys
 
 
-LONGEST = 1_000_000
-"""Bytes of a configuration file."""
-MOST_VALUES, DEEPEST = 100_000, 40
-"""Values of a configuration file, each alias counted as all that it stands for, and how deep they stand."""
-
-
-def _expect_small(root: yaml.Node | None) -> None:
-    """Refuse a file that a few aliases make huge, or endless.
-
-    Raises:
-        ValueError: saying so.
-    """
-    sizes: dict[int, int] = {}
-
-    def count(node: yaml.Node, left: int) -> int:
-        if not left:
-            raise ValueError(f"values deeper than {DEEPEST}, or an alias of itself")
-        if id(node) not in sizes:
-            parts = [] if isinstance(node, yaml.ScalarNode) else [part for one in node.value for part in _pair(one)]
-            sizes[id(node)] = 1 + sum(count(part, left - 1) for part in parts)
-        if sizes[id(node)] > MOST_VALUES:
-            raise ValueError(f"more than {MOST_VALUES} values, counting what aliases stand for")
-        return sizes[id(node)]
-
-    if root is not None:
-        count(root, DEEPEST)
-
-
-def _pair(found: yaml.Node | tuple[yaml.Node, yaml.Node]) -> tuple[yaml.Node, ...]:
-    """An entry of a list, or key and value of a mapping."""
-    return found if isinstance(found, tuple) else (found,)
+LONGEST = 200_000
+"""Bytes of a configuration file; OmegaConf bounds what its aliases stand for."""
 
 
 def configurations(arguments: Sequence[str]) -> list[str]:

@@ -90,7 +90,8 @@ CONFIGS: list[tuple[str, object, str]] = [
     ("horizon", 0, "horizon: expected a number from 1"),
     ("horizon", -8, "key 'horizon'"),
     ("horizon", 10**9, "key 'horizon'"),
-    ("horizon", 10**6, "larger network"),
+    ("horizon", 10**6, "horizon: expected a number from 1 to 10000"),
+    ("horizon", 8000, "larger network"),
     ("horizon", ..., "key 'horizon': expected a value, found none"),
     ("state_dim", 8, "key 'state_dim': expected 7 (domain driving), found 8"),
     ("concept_dim", 10**6, "larger network"),
@@ -403,11 +404,11 @@ def test_results(text: str, expected: str, capsys: Told) -> None:
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 10))
 YAML: list[tuple[bytes, str]] = [
-    (BOMB.encode(), "aliases"),
-    (b"a: &a [*a]", "alias of itself"),
+    (BOMB.encode(), "expansion"),
+    (b"a: &a [*a]", "recursive"),
     (b"a: \xff\xfe", "expected a configuration file"),
     (b"a: " + b"[" * 5000 + b"]" * 5000, "expected a configuration file"),
-    (b"a: " + b"{a: " * 60 + b"1" + b"}" * 60, "deeper"),
+    (b"a: " + b"{a: " * 400 + b"1" + b"}" * 400, "recursion"),
     (b"a: !!python/object/apply:os.system [ls]", "expected a configuration file"),
     (b"a: !unknown 3", "expected a configuration file"),
     (b"- 1\n- 2", "expected a mapping"),
@@ -430,7 +431,7 @@ def test_a_configuration_file(content: bytes, expected: str, capsys: Told) -> No
 @pytest.mark.parametrize("verb", ["fit", "invert", "validate", "test", "report", "explain", "study"])
 def test_a_configuration_file_of_every_verb(verb: str, capsys: Told) -> None:
     Path("c.yaml").write_text(BOMB)
-    refused(capsys, [verb, "--config=c.yaml"], "c.yaml", "aliases")
+    refused(capsys, [verb, "--config=c.yaml"], "c.yaml", "expansion")
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,8 @@ CONFIG, WEIGHTS, EXAMPLES = "config.json", "model.safetensors", "demonstrations.
 """Files of a model's folder; the last one only of a model of a user's own data."""
 VERSION = 2
 """Of the configuration's form. Form 1, which still loads, did not name observed features."""
+LONGEST = 10_000
+"""States in a plan; networks over time have the same weights for any number."""
 DIFFUSION = "diffusion"
 """The kind of a model whose configuration names none."""
 
@@ -84,8 +86,9 @@ class ModelConfig(Sizes):
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, value in (("horizon", self.horizon), ("state_dim", self.state_dim), ("concept_dim", self.concept_dim)):
-            expect_range(name, value, 1, LARGEST)
+        expect_range("horizon", self.horizon, 1, LONGEST)
+        expect_range("state_dim", self.state_dim, 1, LARGEST)
+        expect_range("concept_dim", self.concept_dim, 1, LARGEST)
         expect_range("observed, image_dim", self.vector_dim, 0, LARGEST)
 
 
