@@ -6,10 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftl_lightning.ablation import Stage
+from ftl_lightning.ranges import expect_count, expect_range
 
 if TYPE_CHECKING:
     from ftl_lightning.demonstrations.features import InitialStates
     from ftl_lightning.domains.domain import Domain
+
+
+MOST_DEMONSTRATIONS, MOST_SAMPLES, MOST_DRAWN, MOST_WORKERS = 1_000_000, 10_000, 1000, 1000
+"""That one command makes; of samples, which are made in one batch, those that one figure shows too; and of processes."""
 
 
 def generate(
@@ -35,12 +40,9 @@ def generate(
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.errors import UserError
 
-    if count < 1:
-        raise UserError(f"count: expected 1 or more, found {count}")
-    if seed < 0:
-        raise UserError(f"seed: expected 0 or more, found {seed}")
-    if workers < 1:
-        raise UserError(f"workers: expected 1 or more, found {workers}")
+    expect_count("count", count, 1, MOST_DEMONSTRATIONS)
+    expect_range("seed", seed, 0)
+    expect_count("workers", workers, 1, MOST_WORKERS)
     name = out.removeprefix("minari:")
     if name != out and importlib.util.find_spec("minari") is None:
         raise UserError(f"out: expected a file, found the Minari data set {name!r}, which needs the extra 'minari'")
@@ -149,9 +151,10 @@ class SampleOptions:
         for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
             if path and Path(path).suffix not in endings:
                 raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
-        for name, least in (("count", 1), ("seed", 0), ("steps", 0), ("replan", 0)):
-            if (value := getattr(self, name)) < least:
-                raise UserError(f"{name}: expected {least} or more, found {value}")
+        expect_range("seed", self.seed, 0)
+        expect_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
+        expect_count("steps", self.steps, 0)
+        expect_count("replan", self.replan, 0)
 
 
 def sample(options: SampleOptions) -> None:
@@ -219,15 +222,10 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
 
 def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
     """Initial states of a file's demonstrations or of the goal; ``None`` where behaviour has none."""
-    from ftl_lightning.demonstrations.container import Demonstrations
-    from ftl_lightning.errors import UserError
-
     if options.initial:
-        found = Demonstrations.load(options.initial)
-        try:
-            return found.fitted(domain.observed).initial_states
-        except UserError as error:
-            raise UserError(f"{options.initial}: {error}") from None
+        from ftl_lightning.domains.data import read_demonstrations
+
+        return read_demonstrations(options.initial, domain).initial_states
     task = _start_task(options, domain)
     return domain.source(None).starts(task, options.count, options.seed) if domain.observed else None
 
@@ -252,12 +250,10 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     """
     from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.concepts.explanation import explain as explained
-    from ftl_lightning.errors import UserError
     from ftl_lightning.learning.pretrained import find_model, load_model
     from ftl_lightning.shipped import shipped
 
-    if nearest < 1:
-        raise UserError(f"nearest: expected 1 or more, found {nearest}")
+    expect_count("nearest", nearest, 1)
     learned = Concept.load(concept)
     model = load_model(
         pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), shipped("pretrained")))
@@ -342,11 +338,9 @@ class StudyOptions:
     consent: str = ""
 
     def __post_init__(self) -> None:
-        from ftl_lightning.errors import UserError
-
-        for name, least in (("scenarios", 1), ("repeats", 0), ("still", 0), ("seed", 0)):
-            if (value := getattr(self, name)) < least:
-                raise UserError(f"{name}: expected {least} or more, found {value}")
+        expect_range("seed", self.seed, 0)
+        for name, least in (("scenarios", 1), ("repeats", 0), ("still", 0)):
+            expect_count(name, getattr(self, name), least)
 
 
 def study(options: StudyOptions) -> None:

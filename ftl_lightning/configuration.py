@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
@@ -51,7 +51,10 @@ def load(path: str | Path) -> dict[str, Any]:
     Raises:
         UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
     """
-    found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+    try:
+        found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+    except (OmegaConfBaseException, RecursionError) as error:
+        raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
 
@@ -68,7 +71,7 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConf
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {names}")
+        raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
     for name in names:
         yield from _parts(_beside(path, name), (*above, path))
     yield path, keys
@@ -91,12 +94,19 @@ def _relative(path: Path) -> Path:
 
 def _read(path: Path) -> DictConfig:
     try:
+        if (size := path.stat().st_size) > LONGEST:
+            raise ValueError(f"{size} bytes, more than {LONGEST}")
         keys = OmegaConf.load(path)
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"{path}: expected a configuration file (YAML), found {' '.join(str(error).split())}") from error
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError, TypeError, LookupError) as error:
+        told = short(str(error), 200)
+        raise UserError(f"{path}: expected a configuration file (YAML), found {told}") from error
     if not isinstance(keys, DictConfig):
         raise UserError(f"{path}: expected a mapping of keys, found a list")
     return keys
+
+
+LONGEST = 200_000
+"""Bytes of a configuration file; OmegaConf bounds what its aliases stand for."""
 
 
 def configurations(arguments: Sequence[str]) -> list[str]:

@@ -24,6 +24,7 @@ from ftl_lightning.learning.concept_model import CONFIG, DIFFUSION, ConceptModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
+from ftl_lightning.ranges import expect_count
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 from ftl_lightning.shipped import pretrained_folder, shipped
 from ftl_lightning.tensor_file import atomic
@@ -269,8 +270,7 @@ class FewShot:
             raise UserError(f"observed: expected where plans start ({told}), found nothing; model.starts(goal) draws some")
         if starts is not None:
             count = len(starts)
-        if count < 1:
-            raise UserError(f"count: expected 1 or more, found {count}")
+        expect_count("count", count, 1)
         seen = {} if starts is None else {key: values.to(self.model.device) for key, values in starts.observed.items()}
         states = self.model.sample([concept], count, sampling, [generator("cpu", seed)], seen)[0].cpu()
         return Demonstrations(

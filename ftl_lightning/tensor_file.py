@@ -14,7 +14,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.schema import parse_json
 from ftl_lightning.targets import expect_file
 
 _HEADER = "ftl_lightning"
@@ -120,17 +121,21 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
         raise UserError(f"{path}: expected a {kind} file, found {'a folder' if path.is_dir() else 'nothing'}")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get(_HEADER, "{}"))
+            text = (file.metadata() or {}).get(_HEADER, "{}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({error})") from error
-    found = header.get("kind") if isinstance(header, dict) else None
-    if found != kind:
-        raise UserError(f"{path}: expected a {kind} file, found {f'a {found} file' if found else 'a file of other software'}")
-    if header.get("format") not in versions:
-        expected = " or ".join(map(str, versions))
-        raise UserError(f"{path}: key 'format': expected {expected}, found {header.get('format')!r}; it is of another version")
-    return tensors, header
+    except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({short(str(error), 100)})") from error
+    with about(path):
+        header = parse_json(text)
+        found = header.get("kind") if isinstance(header, dict) else None
+        if found != kind:
+            told = f"a {short(str(found))} file" if found else "a file of other software"
+            raise UserError(f"expected a {kind} file, found {told}")
+        version = header.get("format")
+        if type(version) is not int or version not in versions:
+            expected = " or ".join(map(str, versions))
+            raise UserError(f"key 'format': expected {expected}, found {shown(version)}; it is of another version")
+        return tensors, header
 
 
 def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
@@ -141,7 +146,7 @@ def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> Non
     """
     for name, value in tensors.items():
         if not value.isfinite().all():
-            raise UserError(f"{where}: expected finite numbers, found others in {name!r}; {advice}")
+            raise UserError(f"{where}: expected finite numbers, found others in {short(name)!r}; {advice}")
 
 
 def bytes_hash(content: bytes) -> str:

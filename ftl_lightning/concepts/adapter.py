@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.concepts.composition import Denoiser
+from ftl_lightning.errors import UserError, short
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,17 @@ class LowRank:
         up, down = (factor.to(weight.device) for factor in self.factors[name])
         return weight + (up @ down).reshape(weight.shape)
 
+    def expect_fits(self, network: nn.Module) -> None:
+        """Refuse factors of weights that a network does not have.
+
+        Raises:
+            UserError: naming the first.
+        """
+        known = adaptable(network)
+        for name, (up, down) in self.factors.items():
+            if known.get(name) != (found := (len(up), down.shape[1])):
+                raise UserError(f"key 'adapter/{short(name)}': expected the sizes {known.get(name, 'of no weight')}, found {found}")
+
     def __len__(self) -> int:
         """How many numbers it holds."""
         return sum(up.numel() + down.numel() for up, down in self.factors.values())
@@ -47,8 +59,21 @@ class LowRank:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], everywhere: bool = False) -> "LowRank":
-        """The inverse of :meth:`tensors`."""
+        """The inverse of :meth:`tensors`.
+
+        Raises:
+            UserError: for a factor without its other, or two whose shapes do not go together.
+        """
         names = dict.fromkeys(name.rpartition("/")[0] for name in tensors)
+        for name in names:
+            up, down = (tensors.get(f"{name}/{kind}") for kind in KINDS)
+            if up is None or down is None or not up.dim() == down.dim() == 2 or up.shape[1] != down.shape[0]:
+                told = " and ".join("none" if one is None else str(tuple(one.shape)) for one in (up, down))
+                raise UserError(f"key 'adapter/{short(name)}': expected shapes (outputs, rank) and (rank, inputs), found {told}")
+            if not up.dtype == down.dtype == torch.float32:
+                raise UserError(f"key 'adapter/{short(name)}': expected float32, found {up.dtype} and {down.dtype}")
+        if unknown := set(tensors) - {f"{name}/{kind}" for name in names for kind in KINDS}:
+            raise UserError(f"key 'adapter': expected factors {' and '.join(KINDS)}, found {short(min(unknown))}")
         return cls({name: (tensors[f"{name}/{KINDS[0]}"], tensors[f"{name}/{KINDS[1]}"]) for name in names}, everywhere)
 
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, Modes
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.schema import built, expect_type
 from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
 
 KIND = "concept"
@@ -60,6 +61,9 @@ class Concept:
             form. Composing uses ``embeddings``, unless the concept has several knots.
         knots: embeddings of a component, one after another, at even times of the plan; 1 is the paper's form.
         adapter: what it changes of the denoiser; ``None`` for the paper's form.
+
+    Raises:
+        UserError: at construction, for tensors of other shapes or types.
     """
 
     embeddings: Tensor
@@ -68,6 +72,23 @@ class Concept:
     modes: Modes | None = None
     knots: int = 1
     adapter: LowRank | None = None
+
+    def __post_init__(self) -> None:
+        count, width = (*self.embeddings.shape, 0, 0)[:2]
+        if self.embeddings.dim() != 2 or not count or not width or width % self.knots:
+            expected = "(K, n)" if self.knots == 1 else f"(K, {self.knots} n)"
+            raise UserError(f"key 'embeddings': expected shape {expected}, found {tuple(self.embeddings.shape)}")
+        shapes = {"embeddings": (self.embeddings, (count, width)), "weights": (self.weights, (count,))}
+        if (modes := self.modes) is not None:
+            number = len(modes.embeddings) if modes.embeddings.dim() else 0
+            shapes |= {
+                "mode_embeddings": (modes.embeddings, (max(number, 1), count, width)),
+                "mode_weights": (modes.weights, (max(number, 1), count)),
+            }
+        for name, (values, shape) in shapes.items():
+            if values.shape != shape or values.dtype != torch.float32:
+                told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
+                raise UserError(f"key {name!r}: expected float32 of shape {shape}, found {told}")
 
     @property
     def composition(self) -> Composition:
@@ -108,10 +129,15 @@ class Concept:
         Raises:
             UserError: naming ``where`` and the first of them.
         """
+        expect_finite(self.numbers, where, "lower model.learning_rate")
+
+    @property
+    def numbers(self) -> dict[str, Tensor]:
+        """All that it holds, by name."""
         modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
         factors = {} if self.adapter is None else self.adapter.tensors()
-        found = {"loss": torch.tensor(self.origin.loss), "embeddings": self.embeddings, "weights": self.weights, **modes, **factors}
-        expect_finite(found, where, "lower model.learning_rate")
+        loss = torch.tensor(float(self.origin.loss))
+        return {"loss": loss, "embeddings": self.embeddings, "weights": self.weights, **modes, **factors}
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.
@@ -148,21 +174,33 @@ class Concept:
         keys = [*(field.name for field in fields(Origin)), *(("axes",) if form in AXES else ()), *(("mixed",) if several else ())]
         names = ["embeddings", "weights", *(("mode_embeddings", "mode_weights") if several else ())]
         missing = [key for key in keys if key not in header] + [name for name in names if name not in tensors]
-        if missing:
-            raise UserError(f"{path}: expected the keys of a concept, found none of {', '.join(missing)}")
-        if form in AXES and header["axes"] != AXES[form]:
-            raise UserError(f"{path}: key 'axes': expected {AXES[form]!r}, found {header['axes']!r}; a newer version may read it")
-        knots, adapter = 1, None
-        if form == 3:
-            if (found := tensors["embeddings"]).dim() != 3:
-                raise UserError(f"{path}: key 'embeddings': expected shape (component, knot, n), found {tuple(found.shape)}")
-            knots = tensors["embeddings"].shape[1]
-            tensors |= {name: tensors[name].flatten(-2) for name in names if "embeddings" in name}
+        with about(path):
+            if missing:
+                raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
+            if form in AXES and header["axes"] != AXES[form]:
+                raise UserError(f"key 'axes': expected {AXES[form]!r}, found {shown(header['axes'])}; a newer version may read it")
+            knots, adapter = 1, None
             own = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
-            adapter = LowRank.from_tensors(own, header.get("everywhere", False)) if own else None
-        modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], header["mixed"]) if several else None
-        origin = Origin(**{field.name: header[field.name] for field in fields(Origin)})
-        return cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)
+            if unknown := set(tensors) - set(names) - ({f"{ADAPTER}{name}" for name in own} if form == 3 else set()):
+                raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
+            if form == 3:
+                axes = {name: 4 if name.startswith("mode_") else 3 for name in names if "embeddings" in name}
+                knots = max((*tensors["embeddings"].shape, 0, 0)[1], 1)
+                for name, dimensions in axes.items():
+                    if (found := tensors[name].shape) != () and (len(found) != dimensions or found[-2] != knots):
+                        expected = ("mode, " if dimensions == 4 else "") + f"component, {knots} knots, n"
+                        raise UserError(f"key {name!r}: expected shape ({expected}), found {tuple(found)}")
+                tensors |= {name: tensors[name].flatten(-2) for name in axes if tensors[name].dim()}
+                everywhere = expect_type(header.get("everywhere", False), bool, "everywhere")
+                adapter = LowRank.from_tensors(own, everywhere) if own else None
+            mixed = expect_type(header["mixed"], bool, "mixed") if several else False
+            modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed) if several else None
+            origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
+            learned = cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)
+            if header.get("components", len(learned.weights)) != len(learned.weights):
+                raise UserError(f"key 'components': expected {len(learned.weights)}, found {shown(header['components'])}")
+            expect_finite(learned.numbers, "content", "learn it again")
+            return learned
 
 
 def load_concepts(paths: Iterable[str | Path]) -> list[Concept]:

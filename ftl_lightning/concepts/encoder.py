@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.concepts.hashing import HashingEncoder
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors, visible
 
 if TYPE_CHECKING:
@@ -81,7 +81,10 @@ class TransformerEncoder:
     def __call__(self, texts: Sequence[str]) -> Tensor:
         cached = self.cache and self.cache / f"{content_hash([self.identity, list(texts)])}.safetensors"
         if cached and cached.is_file():
-            return load_tensors(cached, KIND)[0]["embeddings"]
+            found = load_tensors(cached, KIND)[0].get("embeddings")
+            if found is None or found.dim() != 2 or len(found) != len(texts) or not found.isfinite().all():
+                raise UserError(f"{cached}: expected {len(texts)} embeddings, found others; delete the file")
+            return found
         embeddings = self._embed(texts)
         if cached:
             save_tensors(cached, KIND, {"embeddings": embeddings}, {"encoder": self.identity, "texts": list(texts)})
@@ -107,13 +110,21 @@ class TransformerEncoder:
         try:
             config = AutoConfig.from_pretrained(self.name, revision=self.revision)
             kind = T5EncoderModel if config.model_type == "t5" else AutoModel
-            model: PreTrainedModel = kind.from_pretrained(self.name, revision=self.revision, use_safetensors=True)
-        except (OSError, ValueError) as error:
+            read: Any = kind.from_pretrained  # its annotation leaves out what it returns with the option
+            model, told = read(self.name, revision=self.revision, use_safetensors=True, output_loading_info=True)
+        except Exception as error:  # transformers and safetensors raise many kinds for a folder that is damaged
             raise UserError(
                 f"encoder: expected a folder or a Hugging Face name of a T5 or BERT-like model with safetensors weights, found "
-                f"{self.name!r} ({str(error).splitlines()[0]})"
+                f"{short(self.name)!r} ({short(str(error), 100)})"
             ) from error
-        return model.eval()
+        # What a file lacks is drawn at random; the pooling layer alone is not used.
+        if missing := [name for name in told["missing_keys"] if not name.startswith("pooler.")]:
+            raise UserError(
+                f"encoder: {self.name}: expected all weights of the model, found none of {len(missing)}, such as "
+                f"{short(min(missing))!r}; download it again"
+            )
+        found: PreTrainedModel = model.eval()
+        return found
 
 
 def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encoder:

@@ -1,6 +1,9 @@
 """The container of demonstrations and its file."""
 
+import lzma
 import math
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -13,7 +16,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed, take
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.schema import expect_type
 from ftl_lightning.tensor_file import bytes_hash, load_tensors, save_tensors, serialise
 
 KIND = "demonstrations"
@@ -73,8 +77,11 @@ class Demonstrations:
             raise UserError("key 'states': expected at least one demonstration, found none")
         if not time or not state:
             raise UserError(f"key 'states': expected at least one time and column, found none in {tuple(self.states.shape)}")
+        if self.lengths.dtype != torch.int64:
+            raise UserError(f"key 'lengths': expected whole numbers (int64), found {self.lengths.dtype}")
         if self.lengths.shape != (count,) or self.lengths.min() < 1 or self.lengths.max() > time:
-            raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {self.lengths.tolist()}")
+            found = shown(self.lengths.flatten()[:20].tolist())
+            raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {found}")
         for key, values, expected in (
             ("state_names", self.state_names, state),
             ("state_units", self.state_units, state),
@@ -83,7 +90,7 @@ class Demonstrations:
             if len(values) != expected:
                 raise UserError(f"key {key!r}: expected {expected} entries, found {len(values)}")
         if unknown := set(self.per_step) - set(self.observed):
-            raise UserError(f"key 'per_step': expected names of observed features, found {', '.join(sorted(unknown))}")
+            raise UserError(f"key 'per_step': expected names of observed features, found {short(', '.join(sorted(unknown)))}")
         for name, feature in self.observed.items():
             leading = (count, time) if name in self.per_step else (count,)
             if tuple(feature.shape[: len(leading)]) != leading or feature.dim() <= len(leading):
@@ -94,6 +101,8 @@ class Demonstrations:
                 raise UserError(f"key 'observed/{name}': expected float32, or uint8 for images, found {found}")
         if self.scenes is not None and (self.scenes.dim() != 2 or len(self.scenes) != count):
             raise UserError(f"key 'scenes': expected shape ({count}, scene), found {tuple(self.scenes.shape)}")
+        if self.scenes is not None and self.scenes.dtype != torch.float32:
+            raise UserError(f"key 'scenes': expected float32, found {self.scenes.dtype}")
         for key, tensor in self.tensors.items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
@@ -212,11 +221,12 @@ class Demonstrations:
         """
         path = Path(path)
         tensors, header = _read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, PLAIN, VERSION))
-        if "states" not in tensors:
-            raise UserError(f"{path}: key 'states': expected (demo, time, state), found only {', '.join(tensors) or 'nothing'}")
-        states = tensors["states"]
-        demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
-        try:
+        with about(path):
+            if "states" not in tensors:
+                told = short(", ".join(tensors)) or "nothing"
+                raise UserError(f"key 'states': expected (demo, time, state), found only {told}")
+            states = tensors["states"]
+            demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
             texts = {key: _texts(key, header[key]) for key in _TEXTS if key in header}
             per_step, scenes = texts.get("per_step", ()), tensors.get("scenes")
             if header.get("format") == VERSION and demos:
@@ -228,17 +238,15 @@ class Demonstrations:
             return cls(
                 states=states,
                 lengths=tensors.get("lengths", torch.full((demos,), time)),
-                domain=str(header.get("domain", "")),
+                domain=expect_type(header.get("domain", ""), str, "domain"),
                 state_names=texts.get("state_names", tuple(map(str, range(columns)))),
                 state_units=texts.get("state_units", ("",) * columns),
                 concepts=texts.get("concepts", ("",) * demos),
                 observed=observed,
                 per_step=per_step,
                 scenes=scenes,
-                provenance=header.get("provenance", {}),
+                provenance=expect_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
             )
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from None
 
     def fitted(self, features: Mapping[str, Feature]) -> Self:
         """The same with the observed features of a domain.
@@ -326,7 +334,7 @@ _TEXTS = ("state_names", "state_units", "concepts", "per_step")
 
 def _texts(key: str, found: object) -> tuple[str, ...]:
     if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
-        raise UserError(f"key {key!r}: expected a list of texts, found {str(found)[:50]}")
+        raise UserError(f"key {key!r}: expected a list of texts, found {shown(found)}")
     return tuple(found)
 
 
@@ -349,20 +357,21 @@ def _unpacked(tensors: Mapping[str, Tensor], shapes: object, per_step: Sequence[
         UserError: naming the key, if its shape is none that it can have, or its bytes are damaged.
     """
     if not isinstance(shapes, dict):
-        raise UserError(f"key 'compressed': expected shapes of images by key, found {str(shapes)[:50]}")
+        raise UserError(f"key 'compressed': expected shapes of images by key, found {shown(shapes)}")
     found = {}
     for key, shape in shapes.items():
         packed = tensors.get(key)
         if packed is None or not key.startswith(_OBSERVED) or packed.dtype != torch.uint8 or packed.dim() != 1:
             told = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"
-            raise UserError(f"key {key!r}: expected compressed images, uint8 of shape (byte,) under 'observed/NAME', found {told}")
+            expected = "compressed images, uint8 of shape (byte,) under 'observed/NAME'"
+            raise UserError(f"key {short(key)!r}: expected {expected}, found {told}")
         leading = list(tensors["states"].shape[: 2 if key.removeprefix(_OBSERVED) in per_step else 1])
         numbers = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
         if not numbers or shape[: len(leading)] != leading or math.prod(shape) > MOST_SHRUNK * len(packed):
             begin = ", ".join(map(str, leading))
             raise UserError(
                 f"key {key!r}: expected images of shape ({begin}, ...) that fit into {len(packed)} compressed bytes, "
-                f"found the shape {str(shape)[:50]} in the header; the file is damaged"
+                f"found the shape {shown(shape)} in the header; the file is damaged"
             )
         content = _decompressed(key, packed.numpy().tobytes(), math.prod(shape))
         found[key] = torch.from_numpy(np.frombuffer(content, dtype=np.uint8)).reshape(shape)
@@ -386,23 +395,59 @@ def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if not path.is_file():
         raise UserError(f"{path}: expected a demonstrations file, found nothing")
     try:
+        _expect_sizes(path)
         with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({error})") from error
+            arrays = {name: np.asarray(archive[name]) for name in archive.files}
+            texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
+        "".join(text for value in texts.values() for text in np.ravel(value)).encode()
+    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError) as error:
+        told = short(str(error), 100)
+        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({told})") from error
     tensors = {}
     for name, array in arrays.items():
+        measured = name.startswith(_OBSERVED) or name in ("states", "lengths", "scenes")
+        if (measured and array.dtype.kind not in "fiub") or (name in (*_TEXTS, "domain") and array.dtype.kind != "U"):
+            told = "numbers" if measured else "texts"
+            raise UserError(f"{path}: key {short(name)!r}: expected an array of {told}, found one of {short(str(array.dtype))}")
         if array.dtype.kind in "fiub":
             # Images stay bytes; everything else that is measured is float32.
             image = array.dtype == np.uint8 and name.startswith(_OBSERVED)
-            kind = np.uint8 if image else np.int64 if name == "lengths" else np.float32
-            tensors[name] = torch.from_numpy(np.ascontiguousarray(array, dtype=kind))
-    texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
+            kind = np.uint8 if image else np.int64 if name == "lengths" and array.dtype.kind in "iu" else np.float32
+            with np.errstate(over="ignore"):  # what is too large for float32 is told as no finite number
+                tensors[name] = torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
     for name, value in texts.items():
         if isinstance(value, str):
             # One text stands for all demonstrations.
-            texts[name] = [value] * len(tensors["states"]) if name == "concepts" and "states" in tensors else [value]
-    if "domain" in texts:
-        texts["domain"] = texts["domain"][0]
-    header: dict[str, Any] = texts
+            several = name == "concepts" and "states" in tensors and tensors["states"].dim()
+            texts[name] = [value] * len(tensors["states"]) if several else [value]
+    header: dict[str, Any] = dict(texts)
+    if len(texts.get("domain", ())) == 1:
+        header["domain"] = texts["domain"][0]
     return tensors, header
+
+
+_DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)
+"""What numpy and zipfile raise for files that are damaged or none of theirs."""
+MOST_BYTES = 512 * 2**20
+"""Of the arrays of an ``.npz``, where they are more than :data:`MOST_RATIO` times as large as the file."""
+MOST_RATIO = 100
+
+
+def _expect_sizes(path: Path) -> None:
+    """Refuse an archive that is much larger than its file, or holds an array whose header names another size than its bytes have.
+
+    Raises:
+        ValueError: saying so.
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if (total := sum(member.file_size for member in members)) > max(MOST_BYTES, MOST_RATIO * path.stat().st_size):
+            raise ValueError(f"{total} bytes in a file of {path.stat().st_size}; save it without compression")
+        for member in members:
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(file)
+                size = math.prod(shape) * dtype.itemsize
+                if not dtype.hasobject and (min(shape, default=0) < 0 or size != member.file_size - file.tell()):
+                    raise ValueError(f"{member.filename} is not of the size that it says")

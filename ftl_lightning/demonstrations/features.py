@@ -8,7 +8,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
 
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
@@ -26,6 +26,9 @@ class Feature:
         attributes: which of an entity's columns, counted from its first, a concept asks for when it names an entity (its colour,
             its shape); all where empty.
         state: of a vector, the columns that hold the state a plan starts from, in its order; none where it holds no such state.
+
+    Raises:
+        UserError: at construction, for columns that it does not have.
     """
 
     shape: tuple[int, ...]
@@ -33,6 +36,18 @@ class Feature:
     entities: tuple[tuple[int, ...], ...] = ()
     attributes: tuple[int, ...] = ()
     state: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        widths = {len(entity) for entity in self.entities}
+        if len(widths) > 1 or widths == {0}:
+            raise UserError(f"entities: expected as many columns of each, found {shown(sorted(widths))}")
+        for name, columns, size in (
+            ("entities", [column for entity in self.entities for column in entity], self.size),
+            ("attributes", self.attributes, max(widths, default=0)),
+            ("state", self.state, self.size),
+        ):
+            if any(not 0 <= column < size for column in columns):
+                raise UserError(f"{name}: expected columns from 0 to {size - 1}, found {shown(columns)}")
 
     @property
     def size(self) -> int:

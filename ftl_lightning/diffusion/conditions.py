@@ -52,7 +52,7 @@ def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
     if not sizes.entities:
         raise UserError(f"denoiser_args.initial_encoder: expected flat, found {name}: this domain does not name its entities")
     columns = torch.tensor(sizes.entities)
-    own = set(columns.flatten().tolist())
+    own = {column for entity in sizes.entities for column in entity}
     # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
     # columns are 0 after normalisation.
     shared = [column for column in range(sizes.vector_dim) if column not in own]

@@ -1,5 +1,6 @@
 """What a network reads of an image: a few numbers, trained with the rest of it."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,9 +9,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.demonstrations.features import Feature, Observed
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.ranges import expect_range
+from ftl_lightning.schema import built
 
+MOST_PIXELS = 100_000_000
+"""Numbers of an image."""
 GROUPS = 8
 """Of group normalisation, which replaces batch normalisation: that keeps statistics beside the weights, which no running average
 of weights holds (Chi et al., 2023)."""
@@ -150,6 +154,8 @@ class ImageEncoder(nn.Module):
                 raise UserError(f"model.image_encoder.{name}: expected one of {', '.join(known)}, found {value!r}")
         if not widths or any(width < GROUPS or width % GROUPS for width in widths):
             raise UserError(f"model.image_encoder.widths: expected multiples of {GROUPS}, found {list(widths)}")
+        if len(shape) != 3 or not 0 < math.prod(shape) <= MOST_PIXELS:
+            raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {shown(tuple(shape))}")
         channels, height, width = shape
         expect_range("model.image_encoder.keypoints", keypoints, 1)
         expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
@@ -193,10 +199,7 @@ class ImageEncoders(nn.Module):
     def __init__(self, observed: Mapping[str, Feature], arguments: Mapping[str, Any]) -> None:
         super().__init__()
         self.names = [name for name, feature in observed.items() if feature.kind == "image"]
-        try:
-            encoders = [ImageEncoder(observed[name].shape, **arguments) for name in self.names]
-        except TypeError as error:
-            raise UserError(f"model.image_encoder: expected arguments of an image encoder, found others ({error})") from error
+        encoders = [built(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
         self.encoders = nn.ModuleList(encoders)
         self.size = sum(encoder.size for encoder in encoders)
         """Numbers that are read of all images."""

@@ -133,7 +133,9 @@ class TemporalUNet(nn.Module):
             raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
         self.smooth = smooth
         self.width, self.broadcast, self.concept_dim = width, broadcast and sizes.vector_dim > 0, sizes.concept_dim
-        angle = torch.linspace(0, math.pi, sizes.horizon) * 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
+        rates = 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
+        # The device is said: transformers replaces linspace by one that overlooks where a model is built.
+        angle = torch.linspace(0, math.pi, sizes.horizon, device=rates.device) * rates
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))

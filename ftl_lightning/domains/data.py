@@ -19,7 +19,7 @@ from ftl_lightning.demonstrations.features import expect_features
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
 
@@ -334,10 +334,8 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
     found = read_own(path)
     columns = len(domain.plans.columns)
     if found.domain not in ("", domain.name):
-        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {found.domain!r}")
+        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {short(found.domain)!r}")
     if found.states.shape[2] != columns:
         raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(found.states.shape)}")
-    try:
+    with about(path):
         return found.fitted(domain.observed)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from None

@@ -1,16 +1,19 @@
 """The results file: one row for every evaluated number."""
 
+import csv
 import fcntl
+import math
 import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.tensor_file import atomic, visible
 from ftl_lightning.version import __version__
 
@@ -57,8 +60,12 @@ class Row:
     version: str = __version__
 
 
+LARGEST_WHOLE = 2**53
+"""Of whole numbers, seeds among them."""
 COLUMNS = [field.name for field in fields(Row)]
-_TEXT = {"omega": str, "model_hash": str, "config_hash": str, "version": str}
+_WHOLE = [field.name for field in fields(Row) if field.type is int]
+_MAYBE_EMPTY = ("setting", "task", "variant", "omega", "model_hash")
+_TEXT = {field.name: str for field in fields(Row) if field.type is str}
 _BEFORE_VARIANTS = [name for name in COLUMNS if name not in ("variant", "role")]
 """The columns of files of version 0.1.0 and older."""
 _SUBJECT = ["domain", "setting", "task", "method", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
@@ -154,6 +161,47 @@ def _parts(path: Path) -> list[str]:
     return re.split(r"(\d+)", path.as_posix())
 
 
+def _read(file: Path) -> pd.DataFrame:
+    table = _table(file, _TEXT)
+    if not isinstance(table.index, pd.RangeIndex):
+        raise UserError(f"expected {len(table.columns)} cells in each row, found more in some; it is damaged")
+    if list(table.columns) not in (COLUMNS, _BEFORE_VARIANTS):
+        told = short(", ".join(map(str, table.columns)), 80)
+        raise UserError(f"expected the columns {short(', '.join(COLUMNS), 140)}, found {told}")
+    if (found := _bad_cell(table)) is not None:
+        row, column, expected = found
+        cell = _table(file, str).fillna("").iloc[row][column]
+        raise UserError(f"row {row + 2}, column {column!r}: expected {expected}, found {shown(cell)}; it is damaged")
+    return table if list(table.columns) == COLUMNS else upgraded(table)
+
+
+def _table(file: Path, kinds: Any) -> pd.DataFrame:
+    try:
+        return pd.read_csv(file, dtype=kinds, keep_default_na=False)
+    except (OSError, ValueError, OverflowError, MemoryError, csv.Error) as error:
+        raise UserError(f"expected a results file, found something else ({short(str(error), 100)})") from error
+
+
+def _bad_cell(table: pd.DataFrame) -> tuple[int, str, str] | None:
+    """Row, column and what is expected there, of the first cell that is none of its column's."""
+    for name, values in table.items():
+        numbers = pd.to_numeric(values.astype(str), errors="coerce") if name not in _TEXT else pd.Series(dtype=float)
+        if name == "role":
+            good, expected = values.isin((METHOD, REFERENCE)), f"{METHOD} or {REFERENCE}"
+        elif name in _TEXT:
+            good = values.notna() & ((values != "") | (name in _MAYBE_EMPTY))
+            expected = "a text"
+        elif name in _WHOLE:
+            good, expected = numbers.between(0, LARGEST_WHOLE) & (numbers % 1 == 0), f"a whole number up to {LARGEST_WHOLE}"
+        else:
+            good, expected = numbers.abs() < math.inf, "a finite number"
+        if not good.all():
+            return int((~good).to_numpy().argmax()), str(name), expected
+        if name not in _TEXT and len(values) and values.dtype.kind not in ("iu" if name in _WHOLE else "iuf"):
+            return 0, str(name), expected  # numbers that are written in another way
+    return None
+
+
 def read_rows(path: str | Path) -> pd.DataFrame:
     """Read one results file, or all ``.csv`` files of a folder.
 
@@ -166,15 +214,8 @@ def read_rows(path: str | Path) -> pd.DataFrame:
     files = _files(path) if path.is_dir() else [path]
     tables = []
     for file in files:
-        try:
-            table = pd.read_csv(file, dtype=_TEXT, keep_default_na=False)
-        except (OSError, ValueError) as error:
-            raise UserError(f"{file}: expected a results file, found something else ({error})") from error
-        if list(table.columns) == _BEFORE_VARIANTS:
-            table = upgraded(table)
-        if list(table.columns) != COLUMNS:
-            raise UserError(f"{file}: expected the columns {', '.join(COLUMNS)}, found {', '.join(table.columns)}")
-        tables.append(table)
+        with about(file):
+            tables.append(_read(file))
     if not tables:
         raise UserError(f"{path}: expected results (.csv files), found none; run: make run")
     return pd.concat(tables, ignore_index=True)

@@ -2,14 +2,17 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -21,7 +24,9 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.ranges import LARGEST, expect_range
+from ftl_lightning.schema import built, expect_type, read_json
 from ftl_lightning.tensor_file import (
     FORMAT,
     bytes_hash,
@@ -38,6 +43,8 @@ CONFIG, WEIGHTS, EXAMPLES = "config.json", "model.safetensors", "demonstrations.
 """Files of a model's folder; the last one only of a model of a user's own data."""
 VERSION = 2
 """Of the configuration's form. Form 1, which still loads, did not name observed features."""
+LONGEST = 10_000
+"""States in a plan; networks over time have the same weights for any number."""
 DIFFUSION = "diffusion"
 """The kind of a model whose configuration names none."""
 
@@ -63,6 +70,9 @@ class ModelConfig(Sizes):
         feature_dropout: of observed vectors by name, how often each is hidden (0 after normalisation) in training.
         metrics: of a user's own data, what plans are judged by, see :mod:`ftl_lightning.domains.from_file`.
         training: how it was trained, for the record.
+
+    Raises:
+        UserError: at construction, for a size out of its range.
     """
 
     domain: str
@@ -75,6 +85,12 @@ class ModelConfig(Sizes):
     metrics: Mapping[str, float] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        expect_range("horizon", self.horizon, 1, LONGEST)
+        expect_range("state_dim", self.state_dim, 1, LARGEST)
+        expect_range("concept_dim", self.concept_dim, 1, LARGEST)
+        expect_range("observed, image_dim", self.vector_dim, 0, LARGEST)
+
 
 def find_view(domain: Domain, name: str) -> View | None:
     """A domain's view by its name; ``None`` for the empty one.
@@ -85,7 +101,7 @@ def find_view(domain: Domain, name: str) -> View | None:
     if not name:
         return None
     if name not in domain.views:
-        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {name!r}")
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {short(name)!r}")
     return domain.views[name]
 
 
@@ -97,18 +113,21 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / CONFIG
     try:
-        content: dict[str, Any] = {"kind": DIFFUSION} | json.loads(path.read_text(encoding="utf-8"))
-        if (version := content.pop("format")) not in (FORMAT, VERSION):
-            raise ValueError(f"format is not {FORMAT} or {VERSION}")
-        if version == FORMAT:
-            _upgrade(content)
-        if "hash" not in content:
-            raise ValueError("it has no hash")
+        found = read_json(path)
     except OSError as error:
         raise UserError(f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: expected the configuration of a pretrained model, found something else ({error})") from error
-    return content
+    with about(path):
+        version = found.pop("format", None) if isinstance(found, dict) else None
+        if type(version) is not int or version not in (FORMAT, VERSION):
+            raise UserError(
+                f"expected the configuration of a pretrained model, found something else (its format is not {FORMAT} or {VERSION})"
+            )
+        content: dict[str, Any] = {"kind": DIFFUSION} | found
+        for key in ("kind", "hash", "domain"):
+            expect_type(content.get(key), str, key)
+        if version == FORMAT:
+            _upgrade(content)
+        return content
 
 
 def _upgrade(content: dict[str, Any]) -> None:
@@ -116,20 +135,15 @@ def _upgrade(content: dict[str, Any]) -> None:
     size = content.pop("initial_state_dim", 0)
     for key in ("entities", "looks", "state_columns"):
         content.pop(key, None)
-    domain = load_domain(content["domain"])
-    view = find_view(domain, content.get("view", ""))
-    features = (view.features if view else domain.observed) if size else {}
+    features = _features(content["domain"], expect_type(content.get("view", ""), str, "view")) if size else {}
     content["observed"] = {name: asdict(feature) for name, feature in features.items()}
 
 
-def _feature(content: Mapping[str, Any]) -> Feature:
-    return Feature(
-        shape=tuple(content["shape"]),
-        kind=content["kind"],
-        entities=tuple(map(tuple, content["entities"])),
-        attributes=tuple(content["attributes"]),
-        state=tuple(content["state"]),
-    )
+def _features(domain: str, view: str) -> Mapping[str, Feature]:
+    """What is observed in a domain through one of its views."""
+    found = load_domain(domain)
+    seen = find_view(found, view)
+    return found.observed if seen is None else seen.features
 
 
 class ConceptModel(nn.Module, ABC):
@@ -172,6 +186,8 @@ class ConceptModel(nn.Module, ABC):
         if config.perturb and (self.view is None or self.view.perturb is None):
             raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
         self.images = ImageEncoders(config.observed, config.image_encoder) if config.image_dim else None
+        if self.images is not None and self.images.size != config.image_dim:
+            raise UserError(f"image_dim: expected {self.images.size} (what is read of the images), found {config.image_dim}")
         self.normalization = normalization
         self.initial_normalization = initial_normalization
         self.register_buffer("empty", embeddings[0].clone())
@@ -266,14 +282,30 @@ class ConceptModel(nn.Module, ABC):
         """Refuse a learned concept that belongs to another model.
 
         Raises:
-            UserError: if encoder, domain or pretrained model differ.
+            UserError: if encoder, domain or pretrained model differ, or its sizes are not those of the model.
         """
         mine = {"encoder": self.config.encoder, "domain": self.config.domain, "pretrained": self.hash}
         for key, expected in mine.items():
             if (found := getattr(concept.origin, key)) != expected:
                 raise UserError(
-                    f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {found!r}; learn it again"
+                    f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(found)!r}; learn it again"
                 )
+        with about(path):
+            if concept.embeddings.shape[1] != concept.knots * self.config.concept_dim:
+                found = concept.embeddings.shape[1] // concept.knots
+                raise UserError(f"key 'embeddings': expected {self.config.concept_dim} numbers each, found {found}")
+            if concept.knots > 1 and not self.over_time:
+                raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")
+            if concept.adapter is not None:
+                self.expect_adapter(concept.adapter)
+
+    def expect_adapter(self, adapter: LowRank) -> None:
+        """Refuse an adapter that does not fit.
+
+        Raises:
+            UserError: naming what it would change; for a method without adapters, any.
+        """
+        raise UserError(f"key 'adapter': expected none for a model of {self.name}, found one")
 
     def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:
         """What to learn from: behaviour with another present, if the model's configuration says so."""
@@ -376,41 +408,112 @@ class ConceptModel(nn.Module, ABC):
         path = Path(folder) / CONFIG
         content = read_config(folder)
         expected_hash = content.pop("hash")
-        if (found := content.pop("kind")) != cls.kind:
-            raise UserError(f"{path}: key 'kind': expected {cls.kind!r}, found {found!r}, the model of another method")
-        try:
-            content["training_concepts"] = tuple(content["training_concepts"])
-            content["observed"] = {name: _feature(feature) for name, feature in content["observed"].items()}
-            config = cls.Config(**content)
-        except (TypeError, KeyError, AttributeError) as error:
-            raise UserError(f"{path}: expected the configuration of a pretrained model, found something else ({error})") from error
+        with about(path):
+            if (found := content.pop("kind")) != cls.kind:
+                raise UserError(f"key 'kind': expected {cls.kind!r}, found {found!r}, the model of another method")
+            config = built(cls.Config, content, "")
         weights = Path(folder) / WEIGHTS
         tensors, _ = load_tensors(weights, KIND)
         if (found := file_hash(weights)) != expected_hash:
             raise UserError(
-                f"{weights}: expected the hash {expected_hash} that {CONFIG} names, found {found}; copy both files again"
+                f"{weights}: expected the hash {short(expected_hash)} that {CONFIG} names, found {found}; copy both files again"
             )
-        blank = torch.zeros(config.state_dim)
-        initial = torch.zeros(config.measured_dim)
         examples = Demonstrations.load(Path(folder) / EXAMPLES) if config.domain == OWN else None
-        domain = (
-            load_domain(config.domain)
-            if examples is None
-            else own_domain(examples, config.training_concepts, config.horizon, config.metrics)
-        )
-        model = cls(
+        with about(path):
+            domain = (
+                load_domain(config.domain)
+                if examples is None
+                else own_domain(examples, config.training_concepts, config.horizon, config.metrics)
+            )
+            _expect_domain(config, domain)
+            # First on paper: a file of a few bytes can name sizes that no memory holds.
+            with torch.device("meta"), _at_most(sum(value.numel() for value in tensors.values())):
+                expected = cls._blank(config, domain).state_dict()
+        with about(weights):
+            _expect_weights(tensors, expected)
+        model = cls._blank(config, domain)
+        model.examples = examples
+        model.load_state_dict(tensors)
+        return model.requires_grad_(False).eval()
+
+    @classmethod
+    def _blank(cls, config: ModelConfig, domain: Domain) -> Self:
+        """A fresh model, whose buffers are zeros."""
+        blank, initial = torch.zeros(config.state_dim), torch.zeros(config.measured_dim)
+        return cls(
             config,
             domain,
             Normalization(blank, blank),
             torch.zeros(1 + len(config.training_concepts), config.concept_dim),
             Normalization(initial, initial) if config.measured_dim else None,
         )
-        model.examples = examples
-        try:
-            model.load_state_dict(tensors)
-        except RuntimeError as error:
-            raise UserError(f"{weights}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()})") from error
-        return model.requires_grad_(False).eval()
+
+
+MOST_PARAMETERS = 10_000
+"""Of tensors that are learned in a model that is read from files."""
+SPARE = 4
+"""So many times the numbers of a file may be made while a network is built: layers that are stacked afterwards are made twice."""
+
+
+@contextmanager
+def _at_most(numbers: int) -> Iterator[None]:
+    """Build a network of about so many numbers; larger ones are not built to their end.
+
+    Raises:
+        UserError: for a network that is larger, or that cannot be built.
+    """
+    tensors, left = 0, SPARE * numbers
+
+    def count(module: nn.Module, name: str, parameter: Tensor | None) -> None:
+        nonlocal tensors, left
+        if parameter is not None:
+            tensors, left = tensors + 1, left - parameter.numel()
+        if tensors > MOST_PARAMETERS or left < 0:
+            raise UserError(f"expected the sizes of the {numbers} numbers in {WEIGHTS}, found those of a larger network")
+
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # torch and the networks raise many kinds for sizes that do not go together
+        raise UserError(f"expected sizes that make a network, found others ({short(str(error), 100)})") from error
+    finally:
+        handle.remove()
+
+
+def _expect_domain(config: ModelConfig, domain: Domain) -> None:
+    """Refuse sizes that are not those of the domain's behaviour.
+
+    Raises:
+        UserError: naming the key.
+    """
+    if config.state_dim != (columns := len(domain.plans.columns)):
+        raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
+    view = find_view(domain, config.view)
+    expected = domain.observed if view is None else view.features
+    for name, feature in config.observed.items():
+        if name not in expected or not feature.fits(expected[name]):
+            told = expected[name].words if name in expected else f"one of {', '.join(expected) or 'no features'}"
+            raise UserError(f"key 'observed.{short(name)}': expected {told}, found {short(feature.words)}")
+
+
+def _expect_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Refuse tensors that are not those of a model, or hold numbers that are none.
+
+    Raises:
+        UserError: naming the first one.
+    """
+    for name in [*expected, *found]:
+        if name not in found or name not in expected:
+            told = "expected it, found nothing" if name not in found else "expected nothing, found it"
+            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: {told}")
+        own, like = found[name], expected[name]
+        if own.shape != like.shape or own.is_floating_point() != like.is_floating_point():
+            kinds = [f"{str(one.dtype).removeprefix('torch.')} {tuple(one.shape)}" for one in (like, own)]
+            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: expected {kinds[0]}, found {kinds[1]}")
+        if own.is_floating_point() and own.numel() and not torch.stack(own.aminmax()).isfinite().all():
+            raise UserError(f"key {short(name)!r}: expected finite numbers, found others; take another copy of both files")
 
 
 def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning import diffusion
+from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, Context, batched, composed_epsilon
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
@@ -16,8 +17,9 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import DIFFUSION, Draws, ModelConfig, TextConceptModel
+from ftl_lightning.schema import built
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,16 +46,13 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
         UserError: for a class that :mod:`ftl_lightning.diffusion` does not have, or arguments it does not take.
     """
     if config.denoiser not in diffusion.__all__:
-        raise UserError(f"denoiser: expected one of {', '.join(diffusion.__all__)}, found {config.denoiser!r}")
+        raise UserError(f"denoiser: expected one of {', '.join(diffusion.__all__)}, found {short(config.denoiser)!r}")
     if config.prediction not in PREDICTIONS:
-        raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {config.prediction!r}")
+        raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {short(config.prediction)!r}")
     if config.prediction in ("epsilon", "v") and config.denoiser_args.get("smooth"):
         raise UserError(f"denoiser_args.smooth: expected 0 for a network that puts out {config.prediction}, which is not smooth")
     kind: type[nn.Module] = getattr(diffusion, config.denoiser)
-    try:
-        denoiser = kind(config, **config.denoiser_args)
-    except TypeError as error:
-        raise UserError(f"denoiser_args: {config.denoiser} does not take them ({error})") from error
+    denoiser = built(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
         return denoiser
     return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns)
@@ -95,6 +94,9 @@ class GenerativeModel(TextConceptModel):
     def over_time(self) -> bool:
         found: bool = getattr(diffusion, self.config.denoiser).over_time
         return found
+
+    def expect_adapter(self, adapter: LowRank) -> None:
+        adapter.expect_fits(self.denoiser)
 
     @property
     def max_steps(self) -> int:

@@ -4,7 +4,7 @@ import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import CONFIG, ConceptModel, read_config
 from ftl_lightning.shipped import pretrained_folder
 
@@ -35,7 +35,7 @@ def load_model(folder: str | Path) -> ConceptModel:
     """
     folder = pretrained_folder(folder)
     if (kind := read_config(folder)["kind"]) not in MODELS:
-        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {kind!r}")
+        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {short(kind)!r}")
     return model_class(kind).load(folder)
 
 

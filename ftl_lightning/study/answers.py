@@ -1,12 +1,12 @@
 """What raters answered: files that their browsers saved, read and checked against a study's key."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.schema import read_json
 from ftl_lightning.study.page import FORMAT, KEY_KIND
 from ftl_lightning.study.questions import BEST, CHECK, DEPICTS, NO, REPEAT, YES
 
@@ -52,16 +52,17 @@ class Rater:
 
 def _json(path: Path, kind: str) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, f"a {kind} file")
     except FileNotFoundError:
         raise UserError(f"{path}: expected a {kind} file, found nothing") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
         raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign one ({error})") from error
     found = content.get("kind") if isinstance(content, dict) else None
     if found != kind:
-        raise UserError(f"{path}: expected a {kind} file, found {f'a {found} file' if found else 'a file of other software'}")
+        told = f"a {short(str(found))} file" if found else "a file of other software"
+        raise UserError(f"{path}: expected a {kind} file, found {told}")
     if content.get("format") != FORMAT:
-        raise UserError(f"{path}: key 'format': expected {FORMAT}, found {content.get('format')!r}; it is of another version")
+        raise UserError(f"{path}: key 'format': expected {FORMAT}, found {shown(content.get('format'))}; it is of another version")
     return content
 
 
@@ -97,7 +98,7 @@ def read_rater(path: Path, key: Key) -> Rater:
     for part, expected in (("study", key.study), ("page", key.page)):
         if content.get(part) != expected:
             raise UserError(
-                f"{path}: key {part!r}: expected {expected}, found {content.get(part)!r}; the answers are of another {part}"
+                f"{path}: key {part!r}: expected {expected}, found {shown(content.get(part))}; the answers are of another {part}"
             )
     name, given = content.get("rater"), content.get("answers")
     if not isinstance(name, str) or not name or not isinstance(given, list):

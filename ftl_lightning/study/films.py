@@ -1,6 +1,5 @@
 """The films of a study: which behaviour, of which method, is said to depict which concept."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,8 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
+from ftl_lightning.schema import read_json
 from ftl_lightning.tensor_file import file_hash, visible
 
 LISTING = "films.json"
@@ -128,8 +128,8 @@ def _named(folder: Path) -> list[dict[str, Any]]:
 
 def _listed(path: Path) -> list[dict[str, Any]]:
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        entries = read_json(path)
+    except OSError as error:
         raise UserError(f"{path}: expected JSON, found something else ({error})") from error
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{path}: expected a list of films, found {type(entries).__name__ if entries != [] else 'an empty one'}")
@@ -141,7 +141,7 @@ def _listed(path: Path) -> list[dict[str, Any]]:
             raise UserError(f"{where}: expected the keys {', '.join((*_NEEDED, *_OPTIONAL))}, found {', '.join(unknown)}")
         for key in _NEEDED:
             if not isinstance(entry.get(key), str) or not entry[key]:
-                raise UserError(f"{where}: key {key!r}: expected a text, found {entry.get(key)!r}")
+                raise UserError(f"{where}: key {key!r}: expected a text, found {shown(entry.get(key))}")
     return entries
 
 

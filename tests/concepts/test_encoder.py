@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from transformers import BertConfig, BertModel, PreTrainedTokenizerFast, T5Config, T5EncoderModel
 
 from ftl_lightning.concepts.encoder import TableEncoder, TransformerEncoder, load_encoder, write_table
@@ -69,6 +70,16 @@ def test_the_identity_tells_models_apart(language_model: Path) -> None:
     weights.write_bytes(bytes(content))
     assert TransformerEncoder(str(language_model)).identity != before
     assert TransformerEncoder("name", "v1").identity != TransformerEncoder("name", "v2").identity
+
+
+@pytest.mark.parametrize("kept", [0, 3])
+def test_a_model_without_some_of_its_weights_is_refused(language_model: Path, kept: int) -> None:
+    weights = language_model / "model.safetensors"
+    tensors = load_file(weights)
+    some = {name: tensors[name] for name in sorted(tensors)[:kept]}
+    save_file(some or {"more": torch.zeros(1)}, weights, {"format": "pt"})
+    with pytest.raises(UserError, match=r"expected all weights of the model, found none of \d+, such as '.*'; download it again"):
+        TransformerEncoder(str(language_model))(["circle"])
 
 
 def test_every_shipped_table_holds_every_description() -> None:

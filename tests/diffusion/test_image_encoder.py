@@ -60,7 +60,10 @@ def test_sizes(options: dict[str, Any], size: int) -> None:
         ({"widths": []}, r"model.image_encoder.widths: expected multiples of 8, found \[\]"),
         ({"crop": 24}, "model.image_encoder.crop: expected a number from 0 to 23, found 24"),
         ({"keypoints": 0}, "model.image_encoder.keypoints: expected 1 or more, found 0"),
-        ({"depth": 3}, "model.image_encoder: expected arguments of an image encoder, found others"),
+        (
+            {"depth": 3},
+            "key .model.image_encoder.depth.: expected one of network, widths, head, keypoints, crop",
+        ),
     ],
 )
 def test_mistakes_are_told_in_one_line(options: dict[str, Any], message: str) -> None:

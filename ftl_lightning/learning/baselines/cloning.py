@@ -13,7 +13,6 @@ from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
 from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
 from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
@@ -76,8 +75,7 @@ class CloningModel(AdditiveModel, TextConceptModel):
         initial_normalization: Normalization | None = None,
     ) -> None:
         super().__init__(config, domain, normalization, embeddings, initial_normalization)
-        if config.members < 1:
-            raise UserError(f"model.members: expected 1 or more, found {config.members}")
+        expect_range("model.members", config.members, 1, 1000)
         inputs = config.concept_dim + config.vector_dim
         self.network = ParallelMLP(config.members, inputs, config.hidden_dim, config.moments * config.state_dim)
 

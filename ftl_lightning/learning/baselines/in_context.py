@@ -21,6 +21,7 @@ from ftl_lightning.learning.baselines.transitions import StepConfig, expect_wind
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
+from ftl_lightning.ranges import LARGEST, expect_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +40,12 @@ class InContextConfig(StepConfig):
     width: int = 128
     layers: int = 4
     heads: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("tokens", "bins", "width", "heads"):
+            expect_range(f"model.{name}", getattr(self, name), 1, LARGEST)
+        expect_range("model.layers", self.layers, 1, 100)
 
 
 class InContextModel(ConceptModel):

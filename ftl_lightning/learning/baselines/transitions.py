@@ -23,6 +23,7 @@ class StepConfig(ModelConfig):
     stride: int = 1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.stride < 1:
             raise UserError(f"model.stride: expected 1 or more, found {self.stride}")
         if self.horizon > 1 and (self.horizon, self.stride) != (2, 1) and not self.state_columns:

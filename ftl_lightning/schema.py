@@ -1,0 +1,170 @@
+"""What a file or a configuration says, held against the annotations of what is made of it: types and ranges in one place."""
+
+import collections
+import collections.abc
+import dataclasses
+import functools
+import inspect
+import json
+import math
+import types
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.ranges import LARGEST
+
+FLOAT32 = 3.4e38
+"""Of a number with a point."""
+DEEPEST = 40
+"""Lists and mappings within one another."""
+LONGEST_TEXT = 32 * 2**20
+"""Bytes of a text file that is read."""
+_WORDS: Mapping[object, str] = {str: "a text", bool: "true or false", float: "a finite number (float32)"}
+_LISTS = (tuple, list, collections.abc.Sequence)
+
+T = TypeVar("T")
+
+
+def read_json(path: Path, kind: str = "JSON") -> Any:
+    """What a JSON file says.
+
+    Raises:
+        UserError: naming it, as :func:`parse_json`; also where it is too long.
+        OSError: if it cannot be read.
+    """
+    with about(path):
+        if (size := path.stat().st_size) > LONGEST_TEXT:
+            raise UserError(f"expected at most {LONGEST_TEXT} bytes of JSON, found {size}")
+        return parse_json(path.read_bytes(), kind)
+
+
+def parse_json(text: str | bytes, kind: str = "JSON") -> Any:
+    """What a JSON text says.
+
+    Args:
+        text: of it.
+        kind: what it is expected to be, for messages.
+
+    Raises:
+        UserError: for damaged text, keys that stand there twice, numbers that are not finite, texts that are no Unicode, or lists
+            and mappings deeper than :data:`DEEPEST`.
+    """
+    try:
+        found = json.loads(text.decode() if isinstance(text, bytes) else text, object_pairs_hook=_once)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"expected {kind}, found damaged text or too deep a nesting ({short(str(error))})") from error
+    _expect_plain(found, DEEPEST)
+    return found
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        ((twice, _),) = collections.Counter(key for key, _ in pairs).most_common(1)
+        raise UserError(f"key {short(twice)!r}: expected it once, found it several times")
+    return found
+
+
+def _expect_plain(value: object, left: int) -> None:
+    """Refuse what JSON can say and no other program reads."""
+    if isinstance(value, str):
+        try:
+            value.encode()
+        except UnicodeEncodeError as error:
+            raise UserError(f"expected texts of Unicode characters, found half of one in {short(ascii(value))}") from error
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise UserError(f"expected finite numbers, found {value}")
+    elif isinstance(value, dict | list):
+        if not left:
+            raise UserError(f"expected lists and mappings at most {DEEPEST} deep, found deeper ones")
+        for one in (*value, *value.values()) if isinstance(value, dict) else value:
+            _expect_plain(one, left - 1)
+
+
+def built(kind: Callable[..., T], content: object, key: str, *given: object) -> T:
+    """Call a class with arguments that a file or configuration names, each of the type that the class says.
+
+    Whole numbers are from 0 to :data:`LARGEST`; narrower ranges are the class's own matter.
+
+    Args:
+        kind: a dataclass, or a class whose ``__init__`` is annotated.
+        content: the arguments by name.
+        key: where they stand, for messages; empty for the top.
+        given: arguments before them, which no file names.
+
+    Raises:
+        UserError: naming the key of an argument that is missing, unknown or of another type.
+    """
+    hints, needed = _arguments(kind)
+    names = list(hints)[len(given) :]
+    if not isinstance(content, Mapping):
+        raise UserError(f"{_named(key)}: expected a mapping, found {shown(content)}")
+    for name in content:
+        if name not in names:
+            raise UserError(f"{_named(_joined(key, name))}: expected one of {short(', '.join(names), 120)}, found another key")
+    for name in names:
+        if name in needed and name not in content:
+            raise UserError(f"{_named(_joined(key, name))}: expected a value, found none")
+    return kind(*given, **{name: expect_type(value, hints[name], _joined(key, name)) for name, value in content.items()})
+
+
+@functools.cache
+def _arguments(kind: Callable[..., Any]) -> tuple[dict[str, Any], frozenset[str]]:
+    """The arguments of a class with their annotations, and those that it cannot do without."""
+    hints = get_type_hints(kind if dataclasses.is_dataclass(kind) else kind.__init__)
+    parameters = inspect.signature(kind).parameters
+    needed = (name for name, parameter in parameters.items() if parameter.default is inspect.Parameter.empty)
+    return {name: hints.get(name, Any) for name in parameters}, frozenset(needed)
+
+
+def expect_type(value: Any, kind: Any, key: str) -> Any:
+    """A value that JSON or YAML gave, as the annotation has it: lists become tuples, mappings dataclasses.
+
+    Raises:
+        UserError: naming the key, for a value of another type.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return built(kind, value, key)
+    if origin in (Union, types.UnionType):
+        for one in arguments:
+            try:
+                return expect_type(value, one, key)
+            except UserError as error:
+                mistake = error
+        raise mistake
+    if origin is Literal:
+        if not any(type(value) is type(one) and value == one for one in arguments):
+            raise _mistake(key, f"one of {', '.join(map(repr, arguments))}", value)
+    elif origin in (dict, collections.abc.Mapping):
+        if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
+            raise _mistake(key, "a mapping", value)
+        return {name: expect_type(one, arguments[1], _joined(key, name)) for name, one in value.items()}
+    elif origin in _LISTS:
+        if not isinstance(value, Sequence) or isinstance(value, str):
+            raise _mistake(key, "a list", value)
+        every = (expect_type(one, arguments[0], f"{key}[{index}]") for index, one in enumerate(value))
+        return tuple(every) if origin is tuple else list(every)
+    elif kind is int:
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:
+            raise _mistake(key, f"a whole number from 0 to {LARGEST}", value)
+    elif kind is float:
+        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= FLOAT32:
+            raise _mistake(key, _WORDS[kind], value)
+    elif kind in _WORDS and type(value) is not kind:
+        raise _mistake(key, _WORDS[kind], value)
+    return value
+
+
+def _joined(key: str, name: object) -> str:
+    return f"{key}.{short(str(name))}" if key else short(str(name))
+
+
+def _named(key: str) -> str:
+    return f"key {key!r}" if key else "content"
+
+
+def _mistake(key: str, expected: str, found: object) -> UserError:
+    return UserError(f"{_named(key)}: expected {expected}, found {shown(found)}")
