@@ -257,7 +257,9 @@ def test_pushing_at_the_height_of_the_table_moves_the_book(env: TableTopEnvironm
 def test_demonstrations_with_images_go_through_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["generate", "tabletop", "--task", PUSH_ON_BOOK, "--count", "2", "--out", "demos.safetensors"]) == 0
     read = Demonstrations.load(tmp_path / "demos.safetensors")
-    assert read.features == dict(DOMAIN.observed)
+    assert {name: (one.shape, one.kind) for name, one in read.features.items()} == {
+        name: (one.shape, one.kind) for name, one in DOMAIN.observed.items()
+    }
     assert read.observed[IMAGE].dtype == torch.uint8
     assert read.states.shape[2] == ACTION
     assert read.scenes is not None
