@@ -1,5 +1,6 @@
 """What a network reads of an image: a few numbers, trained with the rest of it."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.demonstrations.features import Feature, Observed
-from ftl_lightning.errors import UserError, shown
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.schema import built
 
@@ -18,6 +19,7 @@ MOST_PIXELS = 100_000_000
 GROUPS = 8
 """Of group normalisation, which replaces batch normalisation: that keeps statistics beside the weights, which no running average
 of weights holds (Chi et al., 2023)."""
+QUARTER = 4
 RESNET18 = "resnet18"
 NETWORKS = ("small", RESNET18)
 HEADS = ("keypoints", "grid")
@@ -88,17 +90,14 @@ class Grid(nn.Module):
 
 
 def _small(channels: int, widths: Sequence[int], height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
-    """A residual network whose feature map is a quarter of the image in each direction, and that map's shape."""
-    first, *rest = widths
-    layers: list[nn.Module] = [nn.Conv2d(channels, first, 5, 2, padding=2, bias=False), nn.GroupNorm(GROUPS, first), nn.ReLU()]
-    before = first
-    for number, after in enumerate(rest):
-        layers.append(ResidualBlock(before, after, 1 if number else 2))
-        before = after
-    halvings = 2 if rest else 1
-    for _ in range(halvings):
-        height, width = -(-height // 2), -(-width // 2)
-    return nn.Sequential(*layers), (before, height, width)
+    """A residual network whose feature map is a quarter of the image in each direction, and that map's shape.
+
+    The first convolution goes there at once: convolutions of few channels on many pixels take most of the time of deeper stems.
+    """
+    first = nn.Conv2d(channels, widths[0], 2 * QUARTER, QUARTER, padding=QUARTER // 2, bias=False)
+    blocks = [ResidualBlock(before, after, 1) for before, after in itertools.pairwise(widths)]
+    height, width = ((side + 2 * (QUARTER // 2) - 2 * QUARTER) // QUARTER + 1 for side in (height, width))
+    return nn.Sequential(first, nn.GroupNorm(GROUPS, widths[0]), nn.ReLU(), *blocks), (widths[-1], height, width)
 
 
 class _ResNet18(nn.Module):
@@ -134,6 +133,8 @@ class ImageEncoder(nn.Module):
         head: ``'keypoints'`` (spatial softmax), or ``'grid'``, all of the last map, which suits ResNet-18, whose map is small.
         keypoints: how many; of the grid, how many channels.
         crop: pixels by which each side is smaller after cropping: at random in training, in the middle else; 0 for none.
+        origin: name of an observed vector, column and row (-1 to 1) of a place in the image, that keypoints are told relative to:
+            of a hand, for example, for which it matters where things are from there; empty for the image's middle.
 
     Raises:
         UserError: for a value that is none.
@@ -143,10 +144,11 @@ class ImageEncoder(nn.Module):
         self,
         shape: Sequence[int],
         network: str = "small",
-        widths: Sequence[int] = (16, 32, 32),
+        widths: Sequence[int] = (32,),
         head: str = "keypoints",
         keypoints: int = 32,
         crop: int = 0,
+        origin: str = "",
     ) -> None:
         super().__init__()
         for name, value, known in (("network", network, NETWORKS), ("head", head, HEADS)):
@@ -159,8 +161,15 @@ class ImageEncoder(nn.Module):
         channels, height, width = shape
         expect_range("model.image_encoder.keypoints", keypoints, 1)
         expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
-        self.crop = crop
+        if origin and head != "keypoints":
+            raise UserError(f"model.image_encoder.origin: expected none for a head without keypoints, found {origin!r}")
+        self.crop, self.origin = crop, origin
         height, width = height - crop, width - crop
+        if network == "small" and min(height, width) < 2 * QUARTER:
+            raise UserError(
+                f"model.image_encoder.crop: expected images of {2 * QUARTER} x {2 * QUARTER} or more for the small network, "
+                f"found {height} x {width}"
+            )
         if network == RESNET18:
             self.network: nn.Module = _ResNet18(channels)
             size = (512, -(-height // 32), -(-width // 32))
@@ -171,7 +180,7 @@ class ImageEncoder(nn.Module):
         """Numbers that are read of an image."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(batch, channels, height, width)`` uint8 to ``(batch, size)``."""
+        """``(batch, channels, height, width)`` uint8 to ``(batch, size)``, keypoints told from the image's middle."""
         height, width = (side - self.crop for side in images.shape[2:])
         if self.crop and self.training:
             top, left = torch.randint(self.crop + 1, (2, len(images), 1), device=images.device)
@@ -200,10 +209,30 @@ class ImageEncoders(nn.Module):
         super().__init__()
         self.names = [name for name, feature in observed.items() if feature.kind == "image"]
         encoders = [built(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
+        self.origins = [encoder.origin for encoder in encoders]
+        for origin in self.origins:
+            if origin and (origin not in observed or observed[origin].shape != (2,)):
+                raise UserError(f"model.image_encoder.origin: expected an observed vector of 2 columns, found {short(origin)!r}")
         self.encoders = nn.ModuleList(encoders)
-        self.size = sum(encoder.size for encoder in encoders)
+        self.sizes = [encoder.size for encoder in encoders]
+        self.size = sum(self.sizes)
         """Numbers that are read of all images."""
 
     def forward(self, observed: Observed) -> Tensor:
         """Images by name ``(batch, *shape)`` to ``(batch, size)``."""
         return torch.cat([encoder(observed[name]) for name, encoder in zip(self.names, self.encoders, strict=True)], dim=-1)
+
+    def from_origins(self, read: Tensor, observed: Observed) -> Tensor:
+        """The same, keypoints told from their origins.
+
+        Args:
+            read: ``(batch, size)``, of images that may have been seen before.
+            observed: vectors by name, of which origins are the present ones.
+        """
+        parts = []
+        for part, origin in zip(read.split(self.sizes, dim=1), self.origins, strict=True):
+            if origin:
+                places, heights = part.split((2 * part.shape[1] // 3, part.shape[1] // 3), dim=1)
+                part = torch.cat((places - observed[origin].repeat_interleave(part.shape[1] // 3, dim=1), heights), dim=1)
+            parts.append(part)
+        return torch.cat(parts, dim=1)

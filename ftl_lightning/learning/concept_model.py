@@ -347,7 +347,7 @@ class ConceptModel(nn.Module, ABC):
             vectors = self.initial_normalization.encode(joined_vectors(seen, self.config.observed))
             parts.append(self._dropped(vectors) if self.training else vectors)
         if self.images is not None:
-            parts.append(self.images(seen) if of_images is None else of_images)
+            parts.append(self.images.from_origins(self.images(seen) if of_images is None else of_images, seen))
         return torch.cat(parts, dim=-1)
 
     def of_images(self, observed: Observed) -> Tensor | None:

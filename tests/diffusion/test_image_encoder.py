@@ -58,11 +58,18 @@ def test_sizes(options: dict[str, Any], size: int) -> None:
         ({"head": "mean"}, "model.image_encoder.head: expected one of keypoints, grid, found 'mean'"),
         ({"widths": [12]}, r"model.image_encoder.widths: expected multiples of 8, found \[12\]"),
         ({"widths": []}, r"model.image_encoder.widths: expected multiples of 8, found \[\]"),
+        ({"origin": "hand"}, "model.image_encoder.origin: expected an observed vector of 2 columns, found 'hand'"),
+        ({"origin": "view"}, "model.image_encoder.origin: expected an observed vector of 2 columns, found 'view'"),
+        (
+            {"origin": "hand", "head": "grid"},
+            "model.image_encoder.origin: expected none for a head without keypoints, found 'hand'",
+        ),
+        ({"crop": 20}, "model.image_encoder.crop: expected images of 8 x 8 or more for the small network, found 12 x 4"),
         ({"crop": 24}, "model.image_encoder.crop: expected a number from 0 to 23, found 24"),
         ({"keypoints": 0}, "model.image_encoder.keypoints: expected 1 or more, found 0"),
         (
             {"depth": 3},
-            "key .model.image_encoder.depth.: expected one of network, widths, head, keypoints, crop",
+            "key .model.image_encoder.depth.: expected one of network, widths, head, keypoints, crop, origin",
         ),
     ],
 )
@@ -80,17 +87,30 @@ def test_a_keypoint_is_where_its_map_is_largest() -> None:
     torch.testing.assert_close(softmax(maps)[:, :2], expected, atol=1e-4, rtol=0)
 
 
+def test_keypoints_are_told_from_their_origin() -> None:
+    features = {"view": Feature(SHAPE, "image"), "other": Feature(SHAPE, "image"), "hand": Feature((2,))}
+    encoders = ImageEncoders(features, {"keypoints": 4, "origin": "hand"})
+    hand = torch.tensor([[0.25, -0.5], [0.0, 1.0]])
+    read = torch.arange(2 * 24.0).reshape(2, 24)
+    moved = read - encoders.from_origins(read, {"hand": hand})
+    assert encoders.size == 24
+    for number, (column, row) in enumerate(hand.tolist()):
+        assert moved[number].tolist() == 2 * [*[column] * 4, *[row] * 4, *[0.0] * 4]
+    plain = ImageEncoders(features, {"keypoints": 4})
+    assert torch.equal(plain.from_origins(read, {}), read)
+
+
 def test_crops_are_random_in_training_and_in_the_middle_else() -> None:
-    encoder = ImageEncoder((1, 8, 8), widths=[8], crop=2)
+    encoder = ImageEncoder((1, 12, 12), widths=[8], crop=2)
     seen: list[Tensor] = []
     encoder.network.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
-    image = torch.arange(64, dtype=torch.uint8).reshape(1, 1, 8, 8)
+    image = torch.arange(144, dtype=torch.uint8).reshape(1, 1, 12, 12)
     encoder.eval()(image)
-    torch.testing.assert_close(seen[0], image[:, :, 1:7, 1:7].float() / 127.5 - 1)
+    torch.testing.assert_close(seen[0], image[:, :, 1:11, 1:11].float() / 127.5 - 1)
     torch.manual_seed(0)
     encoder.train()(image.expand(200, -1, -1, -1))
     corners = ((seen[1][:, 0, 0, 0] + 1) * 127.5).round().long()
-    assert set(corners.tolist()) == {8 * row + column for row in range(3) for column in range(3)}
+    assert set(corners.tolist()) == {12 * row + column for row in range(3) for column in range(3)}
 
 
 # In models: ways to a bright dot or away from it, where the dot is seen in a picture alone

@@ -9,7 +9,7 @@ from ftl_lightning.demonstrations.features import take
 from ftl_lightning.domains.tabletop.environment import IMAGE, POSE
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, TRIANGLE, scene_of
 from ftl_lightning.domains.tabletop.source import initial_states
-from ftl_lightning.domains.tabletop.views import MOVED, SHIFT, VIEWS, moved
+from ftl_lightning.domains.tabletop.views import HAND, MOVED, ORIGIN, SHIFT, VIEWS, moved
 from ftl_lightning.seeding import generator
 
 PLACED = {CIRCLE: (0.42, 0.12, 0.0), TRIANGLE: (0.55, -0.10, 0.3), BOOK: (0.57, 0.10, 0.2)}
@@ -34,6 +34,23 @@ def test_a_moved_scene_looks_as_one_that_was_built_there(mirrored: bool) -> None
     turned = [0.5 + math.cos(angle) * x - math.sin(angle) * y + shift[0], math.sin(angle) * x + math.cos(angle) * y + shift[1]]
     torch.testing.assert_close(seen[POSE][0, :2], torch.tensor(turned), atol=1e-5, rtol=0)
     assert torch.equal(seen[POSE][:, 2:], hand[:, 2:])
+
+
+def test_places_are_told_from_the_hand() -> None:
+    start = initial_states(torch.from_numpy(scene_of(PLACED))[None])
+    view, hand = VIEWS[HAND], start.observed[POSE][0]
+    plan = torch.tensor([[[float(hand[0]) + 0.1, float(hand[1]), float(hand[2]) - 0.05, 0.08]]])
+    told = view.encode(plan, start.observed)
+    torch.testing.assert_close(told, torch.tensor([[[0.1, 0.0, -0.05, 0.08]]]))
+    torch.testing.assert_close(view.decode(told, start.observed), plan)
+    # The picture of a circle at the hand has its green where the origin is.
+    below = {CIRCLE: (float(hand[0]), float(hand[1]), 0.0), TRIANGLE: (0.62, -0.18, 0.3)}
+    seen = view.observe(initial_states(torch.from_numpy(scene_of(below))[None]).observed)
+    red, green, _ = seen[IMAGE][0].float()
+    mask = (green > 1.5 * red).float()
+    along = torch.linspace(-1, 1, 64)
+    found = torch.stack((mask.sum(0) @ along, mask.sum(1) @ along)) / mask.sum()
+    torch.testing.assert_close(seen[ORIGIN][0], found, atol=0.04, rtol=0)  # a pixel is 0.03
 
 
 def test_perturbing_is_random_as_drawn_and_leaves_a_new_task_alone() -> None:

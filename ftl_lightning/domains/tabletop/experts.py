@@ -16,11 +16,13 @@ CLOSED = 0.0
 PUSH_HEIGHT = 0.014
 """Metres of the hand above what the circle stands on while it pushes."""
 GRASP_HEIGHT = 0.016
+ASIDE = 0.02
+"""Metres beside the line at which a push begins at most."""
 CONTACT = 0.037
 """Metres between the centres of hand and circle while one pushes the other."""
-STEERING = 3.0
+STEERING = 5.0
 """Weight of what the hand is beside the line through the circle, in units of :data:`CONTACT`."""
-LOST = 1.0
+LOST = 0.6
 """Radians off that line, beyond which the hand goes around the circle to get behind it again."""
 AHEAD = 0.02
 """Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
@@ -29,9 +31,13 @@ PATIENCE = 10
 SLOWER = 1.4
 """On the book pushes are slower by this factor, which gives more moments to learn from."""
 STRAIGHT_SPEED = 0.009
-NOISE = (0.001, 0.004)
-"""Metres, see :class:`Style`: people's hands wander by millimetres, and only demonstrations that leave the straight way show how to
-come back to it (Laskey et al., 2017)."""
+TREMBLE = 0.0003
+"""Metres, standard deviation of what each step of the hand is off."""
+SLIPS, SLIP = 0.04, (0.006, 0.018)
+"""How often the hand slips in a step of a push, and by how many metres: only demonstrations that leave the way show how to come
+back to it (Laskey et al., 2017). A hand that always wanders shows it too, but hides the way under its noise."""
+RETURN = 0.8
+"""Share of what the hand is off its way that is left a step later."""
 BESIDE = 0.105
 """Metres between bowl and circle that is put down beside it, centre to centre."""
 
@@ -46,16 +52,15 @@ class Style:
 
     Attributes:
         speed: factor of all speeds.
-        behind: metres behind the circle at which a push begins.
+        behind, aside: metres behind the circle, and to the left of the line to where it goes, at which a push begins.
         hover: height in metres at which the hand travels.
-        noise: standard deviation in metres of what the hand wanders off its way.
         grasp, place: metres, beside the circle's centre and beside where it is put.
     """
 
     speed: float
     behind: float
+    aside: float
     hover: float
-    noise: float
     grasp: Place
     place: Place
 
@@ -65,8 +70,8 @@ def style(rng: np.random.Generator) -> Style:
     return Style(
         speed=float(rng.uniform(0.8, 1.2)),
         behind=float(rng.uniform(0.055, 0.08)),
+        aside=float(rng.uniform(-ASIDE, ASIDE)),
         hover=float(rng.uniform(0.11, 0.16)),
-        noise=float(rng.uniform(*NOISE)),
         grasp=rng.uniform(-0.004, 0.004, 2),
         place=rng.uniform(-1, 1, 2),
     )
@@ -83,19 +88,21 @@ class _Expert:
         return self.env.places()[CIRCLE]
 
     def go(self, place: Place, speed: float, opening: float) -> Moves:
-        """Straight there, with a soft start and end; metres a step at most."""
+        """Straight there, with a soft start and end; metres a step at most. A hand that is off this way comes back to it."""
         start, goal = self.at[:3].copy(), np.asarray(place, dtype=np.float64)
+        before = start
         steps = max(2, math.ceil(1.3 * float(np.linalg.norm(goal - start)) / (speed * self.how.speed)))
         for number in range(1, steps + 1):
             share = number / steps
             share -= 0.3 * math.sin(2 * math.pi * share) / (2 * math.pi)
-            self.at = np.array([*(start + share * (goal - start)), opening])
-            yield self.at
+            off, before = self.env.command[:3] - before, start + share * (goal - start)
+            self.at = np.array([*before, opening])
+            yield self.at + np.array([*(RETURN * off), 0.0])
 
     def wait(self, steps: int, opening: float) -> Moves:
         self.at = np.array([*self.at[:3], opening])
         for _ in range(steps):
-            yield self.at
+            yield self.at + np.array([*(RETURN * (self.env.command[:3] - self.at[:3])), 0.0])
 
 
 def moves(env: TableTopEnvironment, task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
@@ -145,11 +152,11 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     return bowl + np.array([side * (BESIDE + 0.01 * how.place[0]), 0.02 * how.place[1]]), 0.0
 
 
-def _behind(expert: _Expert, goal: Place) -> Place:
-    """Where a push of the circle towards a goal begins."""
+def _behind(expert: _Expert, goal: Place, aside: float) -> Place:
+    """Where a push of the circle towards a goal begins, metres to the left of the line between them."""
     circle = expert.circle()[:2]
     along = (goal - circle) / np.linalg.norm(goal - circle)
-    return circle - expert.how.behind * along
+    return circle - expert.how.behind * along + aside * np.array([-along[1], along[0]])
 
 
 def _triangle(expert: _Expert) -> Place:
@@ -210,11 +217,11 @@ def _push(expert: _Expert, height: float) -> Moves:
         if lost >= PATIENCE:
             if expert.at[2] < height + 0.05:
                 yield from expert.go(np.array([*expert.at[:2], height + 0.06]), 0.016, CLOSED)
-            begin = _behind(expert, goal())
+            begin = _behind(expert, goal(), how.aside)
             yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
             yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
             lost = 0
-        circle, hand, ahead = expert.circle()[:2], expert.at[:2], goal()
+        circle, hand, ahead = expert.circle()[:2], expert.env.command[:2], goal()
         along = (ahead - circle) / max(float(np.linalg.norm(ahead - circle)), 1e-6)
         to = circle - hand
         across = to - (to @ along) * along
@@ -236,7 +243,7 @@ def _push(expert: _Expert, height: float) -> Moves:
 def _straight(expert: _Expert, height: float) -> Moves:
     """Push on the line from circle to triangle as they lie in the beginning."""
     goal = _triangle(expert).copy()
-    begin = _behind(expert, goal)
+    begin = _behind(expert, goal, 0.0)
     yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
     yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
     along = (goal - begin) / np.linalg.norm(goal - begin)
@@ -289,10 +296,12 @@ def perform(
     seen, told = env.reset(options={"scene": scene})
     how = style(rng)
     commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
-    wander = np.zeros(3)
     for command in moves(env, task, how, height, feedback):
-        wander = 0.8 * wander + how.noise * rng.standard_normal(3) * (1, 1, 0.3)
-        seen, _, terminated, truncated, told = env.step((command + np.array([*wander, 0.0])).astype(np.float32))
+        off = TREMBLE * rng.standard_normal(3)
+        angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
+        if slips and task in PUSHES:
+            off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
+        seen, _, terminated, truncated, told = env.step((command + np.array([*off, 0.0])).astype(np.float32))
         commands.append(env.command.copy())
         images.append(seen[IMAGE])
         poses.append(seen[POSE])

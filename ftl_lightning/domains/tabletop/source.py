@@ -27,7 +27,7 @@ STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
 STATE_UNITS = ("m",) * 4
 MOST = 4
 """Episodes that are tried at most for each that is kept."""
-FORM = 2
+FORM = 3
 """Of the experts; what is cached of another one is not used."""
 TIMES = {PUSH: 4}
 """So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""

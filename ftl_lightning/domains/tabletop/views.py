@@ -6,13 +6,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
 
-MOVED, STEPS = "moved", "steps"
-SHIFT = 0.05
+HAND, MOVED = "hand", "moved"
+ORIGIN = "origin"
+"""Observed with the view ``hand``: column and row of the hand in the picture (-1 to 1)."""
+SHIFT = 0.07
 """Metres by which a scene is shifted at most, in x and in y."""
 TURN = 0.5
 """Radians by which half of the scenes are turned at most; the others are turned by any angle."""
@@ -69,7 +71,24 @@ def _start(observed: Observed) -> Tensor:
     return observed[POSE][:, None, list(FEATURES[POSE].state)]
 
 
+def _place(observed: Observed) -> Tensor:
+    """What states are told relative to with the view ``hand``: its place, and no opening, ``(sample, 1, 4)``."""
+    return functional.pad(_start(observed)[..., :3], (0, 1))
+
+
+def _with_origin(observed: Observed) -> dict[str, Tensor]:
+    away = (observed[POSE][:, :2] - observed[POSE].new_tensor(MIDDLE)) / -HALF
+    return {**observed, ORIGIN: away.flip(1)}
+
+
 VIEWS = {
+    HAND: View(
+        features={**FEATURES, ORIGIN: Feature((2,))},
+        observe=_with_origin,
+        encode=lambda states, observed: states - _place(observed),
+        decode=lambda states, observed: states + _place(observed),
+        perturb=_perturb,
+    ),
     MOVED: View(
         features=FEATURES,
         observe=lambda observed: observed,
@@ -78,16 +97,9 @@ VIEWS = {
         perturb=_perturb,
         same_columns=True,
     ),
-    STEPS: View(
-        features=FEATURES,
-        observe=lambda observed: observed,
-        encode=lambda states, observed: states - _start(observed),
-        decode=lambda states, observed: states + _start(observed),
-        perturb=_perturb,
-    ),
 }
 """With ``model.perturb``, scenes are mirrored, turned and shifted at random together with what is done in them.
 
-``moved`` shows states as they are. ``steps`` shows how they differ from where the hand is: methods that go from one state to the
-next need not copy it.
+``hand`` shows places from where the hand is; keypoints of pictures can be told likewise, see :data:`ORIGIN`. ``moved`` shows states
+as they are.
 """
