@@ -299,7 +299,7 @@ def perform(
     for command in moves(env, task, how, height, feedback):
         off = TREMBLE * rng.standard_normal(3)
         angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
-        if slips and task in PUSHES:
+        if slips and task in PUSHES and feedback:  # who does not look cannot come back
             off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
         seen, _, terminated, truncated, told = env.step((command + np.array([*off, 0.0])).astype(np.float32))
         commands.append(env.command.copy())
