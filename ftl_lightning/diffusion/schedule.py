@@ -52,7 +52,12 @@ def clean_from_epsilon(noisy: Tensor, epsilon: Tensor, alpha_bar: Tensor, clip: 
 
 
 def denoising_loss(
-    epsilon: Callable[[Tensor, Tensor], Tensor], clean: Tensor, noise: Tensor, t: Tensor, alpha_bar: Tensor
+    epsilon: Callable[[Tensor, Tensor], Tensor],
+    clean: Tensor,
+    noise: Tensor,
+    t: Tensor,
+    alpha_bar: Tensor,
+    discount: float = 1.0,
 ) -> Tensor:
     """Squared error of the noise estimate, the integrand of Eq. 1 and Eq. 2; which of the two, ``epsilon`` decides.
 
@@ -61,8 +66,13 @@ def denoising_loss(
         clean, noise: ``(batch, horizon, state)``.
         t: ``(batch,)`` int64.
         alpha_bar: the schedule ``(T,)``.
+        discount: state k of the window weighs ``discount ** k``, in units of the mean of these (Janner et al., 2022).
 
     Returns:
         ``(batch,)``, the mean over horizon and state.
     """
-    return (epsilon(add_noise(clean, noise, alpha_bar[t]), t) - noise).square().mean(dim=(1, 2))
+    squared = (epsilon(add_noise(clean, noise, alpha_bar[t]), t) - noise).square()
+    if discount != 1:
+        weights = discount ** torch.arange(clean.shape[1], device=clean.device)
+        squared = squared * (weights / weights.mean())[:, None]
+    return squared.mean(dim=(1, 2))

@@ -371,6 +371,7 @@ class PretrainingModule(Pretraining):
             which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
             weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        loss_discount: state k of a window weighs so much to the power of k: below 1 for plans that are made anew before they end.
         code_share: of the samples are also told a rough code of their own behaviour, which varies over the window, see
             :class:`~ftl_lightning.learning.codes.Codes`: so the network has seen concepts that do, and concepts that no text
             names. 0 is the paper's form.
@@ -394,6 +395,7 @@ class PretrainingModule(Pretraining):
         guidance: float = 1.2,
         prediction: str = "epsilon",
         loss: str = "epsilon",
+        loss_discount: float = 1.0,
         view: str = "",
         perturb: bool = False,
         code_share: float = 0.0,
@@ -424,6 +426,7 @@ class PretrainingModule(Pretraining):
         if not 0 <= code_share <= 1:
             raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
         expect_range("model.condition_dropout", condition_dropout, 0, 1)
+        expect_range("model.loss_discount", loss_discount, 0, 1)
         expect_range("model.code_noise", code_noise, 0)
         for name, count in (("diffusion_steps", diffusion_steps), ("code_knots", code_knots), ("code_size", code_size)):
             expect_range(f"model.{name}", count, 1)
@@ -461,5 +464,12 @@ class PretrainingModule(Pretraining):
             concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
         t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
         noise = torch.randn(clean.shape, generator=draw, device=self.device)
-        losses = denoising_loss(lambda x, t: model.denoiser(x, t, concepts, index, context), clean, noise, t, model.alpha_bar)
+        losses = denoising_loss(
+            lambda x, t: model.denoiser(x, t, concepts, index, context),
+            clean,
+            noise,
+            t,
+            model.alpha_bar,
+            self.hparams["loss_discount"],
+        )
         return losses * loss_weights(self.hparams["loss"], model.alpha_bar)[t]

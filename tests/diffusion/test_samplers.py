@@ -121,6 +121,16 @@ def test_the_loss_of_the_true_noise_is_zero() -> None:
     assert torch.equal(denoising_loss(lambda x, t: noise, torch.zeros(4, 1, 3), noise, t, ALPHA_BAR), torch.zeros(4))
 
 
+def test_a_discount_weighs_states_by_its_powers() -> None:
+    noise = torch.randn(2, 3, 2)
+    one, t = torch.zeros_like(noise), torch.tensor([0, 50])
+    alike = denoising_loss(lambda x, t: one, one, noise, t, ALPHA_BAR)
+    half = denoising_loss(lambda x, t: one, one, noise, t, ALPHA_BAR, 0.5)
+    each = noise.square().mean(dim=2)
+    assert torch.allclose(alike, each.mean(dim=1))
+    assert torch.allclose(half, (each * torch.tensor([1, 0.5, 0.25])).sum(dim=1) / 1.75)
+
+
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_a_sampling_runs_its_sampler_with_its_steps_and_temperature(name: str) -> None:
     found = Sampling(name, 12, 0.3).run(exact, noise(), ALPHA_BAR)

@@ -44,6 +44,7 @@ from ftl_lightning.domains.tabletop.tasks import (
     TO_WHITE,
     TRAINING_CONCEPTS,
 )
+from ftl_lightning.domains.tabletop.world import COLOUR
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 
@@ -251,7 +252,56 @@ def test_pushing_at_the_height_of_the_table_moves_the_book(env: TableTopEnvironm
     assert env._told()["book"] > 0.02
 
 
+def test_an_expert_goes_around_a_circle_that_it_does_not_stand_behind(env: TableTopEnvironment) -> None:
+    env.reset(options={"scene": scene_of({CIRCLE: (0.48, 0.0, 0.0), TRIANGLE: (0.62, 0.0, 0.0)})})
+    for place in ((0.54, -0.06, 0.1), (0.54, -0.06, experts.PUSH_HEIGHT)):  # before the circle, beside its way
+        for _ in range(14):
+            env.step(np.array([*place, 0.0], dtype=np.float32))
+    pushing = experts._push(experts._Expert(env, PUSH, experts.style(np.random.default_rng(0))), experts.PUSH_HEIGHT)
+    pushing = (command for command in pushing if command[2] <= experts.PUSH_HEIGHT)  # it has come down already
+    told: dict[str, Any] = {}
+    for command, _ in zip(pushing, range(100), strict=False):
+        told = env.step(command.astype(np.float32))[-1]
+        if told["touched"]:
+            break
+    assert judged(PUSH, env.scene, told)
+
+
 # Demonstrations
+
+
+def test_distractors_lie_elsewhere_in_each_picture_and_nothing_else_changes(env: TableTopEnvironment) -> None:
+    scene = scene_of({**APART, BOOK: (0.4, -0.2, 0.0), BOWL: (0.62, 0.2, 0.0)})
+    plain, scattered, again = (
+        experts.perform(env, PUSH, scene, np.random.default_rng(3), scatter=scatter) for scatter in (False, True, True)
+    )
+    assert (plain.commands == scattered.commands).all()
+    assert (plain.poses == scattered.poses).all()
+    assert (scattered.images == again.images).all()
+    assert scattered.images.shape == plain.images.shape
+
+    def seen(images: np.ndarray, name: str) -> np.ndarray:
+        """Pixels of an object's colour ``(time, 64, 64)``."""
+        colour = np.array(COLOUR[name])[:, None, None]
+        light = images.max(axis=1, keepdims=True) / 255  # faces differ by how much light they get
+        return (np.abs(images / 255 / np.maximum(light, 0.01) - colour / colour.max()) < 0.12).all(axis=1) & (light[:, 0] > 0.2)
+
+    for name in (CIRCLE, TRIANGLE):
+        assert (seen(plain.images, name) == seen(scattered.images, name)).mean() > 0.999
+        assert seen(plain.images, name).any(axis=(1, 2)).all()
+    assert seen(plain.images, BOOK).all(axis=0).sum() > 50
+    assert seen(scattered.images, BOOK).all(axis=0).sum() == 0
+    assert 0.4 < seen(scattered.images, BOOK).any(axis=(1, 2)).mean() < 0.95
+
+
+def test_training_sets_are_scattered_and_demonstrations_of_a_task_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    expert = DOMAIN.source(None)
+    made = expert.draw(PUSH_ON_BOOK, 1, 0)
+    monkeypatch.setattr(source, "cached", lambda settings, *_: drawn.append(settings) or made)
+    expert.split("train", 2, 0)
+    expert.draw(PUSH, 2, 0)
+    assert [(one["count"], one["scatter"]) for one in drawn] == [(2, True), (2, True), (8, True), (2, True), (2, False)]
 
 
 def test_demonstrations_with_images_go_through_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,7 +313,7 @@ def test_demonstrations_with_images_go_through_a_file(tmp_path: Path, monkeypatc
     assert read.observed[IMAGE].dtype == torch.uint8
     assert read.states.shape[2] == ACTION
     assert read.scenes is not None
-    monkeypatch.setattr(source, "perform", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(source, "perform", lambda *_, **__: pytest.fail("made again"))
     again = DOMAIN.source(None).draw(PUSH_ON_BOOK, 2, 0)
     assert again.hash == read.hash
     # What is seen in the beginning is what the environment shows in the same scene.
@@ -276,11 +326,11 @@ def test_a_simulator_that_raises_costs_its_episode_alone(monkeypatch: pytest.Mon
     kept = source.perform
     calls: list[str] = []
 
-    def fragile(*arguments: Any) -> experts.Episode:
+    def fragile(*arguments: Any, **named: Any) -> experts.Episode:
         calls.append("")
         if len(calls) == 1:
             raise RuntimeError("the simulator broke")
-        return kept(*arguments)
+        return kept(*arguments, **named)
 
     monkeypatch.setattr(source, "perform", fragile)
     made = source.demonstrations(PUSH_ON_BOOK, 1, 5, 1, lambda: None)

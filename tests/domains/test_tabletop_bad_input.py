@@ -157,7 +157,7 @@ def test_commands_that_cannot_be_followed(options: list[str], expected: str, cap
 
 
 def test_experts_that_never_succeed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(source, "perform", lambda *_: episode(success=False))
+    monkeypatch.setattr(source, "perform", lambda *_, **__: episode(success=False))
     expected = "table-top 'push green circle to orange triangle': expected 2 successful episodes of 8, found 0"
     assert expected in told_by(capsys, "generate", NAME, "--task", PUSH, "--count=2")
 
@@ -295,7 +295,7 @@ def performed(error: BaseException) -> Callable[..., Episode]:
     """Experts of whom the second one's simulator raises an error."""
     count: list[str] = []
 
-    def perform(*_: Any) -> Episode:
+    def perform(*_: Any, **__: Any) -> Episode:
         count.append("")
         if len(count) == 2:
             raise error

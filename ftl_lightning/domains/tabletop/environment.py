@@ -175,7 +175,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._steps += 1
         places = self.places()
         if TRIANGLE in places and abs(places[CIRCLE][2] - places[TRIANGLE][2]) < LIFTED:
-            self._touched |= touching(self._outline(TRIANGLE), places[CIRCLE])
+            self._touched |= touching(self.outline(TRIANGLE), places[CIRCLE])
         self._lifted |= bool(places[CIRCLE][2] > self._first[CIRCLE][2] + LIFTED)
         self._trace.append(self._now())
         seen, found = self._observation(), self._told()
@@ -187,7 +187,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         found = {name: self.client.getBasePositionAndOrientation(body)[0] for name, body in self.bodies.objects.items()}
         return {name: np.array(place) for name, place in found.items()}
 
-    def _outline(self, name: str) -> NDArray[np.float64]:
+    def outline(self, name: str) -> NDArray[np.float64]:
+        """An object from above, as it lies, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""
         place, turn = self.client.getBasePositionAndOrientation(self.bodies.objects[name])
         return outline(name, place[0], place[1], pybullet.getEulerFromQuaternion(turn)[2])
 

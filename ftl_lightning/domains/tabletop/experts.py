@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.tabletop.distractors import scattered
 from ftl_lightning.domains.tabletop.environment import IMAGE, MAX_STEPS, OPEN, POSE, TableTopEnvironment
 from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, RING, TRIANGLE, WHITE, support
 from ftl_lightning.domains.tabletop.success import judged
@@ -18,16 +19,10 @@ PUSH_HEIGHT = 0.014
 GRASP_HEIGHT = 0.016
 ASIDE = 0.02
 """Metres beside the line at which a push begins at most."""
-CONTACT = 0.037
-"""Metres between the centres of hand and circle while one pushes the other."""
-STEERING = 5.0
-"""Weight of what the hand is beside the line through the circle, in units of :data:`CONTACT`."""
-LOST = 0.6
-"""Radians off that line, beyond which the hand goes around the circle to get behind it again."""
+OUTWARDS = 4.0
+"""How much a hand that is not behind the circle keeps its distance, over how fast it goes around."""
 AHEAD = 0.02
 """Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
-PATIENCE = 10
-"""Steps in a row around the circle, after which the hand is lifted and comes down behind it."""
 SLOWER = 1.4
 """On the book pushes are slower by this factor, which gives more moments to learn from."""
 STRAIGHT_SPEED = 0.009
@@ -38,8 +33,8 @@ SLIPS, SLIP = 0.04, (0.006, 0.018)
 back to it (Laskey et al., 2017). A hand that always wanders shows it too, but hides the way under its noise."""
 RETURN = 0.8
 """Share of what the hand is off its way that is left a step later."""
-BESIDE = 0.105
-"""Metres between bowl and circle that is put down beside it, centre to centre."""
+BESIDE = 0.12
+"""Metres between bowl and circle that is put down beside it, centre to centre: the fingers, which open to the sides, need room."""
 
 Place = NDArray[np.float64]
 Moves = Generator[Place, None, None]
@@ -146,10 +141,11 @@ def _target(expert: _Expert) -> tuple[Place, float]:
         name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
         return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.place, HEIGHT[name]
     assert expert.task == BESIDE_BOWL
-    # In front of the bowl or behind it, where the fingers, which open to the sides, do not meet it.
+    # On the side of the bowl where it lay: which one that is does not change when the scene is turned.
     bowl = scene[COLUMNS[BOWL]][1:3].astype(np.float64)
-    side = 1.0 if bowl[0] < 0.5 else -1.0
-    return bowl + np.array([side * (BESIDE + 0.01 * how.place[0]), 0.02 * how.place[1]]), 0.0
+    along = expert.circle()[:2] - bowl
+    along /= np.linalg.norm(along)
+    return bowl + (BESIDE + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
 
 
 def _behind(expert: _Expert, goal: Place, aside: float) -> Place:
@@ -196,47 +192,34 @@ def _spread(start: Place, end: Place) -> list[Place]:
 
 
 def _push(expert: _Expert, height: float) -> Moves:
-    """Bring the circle to the triangle, looking where it goes."""
+    """Bring the circle to the triangle, looking where it goes.
+
+    The hand follows a dipole field (Igarashi et al., 2010): where it sees the circle at an angle from the way, it goes at twice
+    that angle. Behind the circle that pushes it, steering; from beside it leads around. What to do follows from where things are
+    alone, without a jump, which is what a network can learn from few demonstrations.
+    """
     how = expert.how
-    way = _way_around(expert) if expert.task == AROUND_BOWL else []
-    done = 0
 
     def goal() -> Place:
-        nonlocal done
-        if not way:
+        if expert.task != AROUND_BOWL:
             return _triangle(expert)
-        circle = expert.circle()[:2]
-        near = range(done, min(len(way), done + 20))
-        done = min(near, key=lambda number: float(np.linalg.norm(way[number] - circle)))
-        ahead = done + int(AHEAD / 0.005)
-        return way[ahead] if ahead < len(way) else _triangle(expert)
+        way, ahead = _way_around(expert), int(AHEAD / 0.005)
+        return way[ahead] if ahead < len(way) else way[-1]
 
     speed = 0.008 * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
-    lost = PATIENCE  # at first the hand is anywhere
+    begin = _behind(expert, goal(), how.aside)
+    yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
+    yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
     while True:
-        if lost >= PATIENCE:
-            if expert.at[2] < height + 0.05:
-                yield from expert.go(np.array([*expert.at[:2], height + 0.06]), 0.016, CLOSED)
-            begin = _behind(expert, goal(), how.aside)
-            yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
-            yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
-            lost = 0
         circle, hand, ahead = expert.circle()[:2], expert.env.command[:2], goal()
-        along = (ahead - circle) / max(float(np.linalg.norm(ahead - circle)), 1e-6)
-        to = circle - hand
-        across = to - (to @ along) * along
-        off = math.atan2(abs(_cross(to, along)), float(to @ along))
-        lost = lost + 1 if off > LOST else 0
-        if off > LOST:
-            # Around the circle at a distance, on the side where the hand is.
-            away = -to / max(float(np.linalg.norm(to)), 1e-6)
-            round_ = np.array([-away[1], away[0]])
-            round_ *= 1.0 if round_ @ -along > 0 else -1.0
-            direction = round_ + 4 * (how.behind - float(np.linalg.norm(to))) / how.behind * away
-        else:
-            direction = along + STEERING * across / CONTACT
-        direction /= max(float(np.linalg.norm(direction)), 1e-6)
-        expert.at = np.array([*(hand + speed * direction), height, CLOSED])
+        along, to = complex(*(ahead - circle)), complex(*(circle - hand))
+        distance = max(abs(to), 1e-6)
+        along, to = along / max(abs(along), 1e-6), to / distance
+        beside = 1 - (to / along).real  # 0 behind the circle, 1 beside it, 2 in front of it
+        near = max(0.0, 1 - distance / how.behind)
+        direction = to * to / along - OUTWARDS * min(1.0, 2 * beside) * near * to
+        direction /= max(abs(direction), 1e-6)
+        expert.at = np.array([*(hand + speed * np.array([direction.real, direction.imag])), height, CLOSED])
         yield expert.at
 
 
@@ -280,6 +263,7 @@ def perform(
     rng: np.random.Generator,
     height: float | None = None,
     feedback: bool = True,
+    scatter: bool = False,
 ) -> Episode:
     """One episode of the expert of a task.
 
@@ -289,6 +273,7 @@ def perform(
         scene: of it.
         rng: draws its style and its noise.
         height, feedback: see :func:`moves`.
+        scatter: whether distractors lie elsewhere in each picture, see :mod:`ftl_lightning.domains.tabletop.distractors`.
 
     Raises:
         UserError: for a scene that cannot be built.
@@ -307,9 +292,11 @@ def perform(
         poses.append(seen[POSE])
         if terminated or truncated:
             break
+    success = judged(task, env.scene, told)
+    if scatter:
+        images = list(scattered(env, task, told["trace"], rng))
     for _ in range(STAY):
         commands.append(commands[-1])
         images.append(images[-1])
         poses.append(poses[-1])
-    success = judged(task, env.scene, told)
     return Episode(np.stack(commands).astype(np.float32), np.stack(images), np.stack(poses).astype(np.float32), success)

@@ -43,6 +43,8 @@ START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))
 """Where the hand starts."""
 RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028
 """Radius in metres of the circle's way around the bowl."""
+BOWL_BESIDE = (0.008, 0.03)
+"""Metres of the bowl's centre beside the line from circle to triangle, which decide on which side the way is shorter."""
 APART = 0.002
 """Metres between objects, at least."""
 
@@ -144,27 +146,29 @@ TRIES = 30
 """Places that are tried for it."""
 
 
-def _anywhere(rng: Rng, around: tuple[tuple[float, float], ...] = WORKSPACE) -> tuple[float, float]:
-    return float(rng.uniform(*around[0])), float(rng.uniform(*around[1]))
+def anywhere(rng: Rng) -> tuple[float, float]:
+    """A place ``(x, y)`` in the workspace."""
+    return float(rng.uniform(*WORKSPACE[0])), float(rng.uniform(*WORKSPACE[1]))
 
 
-def _yaw(rng: Rng, name: str) -> float:
+def random_yaw(rng: Rng, name: str) -> float:
+    """Radians; boxes lie about as the table does."""
     return float(rng.uniform(-0.4, 0.4)) if name in SIZE else float(rng.uniform(-math.pi, math.pi))
 
 
 def _pick(target: str) -> Callable[[Rng], _Placed]:
     def draw(rng: Rng) -> _Placed:
-        return {name: (*_anywhere(rng), _yaw(rng, name)) for name in (CIRCLE, target)}
+        return {name: (*anywhere(rng), random_yaw(rng, name)) for name in (CIRCLE, target)}
 
     return draw
 
 
 def _pair(rng: Rng, near: float, far: float) -> _Placed:
     """Circle and triangle so far apart, in any direction."""
-    x, y = _anywhere(rng)
+    x, y = anywhere(rng)
     angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(near, far)
     other = (x + distance * math.cos(angle), y + distance * math.sin(angle))
-    return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(other[0]), float(other[1]), _yaw(rng, TRIANGLE))}
+    return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(other[0]), float(other[1]), random_yaw(rng, TRIANGLE))}
 
 
 def _push(rng: Rng) -> _Placed:
@@ -178,7 +182,7 @@ def _around(rng: Rng) -> _Placed:
         start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
         along = (end - start) / np.linalg.norm(end - start)
         across = np.array([-along[1], along[0]])
-        beside = rng.uniform(-0.02, 0.02)
+        beside = rng.choice((-1, 1)) * rng.uniform(*BOWL_BESIDE)
         bowl = (start + end) / 2 + rng.uniform(-0.02, 0.02) * along + beside * across
         farthest = bowl - np.sign(beside) * RING * across
         if all(low <= value <= high for value, (low, high) in zip(farthest, WORKSPACE, strict=True)):
@@ -188,7 +192,7 @@ def _around(rng: Rng) -> _Placed:
 def _on_book(rng: Rng) -> _Placed:
     placed = _pair(rng, 0.09, 0.15)
     middle = np.mean([placed[name][:2] for name in (CIRCLE, TRIANGLE)], axis=0) + rng.uniform(-0.03, 0.03, 2)
-    return {**placed, BOOK: (float(middle[0]), float(middle[1]), _yaw(rng, BOOK))}
+    return {**placed, BOOK: (float(middle[0]), float(middle[1]), random_yaw(rng, BOOK))}
 
 
 NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
@@ -250,7 +254,7 @@ def draw_scene(task: str, rng: Rng) -> NDArray[np.float32]:
         if name in placed or rng.uniform() > PRESENT:
             continue
         for _ in range(TRIES):
-            more = {**placed, name: (*_anywhere(rng), _yaw(rng, name))}
+            more = {**placed, name: (*anywhere(rng), random_yaw(rng, name))}
             if _clear(task, more) and _stands(more, hand):
                 placed = more
                 break

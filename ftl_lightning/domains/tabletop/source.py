@@ -27,7 +27,7 @@ STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
 STATE_UNITS = ("m",) * 4
 MOST = 4
 """Episodes that are tried at most for each that is kept."""
-FORM = 3
+FORM = 4
 """Of the experts; what is cached of another one is not used."""
 TIMES = {PUSH: 4}
 """So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""
@@ -39,14 +39,14 @@ _SETTINGS = {
 }
 """What decides a demonstration besides task, count and seed."""
 
-Job = tuple[str, int, int]
-"""Task, seed and number of an episode."""
+Job = tuple[str, int, int, bool]
+"""Task, seed and number of an episode, and whether distractors lie elsewhere in each of its pictures."""
 _ENVIRONMENT: list[TableTopEnvironment] = []
 """The one of this process."""
 
 
 def _scene(job: Job) -> np.ndarray:
-    task, seed, number = job
+    task, seed, number, _ = job
     return draw_scene(task, np.random.default_rng([seed, task_key(task), number]))
 
 
@@ -57,11 +57,12 @@ def _episode(job: Job) -> Episode | None:
         MemoryError, OSError: for what the machine lacks, which would cost every other episode too.
         UserError: where the simulator does not start.
     """
-    task, seed, number = job
+    task, seed, number, scatter = job
     if not _ENVIRONMENT:
         _ENVIRONMENT.append(TableTopEnvironment())
     try:
-        return perform(_ENVIRONMENT[0], task, _scene(job), np.random.default_rng([seed, task_key(task), number, 1]))
+        rng = np.random.default_rng([seed, task_key(task), number, 1])
+        return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter)
     except (MemoryError, OSError):
         raise
     except Exception as error:  # whatever the simulator raises: the other episodes go on
@@ -78,7 +79,9 @@ def _episodes(jobs: list[Job], workers: int) -> Iterator[Episode | None]:
         yield from pool.imap(_episode, jobs)
 
 
-def demonstrations(task: str, count: int, seed: int, workers: int, progress: Callable[[], None]) -> Demonstrations:
+def demonstrations(
+    task: str, count: int, seed: int, workers: int, progress: Callable[[], None], scatter: bool = False
+) -> Demonstrations:
     """The first ``count`` successful episodes of a task, in the order of their numbers, whatever the number of workers.
 
     Args:
@@ -87,12 +90,13 @@ def demonstrations(task: str, count: int, seed: int, workers: int, progress: Cal
         seed: decides scenes, and styles and noise of the expert.
         workers: processes.
         progress: called after each successful episode.
+        scatter: whether distractors lie elsewhere in each picture.
 
     Raises:
         UserError: if too few episodes succeed.
     """
     kept: list[tuple[Job, Episode]] = []
-    jobs = [(task, seed, number) for number in range(MOST * count)]
+    jobs = [(task, seed, number, scatter) for number in range(MOST * count)]
     tried = 0
     for job, episode in zip(jobs, _episodes(jobs, workers), strict=False):
         tried += 1
@@ -125,13 +129,15 @@ class Expert:
     """Episodes of the scripted experts that succeeded, from the cache if they are there."""
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` demonstrations of every training concept, and more of those in :data:`TIMES`."""
+        """``count`` demonstrations of every training concept, and more of those in :data:`TIMES`; distractors are scattered."""
         own = seed if name == "train" else VALIDATION_SEED + seed
-        return concatenate([self.draw(task, TIMES.get(task, 1) * count, own) for task in TRAINING_CONCEPTS])
+        return concatenate([self.draw(task, TIMES.get(task, 1) * count, own, scatter=True) for task in TRAINING_CONCEPTS])
 
-    def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+    def draw(self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False) -> Demonstrations:
+        """``count`` demonstrations of a task, if wanted with distractors that lie elsewhere in each picture."""
         settings = {"domain": NAME, "task": expect_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
-        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress))
+        settings["scatter"] = scatter
+        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """New scenes ``(count, 24)``, and what is seen there."""
