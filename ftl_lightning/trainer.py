@@ -1,5 +1,6 @@
 """Lightning's trainer with one more verb."""
 
+import inspect
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -12,18 +13,55 @@ from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
 from ftl_lightning.ranges import expect_range
 
+HARMLESS = {
+    "accelerator",
+    "barebones",
+    "callbacks",
+    "check_val_every_n_epoch",
+    "default_root_dir",
+    "detect_anomaly",
+    "devices",
+    "enable_autolog_hparams",
+    "enable_checkpointing",
+    "enable_model_summary",
+    "enable_progress_bar",
+    "inference_mode",
+    "limit_predict_batches",
+    "limit_test_batches",
+    "limit_val_batches",
+    "log_every_n_steps",
+    "logger",
+    "model_registry",
+    "num_nodes",
+    "num_sanity_val_steps",
+    "profiler",
+    "reload_dataloaders_every_n_epochs",
+    "val_check_interval",
+}
+"""Options that change no number of a run on one device; every other one does."""
+USUAL = {"max_epochs": 1, "deterministic": True}
+"""Of a configuration that ships with ``invert``, where Lightning's default is another one."""
+
 
 class Trainer(pl.Trainer):
     """A trainer that can also ``invert``.
 
     Attributes:
         verb: what it does, for the progress bar.
+        unusual: options that can change what is learned and have not their usual values: these are part of a result's identity.
     """
 
     verb = "fit"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        known = inspect.signature(pl.Trainer.__init__).parameters
+        usual = {name: one.default for name, one in known.items()} | USUAL
+        self.unusual = {
+            name: value if isinstance(value, int | float | str | None) else type(value).__name__
+            for name, value in options.items()
+            if name not in HARMLESS and value != usual.get(name)
+        }
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
             self.strategy.checkpoint_io = WholeCheckpoints()
 

@@ -17,6 +17,7 @@ from ftl_lightning.cli import COMMANDS, TRAINER_VERBS, main
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.trainer import Trainer
 from tests.conftest import CONF, ROOT, TINY
 
 PARTS = {"verb", "domain", "sampling", "method"}
@@ -63,6 +64,13 @@ def test_every_configuration_file_parses(path: Path, capsys: pytest.CaptureFixtu
     printed = yaml.safe_load(capsys.readouterr().out)
     for key in load(CONF / path):
         assert key in printed
+
+
+@pytest.mark.parametrize("path", [path for path in CONFIGS if "invert" in path.parts], ids=str)
+def test_rows_of_the_configurations_that_ship_are_known_without_the_trainer(path: Path) -> None:
+    """So were they before its options counted."""
+    options = {key: value for key, value in load(CONF / path)["trainer"].items() if key not in ("logger", "accelerator")}
+    assert not Trainer(accelerator="cpu", logger=False, **options).unusual
 
 
 def test_a_missing_input_file_is_told_before_anything_slow_is_imported() -> None:

@@ -159,7 +159,7 @@ def _hash(line: "CommandLine") -> str:
 
     callbacks = line.trainer.callbacks  # type: ignore[attr-defined]
     evaluator = next(callback for callback in callbacks if isinstance(callback, Evaluator))
-    return evaluator.config_hash(line.model, line.datamodule)
+    return evaluator.config_hash(line.model, line.datamodule, line.trainer)
 
 
 def _known(results: str) -> set[str]:

@@ -223,7 +223,7 @@ class Evaluator(pl.Callback):
         if stage == "val":  # a test is no curve
             module.log_dict({f"val/{name}": value for name, value in setting_means(by_task).items()}, batch_size=1)
         found: list[Row] = []
-        configured = configuration(module, data, self.settings(data))
+        configured = configuration(module, data, self.settings(data), trainer)
         if stage == "test" and self.judged:
             compared = self.references if self.references is not None else not getattr(data, "own", False)
             beside = references(self.judged, domain, module.demonstrated, self.seed) if compared else {}
@@ -271,9 +271,9 @@ class Evaluator(pl.Callback):
                     outcome_text(one.task.goal, one.outcomes),
                 )
 
-    def config_hash(self, module: Evaluable, data: pl.LightningDataModule) -> str:
+    def config_hash(self, module: Evaluable, data: pl.LightningDataModule, trainer: pl.Trainer) -> str:
         """What the results file knows this evaluation by."""
-        return config_hash(configuration(module, data, self.settings(data)))
+        return config_hash(configuration(module, data, self.settings(data), trainer))
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Evaluate while fitting and in ``validate``."""

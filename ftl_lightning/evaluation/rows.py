@@ -30,20 +30,25 @@ def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
 
 
-def configuration(module: Evaluable, data: pl.LightningDataModule, settings: Mapping[str, Any]) -> dict[str, Any]:
+def configuration(
+    module: Evaluable, data: pl.LightningDataModule, settings: Mapping[str, Any], trainer: pl.Trainer | None = None
+) -> dict[str, Any]:
     """Everything that was configured, by its place in a configuration file.
 
     Args:
         module: what generates.
         data: what it learned from.
         settings: the evaluator's.
+        trainer: what learns. Unusual options of ours count, unless a model is pretrained, which is known by its weights.
     """
     own = data.hparams.get("demonstrations")
+    unusual = getattr(trainer, "unusual", {}) if "pretrained" in module.hparams else {}
     hparams = [(key, value) for key, value in _public(module.hparams) if key not in ("pretrained", "output")]
     return {
         **{f"model/{key}": value for key, value in hparams if (key, value) not in LATER},
         **{f"data/{key}": value for key, value in _public(data.hparams) if key not in ("demonstrations", "root")},
         **{f"evaluation/{key}": value for key, value in settings.items()},
+        **{f"trainer/{key}": value for key, value in unusual.items()},
         "model/pretrained": module.model.hash,
         # A trained judge decides values, too; rules have no identity.
         **{f"metric/{name}": metric.identity for name, metric in module.model.domain.metrics.items() if metric.identity},

@@ -404,6 +404,26 @@ def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Pa
         assert of(**changes) == plain | {f"model/{key}": value}
 
 
+@pytest.mark.parametrize(
+    ("options", "known"),
+    [
+        ({"max_epochs": 1, "deterministic": True, "gradient_clip_val": None, "max_steps": -1}, {}),
+        ({"max_epochs": 1, "log_every_n_steps": 3, "enable_progress_bar": False, "logger": False}, {}),
+        ({"max_epochs": 1, "gradient_clip_val": 0.5}, {"trainer/gradient_clip_val": 0.5}),
+        ({"max_epochs": 1, "max_steps": 3}, {"trainer/max_steps": 3}),
+        ({"max_epochs": 2, "limit_train_batches": 0.5}, {"trainer/max_epochs": 2, "trainer/limit_train_batches": 0.5}),
+        ({"max_epochs": 1, "precision": "bf16-mixed"}, {"trainer/precision": "bf16-mixed"}),
+        ({"max_epochs": 1, "deterministic": False}, {"trainer/deterministic": False}),
+    ],
+)
+def test_options_of_the_trainer_that_change_what_is_learned_are_part_of_the_identity(
+    options: dict[str, Any], known: dict[str, Any], tiny: Path
+) -> None:
+    data, module = InversionData("object_rearrangement", suite="validation", steps=6), InversionModule(str(tiny))
+    plain = configuration(module, data, {})
+    assert configuration(module, data, {}, Trainer(accelerator="cpu", **options)) == plain | known
+
+
 @pytest.mark.parametrize(("modes", "told"), [(1, ""), (3, ", modes: 3"), ("each", ", modes: each"), ("auto", "")])
 def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told: str) -> None:
     plain, module = InversionModule(str(tiny)), InversionModule(str(tiny), modes=modes)  # type: ignore[arg-type]
