@@ -42,4 +42,3 @@ def test_the_lock_holds_what_runs_with_the_pinned_versions_and_hashes() -> None:
     assert {name: version for name, version in locked.items() if name != "setuptools"}.items() <= constraints.items()
     blocks = re.split(r"^(?=[\w.-]+==)", (ROOT / "requirements.lock").read_text("utf-8"), flags=re.M)[1:]
     assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", block) for block in blocks)
-

@@ -370,6 +370,19 @@ def test_reference_lines() -> None:
     assert LOOP.policies["straight push"](TO_BOOK, starts, None, 0) is None
 
 
+def test_an_experts_actions_come_to_the_same_in_another_simulation(env: TableTopEnvironment) -> None:
+    other = TableTopEnvironment()
+    try:
+        for number, scene in enumerate(scenes(AROUND_BOWL, 2, 3).numpy()):  # long, and the hand slips farther than it can go
+            episode = experts.perform(other, AROUND_BOWL, scene, np.random.default_rng([0, number]))
+            env.reset(options={"scene": scene})
+            told = [env.step(action)[-1] for action in episode.actions][-1]
+            assert judged(AROUND_BOWL, scene, told) == episode.success
+            assert (np.stack(env._trace) == np.stack(other._trace)).all()
+    finally:
+        other.close()
+
+
 def test_every_description_has_an_embedding() -> None:
     from ftl_lightning.concepts.encoder import load_encoder
 

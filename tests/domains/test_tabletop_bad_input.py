@@ -288,7 +288,13 @@ def test_what_the_machine_lacks_stops_all_episodes(where: str, error: BaseExcept
 
 def episode(success: bool = True) -> Episode:
     images = np.full((TIME, *FEATURES[IMAGE].shape), 7, dtype=np.uint8)
-    return Episode(np.zeros((TIME, 4), np.float32), images, np.zeros((TIME, 8), np.float32), success)
+    return Episode(
+        np.zeros((TIME, 4), np.float32),
+        np.zeros((TIME - 1, 4), np.float32),
+        images,
+        np.zeros((TIME, 8), np.float32),
+        success,
+    )
 
 
 def performed(error: BaseException) -> Callable[..., Episode]:

@@ -241,12 +241,14 @@ class Episode:
 
     Attributes:
         commands: ``(time, 4)``, where the hand was told to be; the first is where it starts.
+        actions: ``(steps, 4)``, what the environment was given; of an action that is too far away it goes the first part alone.
         images: ``(time, 3, 64, 64)`` uint8.
         poses: ``(time, 8)``, as measured.
         success: whether it did the task.
     """
 
     commands: NDArray[np.float32]
+    actions: NDArray[np.float32]
     images: NDArray[np.uint8]
     poses: NDArray[np.float32]
     success: bool
@@ -281,12 +283,14 @@ def perform(
     seen, told = env.reset(options={"scene": scene})
     how = style(rng)
     commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
+    actions: list[NDArray[np.float32]] = []
     for command in moves(env, task, how, height, feedback):
         off = TREMBLE * rng.standard_normal(3)
         angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
         if slips and task in PUSHES and feedback:  # who does not look cannot come back
             off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
-        seen, _, terminated, truncated, told = env.step((command + np.array([*off, 0.0])).astype(np.float32))
+        actions.append((command + np.array([*off, 0.0])).astype(np.float32))
+        seen, _, terminated, truncated, told = env.step(actions[-1])
         commands.append(env.command.copy())
         images.append(seen[IMAGE])
         poses.append(seen[POSE])
@@ -299,4 +303,10 @@ def perform(
         commands.append(commands[-1])
         images.append(images[-1])
         poses.append(poses[-1])
-    return Episode(np.stack(commands).astype(np.float32), np.stack(images), np.stack(poses).astype(np.float32), success)
+    return Episode(
+        np.stack(commands).astype(np.float32),
+        np.stack(actions),
+        np.stack(images),
+        np.stack(poses).astype(np.float32),
+        success,
+    )

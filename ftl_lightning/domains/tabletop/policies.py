@@ -16,7 +16,7 @@ _Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None
 
 
 def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> _Make:
-    """Commands of an expert that was there before, in a simulation of its own.
+    """Actions of an expert that was there before, in a simulation of its own, which comes to the same to the bit.
 
     Args:
         tasks: of other tasks there is no such line.
@@ -28,13 +28,13 @@ def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: boo
             return None
         env = TableTopEnvironment()
         try:
-            commands = [
-                torch.from_numpy(perform(env, goal, scene, np.random.default_rng([seed, row]), height, feedback).commands)
+            actions = [
+                torch.from_numpy(perform(env, goal, scene, np.random.default_rng([seed, row]), height, feedback).actions)
                 for row, scene in enumerate(starts.require_scenes().numpy())
             ]
         finally:
             env.close()
-        return lambda observed, rows, step: torch.stack([commands[row][min(step + 1, len(commands[row]) - 1)] for row in rows])
+        return lambda observed, rows, step: torch.stack([actions[row][min(step, len(actions[row]) - 1)] for row in rows])
 
     return make
 
