@@ -168,7 +168,7 @@ def test_experts_that_never_succeed(monkeypatch: pytest.MonkeyPatch, capsys: pyt
 def test_splits_have_four_times_as_many_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = set()
 
-    def draw(self: source.Expert, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+    def draw(self: source.Expert, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False) -> Demonstrations:
         seeds.add(seed)
         return made(task, count)
 
