@@ -1,12 +1,16 @@
 """Every configuration that ships goes on from a checkpoint to the bytes of an unbroken run."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.checkpoint import WholeCheckpoints, read_checkpoint
 from tests.conftest import CONF
 from tests.domains.mocap_samples import folder
 from tests.strokes import TRAINING, strokes
@@ -82,3 +86,17 @@ def test_learning_that_is_interrupted_goes_on_to_the_same_bytes(options: list[st
     assert names
     for name in names:
         assert (Path("again") / name).read_bytes() == (Path("unbroken") / name).read_bytes()
+
+
+def test_a_checkpoint_that_is_cut_off_leaves_the_one_before_it(tmp_path: Path) -> None:
+    path, files, limits = tmp_path / "last.ckpt", WholeCheckpoints(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    content = {"epoch": 0, "global_step": 1, "loops": {}, "state_dict": {"weight": torch.ones(1000)}}
+    files.save_checkpoint(content, path)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))  # as a disk with room for so many bytes
+        with pytest.raises(UserError, match=r"last.ckpt: cannot be written \(File too large\)"):
+            files.save_checkpoint(content | {"global_step": 2}, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert read_checkpoint(path)["global_step"] == 1
+    assert [entry.name for entry in tmp_path.iterdir()] == ["last.ckpt"]
