@@ -29,14 +29,17 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 import torch
+import yaml
 
 from ftl_lightning.concepts.adapter import LowRank, adaptable
 from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
+from ftl_lightning.learning.checkpoint import read_checkpoint
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretrained import load_model
@@ -59,12 +62,12 @@ def mutated(tree: Any, draw: random.Random) -> Any:
     for _ in range(draw.choice((1, 1, 1, 2, 4))):
         holder, key = _place(tree, draw)
         if holder is None:
-            return draw.choice(ODD)
+            return copy.deepcopy(draw.choice(ODD))
         action = draw.random()
         if action < 0.55:
-            holder[key] = draw.choice(ODD)
+            holder[key] = copy.deepcopy(draw.choice(ODD))
         elif action < 0.65 and isinstance(holder, dict):
-            holder[draw.choice(("unknown", "", "depth", "kind", "ħ"))] = draw.choice(ODD)
+            holder[draw.choice(("unknown", "", "depth", "kind", "ħ"))] = copy.deepcopy(draw.choice(ODD))
         elif action < 0.75:
             del holder[key]
         elif action < 0.85:
@@ -112,6 +115,17 @@ def as_json(tree: Any, draw: random.Random) -> bytes:
     if draw.random() < 0.05 and text.startswith("{"):
         text = '{"kind": "diffusion", "horizon": 3, ' + text[1:]
     return flipped(text.encode(), draw) if draw.random() < 0.15 else text.encode()
+
+
+def as_yaml(tree: Any, draw: random.Random) -> bytes:
+    """A mutated tree as YAML, maybe with aliases, tags or bytes changed."""
+    try:
+        text = yaml.safe_dump(mutated(tree, draw) if draw.random() < 0.8 else tree, allow_unicode=True)
+    except RecursionError:  # too deep to be written
+        text = "[" * 5000
+    more = ("", "", "", "x: &a [1, 2]\ny: [*a, *a]\n", "z: !!python/object/apply:os.system ['true']\n", "? [1]\n: 2\n", "\t- x\n")
+    content = (text + draw.choice(more)).encode(errors="surrogatepass")
+    return flipped(content, draw) if draw.random() < 0.3 else content
 
 
 def odd_tensor(value: torch.Tensor, draw: random.Random) -> torch.Tensor:
@@ -274,6 +288,8 @@ class Fuzz:
             "safetensors": self.safetensors,
             "npz": self.npz,
             "csv": self.csv,
+            "checkpoint": self.checkpoint,
+            "yaml": self.yaml,
         }
 
     def _bytes(self, save: Callable[[Path], None]) -> bytes:
@@ -324,6 +340,26 @@ class Fuzz:
         """A results file."""
         found = read_rows(self._written("results.csv", odd_csv(self.rows, draw)))
         assert np.isfinite(latest(found)["value"].to_numpy(dtype=float)).all()
+
+    def checkpoint(self, draw: random.Random) -> None:
+        """A checkpoint with other content, or with bytes changed."""
+        weights = {"weight": torch.ones(3), "bias": torch.zeros(1)}
+        state = {"state": {0: {"step": torch.ones(()), "exp_avg": torch.ones(3)}}, "param_groups": [{"lr": 0.1, "params": [0, 1]}]}
+        tree = {"state_dict": weights, "epoch": 1, "global_step": 7, "loops": {"fit_loop": {"epoch": 1}}, "callbacks": {}}
+        tree |= {"optimizer_states": [state], "lr_schedulers": [{"last_epoch": 7}], "belongs_to": {"class": "x"}, "random": {}}
+        file = io.BytesIO()
+        try:
+            torch.save(mutated(tree, draw) if draw.random() < 0.6 else tree, file)
+        except RecursionError:  # too deep to be written
+            torch.save(tree, file)
+        content = file.getvalue()
+        read_checkpoint(self._written("own.ckpt", flipped(content, draw) if draw.random() < 0.5 else content))
+
+    def yaml(self, draw: random.Random) -> None:
+        """A configuration that builds on another one."""
+        own = {"defaults": ["below.yaml"], "model": {"init_args": {"omega": 1.2, "names": ["a", "b"]}}, "trainer": {"max_steps": 3}}
+        self._written("below.yaml", as_yaml({"model": {"class_path": "x.Y", "init_args": {"omega": 1}}}, draw))
+        load(self._written("own.yaml", as_yaml(own, draw)))
 
 
 def _sampled(model: ConceptModel, concept: Concept | None = None) -> None:
@@ -414,7 +450,7 @@ def counts(kind: str, count: int, seed: int, limit: float) -> collections.Counte
 
 def main() -> None:
     """Print the counts of one kind of files, or of all."""
-    kinds = ("config.json", "concept", "safetensors", "npz", "csv")
+    kinds = ("config.json", "concept", "safetensors", "npz", "csv", "checkpoint", "yaml")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kind", choices=("all", *kinds), default="all")
     parser.add_argument("--count", type=int, default=1000)

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -53,7 +53,7 @@ def load(path: str | Path) -> dict[str, Any]:
     """
     try:
         found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
-    except (OmegaConfBaseException, RecursionError) as error:
+    except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
@@ -70,7 +70,7 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConf
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+    if not isinstance(names, ListConfig | list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
     for name in names:
         yield from _parts(_beside(path, name), (*above, path))
@@ -79,13 +79,17 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConf
 
 def _beside(path: Path, name: str) -> Path:
     """The file that ``defaults`` of a file name."""
-    for folder in path.absolute().parents:
-        if (folder / name).is_file():
-            # As the user writes it: relative where the file is.
-            return folder / name if path.is_absolute() else _relative(folder / name)
-    if (found := shipped(name)).is_file():
-        return found
-    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found no {name} beside it or in a folder above it")
+    try:
+        for folder in path.absolute().parents:
+            if (folder / name).is_file():
+                # As the user writes it: relative where the file is.
+                return folder / name if path.is_absolute() else _relative(folder / name)
+        if (found := shipped(name)).is_file():
+            return found
+    except (OSError, ValueError):  # a name that no file can have
+        pass
+    found_none = f"found no {short(name, 150)} beside it or in a folder above it"
+    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found_none}")
 
 
 def _relative(path: Path) -> Path:

@@ -115,6 +115,7 @@ CONFIGS: list[tuple[str, object, str]] = [
     ("observed.traffic.entities", [[0, 1], [2]], "entities"),
     ("observed.traffic.entities", [[35]], "entities: expected columns from 0 to 34"),
     ("observed.traffic.state", [99], "state: expected columns"),
+    ("observed.traffic.state", [0, 1], "state: expected 7 columns, found 2"),
     ("observed.traffic.more", 1, "key 'observed.traffic.more': expected one of"),
     ("image_dim", 10, "image_dim"),
     ("unknown", 1, "key 'unknown': expected one of"),

@@ -65,6 +65,26 @@ def test_mistakes_in_a_file_name_it(text: str, expected: str) -> None:
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("defaults: 3", "a.yaml: key 'defaults': expected a list of configuration files, found 3"),
+        ("defaults: {b.yaml: 1}", "a.yaml: key 'defaults': expected a list of configuration files"),
+        (f"defaults: [{'b' * 5000}]", "expected configuration files, found no bbb"),
+        ('defaults: ["\\0"]', "expected configuration files, found no"),
+        ("defaults: [below.yaml]\nmodel: [1]", "a.yaml: expected keys that go together"),
+    ],
+)
+def test_odd_defaults_are_told_in_one_short_line(text: str, expected: str) -> None:
+    write("below.yaml", "model: {omega: 1}")
+    write("a.yaml", text)
+    with pytest.raises(UserError) as told:
+        load("a.yaml")
+    assert expected in str(told.value)
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 400
+
+
 def test_a_command_line_gets_the_content_of_its_files() -> None:
     write("a.yaml", "x: 1.0e-3\n")
     for given in (["--config", "a.yaml"], ["--config=a.yaml"], ["-c", "a.yaml"]):

@@ -55,6 +55,8 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     denoiser = built(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
         return denoiser
+    if config.state_columns and len(config.state_columns) != config.state_dim:
+        raise UserError(f"observed, state: expected {config.state_dim} columns, found {len(config.state_columns)}")
     return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns)
 
 

@@ -14,7 +14,7 @@ from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.data import InversionData, PretrainingData
-from ftl_lightning.domains.tabletop import DOMAIN, source
+from ftl_lightning.domains.tabletop import DOMAIN, policies, source
 from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, OPEN, POSE, TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode
 from ftl_lightning.domains.tabletop.scenes import BOWL, CIRCLE, HAND, TRIANGLE, scene_of
@@ -323,6 +323,19 @@ def test_what_the_machine_lacks_stops_the_experts(error: BaseException, monkeypa
     with pytest.raises(type(error)):
         source.Expert().draw(PUSH_ON_BOOK, 2, 0)
     assert not list(Path.cwd().rglob("*.safetensors"))  # neither here nor in the cache
+
+
+def test_an_oracle_that_breaks_does_nothing_there_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(policies, "perform", performed(RuntimeError("broke")))
+    three = starts()
+    policy = policies.POLICIES["expert (oracle)"](PUSH, three, None, 0)
+    assert policy is not None
+    actions = policy(three.observed, [0, 1, 2], 1)
+    assert torch.equal(actions[1], three.observed[POSE][1, [0, 1, 2, 7]])
+    assert torch.equal(actions[[0, 2]], torch.zeros(2, 4))
+    assert "episode 1: RuntimeError('broke'); the expert does nothing there" in caplog.text
 
 
 def test_files_of_pictures_are_a_tenth_as_large_as_the_pictures_and_the_cache_holds_them() -> None:
