@@ -101,8 +101,17 @@ def _read(path: Path) -> DictConfig:
         if (size := path.stat().st_size) > LONGEST:
             raise ValueError(f"{size} bytes, more than {LONGEST}")
         keys = OmegaConf.load(path)
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError, TypeError, LookupError) as error:
-        told = short(str(error), 200)
+    except (
+        OSError,
+        ValueError,
+        YAMLError,
+        OmegaConfBaseException,
+        RecursionError,
+        TypeError,
+        LookupError,
+        AssertionError,
+    ) as error:
+        told = short(str(error), 200) or "no mapping of keys"
         raise UserError(f"{path}: expected a configuration file (YAML), found {told}") from error
     if not isinstance(keys, DictConfig):
         raise UserError(f"{path}: expected a mapping of keys, found a list")

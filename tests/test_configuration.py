@@ -52,6 +52,7 @@ def test_a_part_is_looked_for_beside_the_file_then_above_it_then_among_the_shipp
         ("defaults: b.yaml", "a.yaml: key 'defaults': expected a list of configuration files, found b.yaml"),
         ("defaults: [1]", "a.yaml: key 'defaults': expected a list of configuration files, found [1]"),
         ("- 1", "a.yaml: expected a mapping of keys, found a list"),
+        ("'3'", "a.yaml: expected a configuration file (YAML), found no mapping of keys"),
         ("model: {x: 1", "a.yaml: expected a configuration file (YAML), found "),
         ("model: 1\nmodel: 2\n", "a.yaml: expected a configuration file (YAML), found "),
     ],
