@@ -22,23 +22,26 @@ from ftl_lightning.learning.checkpoint import read_checkpoint
 from ftl_lightning.progress import bar
 from ftl_lightning.tensor_file import visible
 
-SIZES = "--model.denoiser_args={hidden_dim: 256, depth: 2, condition_dim: 16}"
-FIT = ["fit", "--config", str(Path(__file__).parents[1] / "conf" / "object_rearrangement.yaml"), SIZES]
-FIT += [
+FIT = [
+    "fit",
+    "--config",
+    str(Path(__file__).parents[1] / "conf" / "object_rearrangement.yaml"),
+    "--model.denoiser_args={hidden_dim: 256, depth: 2, condition_dim: 16}",
     "--data.samples_per_concept=50",
     "--data.batch_size=8",
     "--trainer.max_steps=100000",
     "--trainer.limit_val_batches=0",
     "--trainer.accelerator=cpu",
+    "--trainer.callbacks.init_args.every_n_train_steps=1",
 ]
-FIT += ["--trainer.callbacks.init_args.every_n_train_steps=1"]
+CHECKPOINTS = Path("logs", "object_rearrangement", "fit", "checkpoints")
 WAIT = 120.0
 """Seconds for the first checkpoint."""
 
 
 def stopped(folder: Path, again: bool, full: bool, draw: random.Random) -> tuple[str, int]:
     """Train until a kill or a file that is cut off; what the program said last, and its exit code."""
-    last = folder / "logs" / "object_rearrangement" / "fit" / "checkpoints" / "last.ckpt"
+    last = folder / CHECKPOINTS / "last.ckpt"
     before = last.stat().st_mtime_ns if last.is_file() else 0
     command = [sys.executable, "-m", "ftl_lightning", *FIT, *(["--ckpt_path=last"] if again else [])]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
@@ -49,7 +52,7 @@ def stopped(folder: Path, again: bool, full: bool, draw: random.Random) -> tuple
             if last.is_file() and last.stat().st_mtime_ns != before:
                 break
             time.sleep(0.05)
-        if full and process.poll() is None:
+        if full and process.poll() is None and last.is_file():
             cut = draw.randrange(1, last.stat().st_size)
             resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (cut, cut))
         else:
@@ -66,16 +69,17 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    folder, draw, bad = Path(options.folder), random.Random(options.seed), 0
+    folder, draw, bad, reached = Path(options.folder), random.Random(options.seed), 0, 0
     folder.mkdir(parents=True)
     with bar("stopped", options.count) as advance:
         for number in range(options.count):
             full = number % 2 == 1
             line, code = stopped(folder, number > 0, full, draw)
-            found = visible(folder / "logs" / "object_rearrangement" / "fit" / "checkpoints", "*.ckpt")
-            steps = [read_checkpoint(path)["global_step"] for path in found]  # raises for one that is not whole
-            expected = 2 if full else -signal.SIGKILL
-            bad += code != expected or not steps
+            # Raises for one that is not whole.
+            steps = {path.name: read_checkpoint(path)["global_step"] for path in visible(folder / CHECKPOINTS, "*.ckpt")}
+            asked = code == 2 and "File too large" in line if full else code == -signal.SIGKILL
+            before, reached = reached, steps.get("last.ckpt", 0)
+            bad += not asked or reached <= before  # else it had gone on from the last one
             print(f"{number}: {f'cut off, {line!r}' if full else 'killed'}, exit code {code}, steps {steps}", flush=True)
             advance()
     print(f"{options.count - bad} of {options.count} left whole checkpoints and ended as expected")

@@ -84,12 +84,13 @@ def _beside(path: Path, name: str) -> Path:
             if (folder / name).is_file():
                 # As the user writes it: relative where the file is.
                 return folder / name if path.is_absolute() else _relative(folder / name)
-        if (found := shipped(name)).is_file():
-            return found
-    except (OSError, ValueError):  # a name that no file can have
-        pass
-    found_none = f"found no {short(name, 150)} beside it or in a folder above it"
-    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found_none}")
+        if (own := shipped(name)).is_file():
+            return own
+    except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
+        told = getattr(error, "strerror", None) or str(error)
+        raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({told})") from error
+    found = f"found no {short(name, 150)} beside it or in a folder above it"
+    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found}")
 
 
 def _relative(path: Path) -> Path:

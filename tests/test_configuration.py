@@ -71,7 +71,7 @@ def test_mistakes_in_a_file_name_it(text: str, expected: str) -> None:
     [
         ("defaults: 3", "a.yaml: key 'defaults': expected a list of configuration files, found 3"),
         ("defaults: {b.yaml: 1}", "a.yaml: key 'defaults': expected a list of configuration files"),
-        (f"defaults: [{'b' * 5000}]", "expected configuration files, found no bbb"),
+        (f"defaults: [{'b' * 5000}]", "expected configuration files, found bbb"),
         ('defaults: ["\\0"]', "expected configuration files, found no"),
         ("defaults: [below.yaml]\nmodel: [1]", "a.yaml: expected keys that go together"),
     ],

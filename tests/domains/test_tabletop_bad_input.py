@@ -325,7 +325,7 @@ def test_what_the_machine_lacks_stops_the_experts(error: BaseException, monkeypa
     assert not list(Path.cwd().rglob("*.safetensors"))  # neither here nor in the cache
 
 
-def test_an_oracle_that_breaks_does_nothing_there_and_the_others_go_on(
+def test_an_oracle_that_breaks_has_no_action_there_and_the_others_go_on(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(policies, "perform", performed(RuntimeError("broke")))
@@ -333,9 +333,16 @@ def test_an_oracle_that_breaks_does_nothing_there_and_the_others_go_on(
     policy = policies.POLICIES["expert (oracle)"](PUSH, three, None, 0)
     assert policy is not None
     actions = policy(three.observed, [0, 1, 2], 1)
-    assert torch.equal(actions[1], three.observed[POSE][1, [0, 1, 2, 7]])
+    assert actions[1].isnan().all()  # the episode counts as failed
     assert torch.equal(actions[[0, 2]], torch.zeros(2, 4))
-    assert "episode 1: RuntimeError('broke'); the expert does nothing there" in caplog.text
+    assert "episode 1: RuntimeError('broke'); the reference line has no action there" in caplog.text
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError("no space")])
+def test_what_the_machine_lacks_stops_the_oracle(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policies, "perform", performed(error))
+    with pytest.raises(type(error)):
+        policies.POLICIES["expert (oracle)"](PUSH, starts(), None, 0)
 
 
 def test_files_of_pictures_are_a_tenth_as_large_as_the_pictures_and_the_cache_holds_them() -> None:

@@ -5,13 +5,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Policy
-from ftl_lightning.domains.tabletop.environment import POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.environment import ACTION, TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, expect_task
 from ftl_lightning.errors import UserError
@@ -32,20 +31,22 @@ def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: boo
     def make(goal: str, starts: InitialStates, known: Demonstrations | None, seed: int) -> Policy | None:
         if expect_task(goal) not in tasks:
             return None
-
-        def episode(row: int, scene: NDArray[np.float32]) -> Tensor:
-            env = TableTopEnvironment()
-            try:
-                return torch.from_numpy(perform(env, goal, scene, np.random.default_rng([seed, row]), height, feedback).actions)
-            except UserError:
-                raise
-            except Exception as error:  # whatever the simulator raises: the other episodes go on
-                _LOG.warning("table-top %r, episode %d: %r; the expert does nothing there", goal, row, error)
-                return starts.observed[POSE][row : row + 1, [0, 1, 2, -1]]
-            finally:
-                env.close()
-
-        actions = [episode(row, scene) for row, scene in enumerate(starts.require_scenes().numpy())]
+        actions: list[Tensor] = []
+        env = TableTopEnvironment()
+        try:
+            for row, scene in enumerate(starts.require_scenes().numpy()):
+                try:
+                    done = perform(env, goal, scene, np.random.default_rng([seed, row]), height, feedback)
+                    actions.append(torch.from_numpy(done.actions))
+                except (UserError, MemoryError, OSError):
+                    raise
+                except Exception as error:  # whatever the simulator raises: the other episodes go on
+                    _LOG.warning("table-top %r, episode %d: %r; the reference line has no action there", goal, row, error)
+                    actions.append(torch.full((1, ACTION), torch.nan))
+                    env.close()
+                    env = TableTopEnvironment()
+        finally:
+            env.close()
         return lambda observed, rows, step: torch.stack([actions[row][min(step, len(actions[row]) - 1)] for row in rows])
 
     return make
