@@ -1,6 +1,7 @@
 """Closed loop: an environment whose actions are wishes for the next state; a look-ahead planner turns them into decisions."""
 
-from typing import Any, NamedTuple
+import math
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -9,9 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Feature, InitialStates
+from ftl_lightning.domains.driving.foresight import BELIEF, VETOES, Beliefs, Worlds
 from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, arrived, make, observe
-from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
+from ftl_lightning.domains.driving.simulation import advance
 from ftl_lightning.errors import UserError
 
 NAMES = tuple(SCENARIOS)
@@ -37,15 +39,6 @@ Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
 
 
-class _Tried(NamedTuple):
-    """What came of a decision: the simulation, reward, whether the episode ends, and unless it crashed the state ``(7,)``."""
-
-    after: Snapshot
-    reward: float
-    ended: bool
-    state: NDArray[np.float64] | None
-
-
 class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     """Any scenario, from a start that its number and seed decide.
 
@@ -66,7 +59,8 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     )
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
 
-    def __init__(self) -> None:
+    def __init__(self, veto: str = BELIEF) -> None:
+        self.veto = veto
         self._name = ""
         self._seed = 0
         self._return = 0.0
@@ -94,6 +88,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         super().reset(seed=start)  # of the draws among equal decisions
         self._env.reset(seed=start)
         self._seed, self._return, self._length = start, 0.0, 0
+        self._beliefs = Beliefs(self._env, name)
         seen = observe(self._env)
         if given is not None and not np.allclose(scene(seen, name, start), given, atol=1e-3):
             raise UserError(
@@ -115,32 +110,39 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         wish = np.asarray(action, dtype=np.float64)
         if wish.shape not in ((STATE,), (DRIVE,), (1,)) or not np.isfinite(wish).all():
             raise UserError(f"driving action: expected {STATE} finite numbers, {DRIVE} or 1, found {wish.tolist()}")
-        now = observe(self._env)[0].astype(np.float64)
-        before = save(self._env)
-        tried = {int(wish[0]): self._try(int(wish[0]), before)} if len(wish) == 1 else {}
-        if not any(one.state is not None for one in tried.values()):  # a decision that does not crash needs no other
-            tried = {decision: self._try(decision, before) for decision in range(self._env.action_space.n)}
-        safe = {decision: one.state for decision, one in tried.items() if one.state is not None}
-        if not safe:
-            chosen = self._slower
-        elif len(wish) == 1:
-            chosen = int(self.np_random.choice(list(safe)))
-        else:
-            far = self._far(now, np.stack(list(safe.values())), wish)
-            chosen = int(self.np_random.choice(np.array(list(safe))[far <= far.min() + 1e-6]))
-        after, reward, ended, _ = tried[chosen]
-        restore(self._env, after)
+        chosen = self._decided(wish)
+        reward, ended = advance(self._env, chosen)
         self._return += reward
         self._length += 1
         info = self._outcome() if ended or self._length >= MAX_STEPS else {}
         return self._observation(), reward, ended, self._length >= MAX_STEPS, info
 
-    def _try(self, decision: int, before: Snapshot) -> "_Tried":
-        """What comes of a decision."""
-        restore(self._env, before)
-        reward, ended = advance(self._env, decision)
-        state = None if self._env.vehicle.crashed else observe(self._env)[0].astype(np.float64)
-        return _Tried(save(self._env), reward, ended, state)
+    def _decided(self, wish: NDArray[np.float64]) -> int:
+        """The decision that is nearest to a wish among those of least risk; to brake if all crash."""
+        now = observe(self._env)[0].astype(np.float64)
+        self._beliefs.look()
+        rng = np.random.default_rng([self._seed, self._length])
+        worlds = Worlds(self._env, VETOES[self.veto], self._beliefs, rng)
+        if len(wish) == 1 and worlds.risk(int(wish[0])) == 0:
+            return int(wish[0])
+        states = {decision: worlds.state(decision) for decision in range(self._env.action_space.n)}
+        there = {decision: state for decision, state in states.items() if state is not None}
+        far = self._far(now, np.stack(list(there.values())), wish) if there and len(wish) > 1 else np.zeros(len(there))
+        risks: dict[int, float] = {}
+        nearest = math.inf
+        for decision, distance in sorted(zip(there, far.tolist(), strict=True), key=lambda pair: pair[1]):
+            if distance > nearest + 1e-6:  # one that is nearer has no risk
+                break
+            risks[decision] = worlds.risk(decision)
+            nearest = distance if risks[decision] == 0 else nearest
+        least = min(risks.values(), default=1)
+        if least == 1:
+            return self._slower
+        kept = [(decision, distance) for decision, distance in zip(there, far, strict=True) if risks.get(decision) == least]
+        closest = min(distance for _, distance in kept)
+        if len(wish) == 1 and int(wish[0]) in dict(kept):
+            return int(wish[0])
+        return int(self.np_random.choice([decision for decision, distance in kept if distance <= closest + 1e-6]))
 
     @staticmethod
     def _far(now: NDArray[np.float64], states: NDArray[np.float64], wish: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -126,12 +126,16 @@ class Scenario:
     arrived: Callable[[AbstractEnv], bool]
     passed: Callable[[AbstractEnv], bool] | None = None
     drivers: tuple[type[IDMVehicle], type[IDMVehicle]] = (IDMVehicle, FastVehicle)
+    destinations: tuple[str, ...] = ()
+    cruise: float = 0.0
 
 
 def _on(*roads: tuple[str, str]) -> Callable[[AbstractEnv], bool]:
     return lambda env: tuple(env.vehicle.lane_index[:2]) in roads
 
 
+EXITS = ("exr", "sxr", "nxr")
+"""Of the roundabout, that other vehicles take."""
 SCENARIOS = {
     "highway": Scenario(Highway, {"duration": 10}, lambda env: bool(env.time >= env.config["duration"])),
     "exit": Scenario(
@@ -156,14 +160,17 @@ SCENARIOS = {
         },
         lambda env: bool(env.has_arrived(env.vehicle)),
         drivers=(IntersectionVehicle, FastIntersectionVehicle),
+        destinations=("o0", "o1", "o2", "o3"),
+        cruise=8.0,
     ),
     "roundabout": Scenario(
         Roundabout,
         {"duration": 8},
         _on(("nx", "nxs"), ("nxs", "nxr")),
         passed=lambda env: bool(env.vehicle.position[1] < -20),
+        destinations=EXITS,
     ),
-    "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr"))),
+    "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
 }
 
 
