@@ -6,9 +6,9 @@ Name, plans, concepts and source have to be said; everything else has a default.
 import difflib
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import gymnasium
 import numpy as np
@@ -204,6 +204,9 @@ class ClosedLoop:
             not filmed.
         keeps: observed features that ``judge`` and ``film`` ask for; all where empty.
         less_is_better: of which outcomes less is better.
+        identity: what decides outcomes besides the code and belongs to the configuration that rows are known by; may be empty.
+        others: environments by name, in which plans are also executed where a configuration says so, such as one with another
+            planner.
         policies: policies to print beside every rate: name to ``(goal, initial states, demonstrations that the behaviour was
             learned from or None, seed) -> policy``, or ``None`` where it would take too long.
     """
@@ -215,7 +218,13 @@ class ClosedLoop:
     film: Callable[[Rollout, Tensor], Frames] | None = None
     keeps: tuple[str, ...] = ()
     less_is_better: tuple[str, ...] = ()
+    identity: str = ""
+    others: Mapping[str, Callable[[], gymnasium.Env[Any, Any]]] = field(default_factory=dict)
     policies: Mapping[str, Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
+
+    def inside(self, name: str) -> Self:
+        """The same in another environment; in its own for the empty name."""
+        return replace(self, environment=self.others[name]) if name else self
 
 
 @dataclass(frozen=True)
@@ -364,5 +373,6 @@ class Domain:
             return True
         outcome = metric.removeprefix(f"{CLOSED} ")
         if outcome != metric:
+            outcome = outcome.partition(" (")[0]  # the environment
             return self.closed_loop is not None and outcome in self.closed_loop.less_is_better
         return metric in self.metrics and self.metrics[metric].less_is_better

@@ -22,7 +22,7 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.evaluation.diversity import Real, lines
@@ -58,6 +58,8 @@ class Evaluator(pl.Callback):
         steps: of the sampler, at most the model's T.
         temperature: the paper's alpha.
         closed_loop: also execute plans, in domains that can, when testing (``test``, ``invert``).
+        environments: of the domain's others, in which plans are executed besides its own; outcomes there are metrics of their own,
+            such as ``closed loop success (step veto)``.
         replan: steps that a plan is followed before a new one is made; the paper's number is 1.
         figures: how many samples of a task a TensorBoard figure shows; 0 for no figures.
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
@@ -76,6 +78,7 @@ class Evaluator(pl.Callback):
         steps: int = 100,
         temperature: float = 0.1,
         closed_loop: bool = False,
+        environments: Sequence[str] = (),
         replan: int = 8,
         figures: int = 16,
         results: str | None = None,
@@ -101,7 +104,10 @@ class Evaluator(pl.Callback):
             "temperature": temperature,
             "sample_seed": seed,
         } | ({"replan": replan} if closed_loop else {})
+        if environments:
+            self._settings["environments"] = list(environments)
         self.closed_loop, self.replan = closed_loop, replan
+        self.environments = tuple(environments)
         self.samples = samples
         self.figures = figures
         self.results = results
@@ -180,12 +186,18 @@ class Evaluator(pl.Callback):
         self, judged: Sequence[Judged], composed: Mapping[EvaluationTask, Composition], model: ConceptModel, domain: Domain
     ) -> list[Judged]:
         """With the plans that the model makes on the way."""
-        tasks = [one.task for one in judged for _ in one.states]
-        draws = [generator("cpu", self.seed, *_key(one.task), episode) for one in judged for episode in range(len(one.states))]
-        assert domain.closed_loop is not None
-        make = sampled_plans(model, [composed[task] for task in tasks], self.sampling, draws)
-        policy = PlanFollower(make, planner(model, domain.closed_loop), self.replan)
+
+        def follower() -> PlanFollower:
+            assert domain.closed_loop is not None
+            tasks = [one.task for one in judged for _ in one.states]
+            draws = [generator("cpu", self.seed, *_key(one.task), episode) for one in judged for episode in range(len(one.states))]
+            make = sampled_plans(model, [composed[task] for task in tasks], self.sampling, draws)
+            return PlanFollower(make, planner(model, domain.closed_loop), self.replan)
+
+        policy = follower()
         done = executed(judged, policy, domain)
+        for environment in self.environments:
+            done = executed(done, follower(), domain, environment)
         firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
         plans = (policy.followed.get(first) for first in firsts)  # none where the first episode could not begin
         return [replace(one, followed=None if own is None else torch.stack(own)) for one, own in zip(done, plans, strict=True)]
@@ -209,6 +221,11 @@ class Evaluator(pl.Callback):
         total = pl_module.model.max_steps
         if total is not None and self.sampling.steps > total:
             raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.sampling.steps}")
+        loop = pl_module.domain.closed_loop
+        others = () if loop is None else tuple(loop.others)
+        if unknown := [name for name in self.environments if name not in others]:
+            told = f"one of {', '.join(others)}" if others else f"none, as {pl_module.domain.name} has no other"
+            raise UserError(f"evaluation.environments: expected {told}, found {short(unknown[0])!r}")
         self._tasks(pl_module.domain, pl_module.concepts)
 
     on_fit_start = on_validation_start = on_test_start = _check
@@ -226,7 +243,7 @@ class Evaluator(pl.Callback):
         configured = configuration(module, data, self.settings(data), trainer)
         if stage == "test" and self.judged:
             compared = self.references if self.references is not None else not getattr(data, "own", False)
-            beside = references(self.judged, domain, module.demonstrated, self.seed) if compared else {}
+            beside = references(self.judged, domain, module.demonstrated, self.seed, self.environments) if compared else {}
             if self.diversity:
                 real = self.real(module, self.judged)
                 self.judged = [known.added(one) for known, one in zip(real, self.judged, strict=True)]

@@ -29,7 +29,7 @@ class Judged:
         starts: initial states that they start from, or ``None``.
         rollout: what happened when they were executed, if they were.
         followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
-        outcomes: the domain's judgement of that, by name ``(sample,)``.
+        outcomes: the domain's judgement of that, by name ``(sample,)``; in other environments, with theirs behind it.
         diversity: novelty and coverage, so far as they are known, see :mod:`ftl_lightning.evaluation.diversity`.
     """
 
@@ -47,10 +47,19 @@ class Judged:
         """Judge states by the task's goal."""
         return cls(task, states, domain.measure(task.goal, states, starts), starts)
 
-    def executed(self, rollout: Rollout, domain: Domain) -> Self:
-        """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success."""
-        outcomes = domain.judge(self.task.goal, rollout)
-        return replace(self, rollout=rollout, outcomes=outcomes | {SUCCESS: outcomes[SUCCESS] & ~rollout.failed})
+    def executed(self, rollout: Rollout, domain: Domain, environment: str = "") -> Self:
+        """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success.
+
+        Args:
+            rollout: the episodes.
+            domain: whose they are.
+            environment: of the domain's others, in which they took place; its outcomes are beside those that there are.
+        """
+        found = domain.judge(self.task.goal, rollout)
+        found |= {SUCCESS: found[SUCCESS] & ~rollout.failed}
+        if environment:
+            return replace(self, outcomes={**self.outcomes, **{f"{name} ({environment})": one for name, one in found.items()}})
+        return replace(self, rollout=rollout, outcomes=found)
 
     def compared(self, diversity: Mapping[str, float]) -> Self:
         """The same with novelty and coverage."""
@@ -91,9 +100,9 @@ def standard_error(values: Sequence[float]) -> float:
     return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
 
 
-def executed(judged: Sequence[Judged], policy: Policy, domain: Domain) -> list[Judged]:
-    """The same tasks with their episodes, which run all side by side."""
+def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environment: str = "") -> list[Judged]:
+    """The same tasks with their episodes, which run all side by side; in the domain's own environment or one of its others."""
     assert domain.closed_loop is not None
     starts = join([one.starts for one in judged if one.starts is not None])
-    parts = roll_out(domain.closed_loop, starts, policy).split([len(one.states) for one in judged])
-    return [one.executed(part, domain) for one, part in zip(judged, parts, strict=True)]
+    parts = roll_out(domain.closed_loop.inside(environment), starts, policy).split([len(one.states) for one in judged])
+    return [one.executed(part, domain, environment) for one, part in zip(judged, parts, strict=True)]

@@ -18,7 +18,11 @@ _KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
 def references(
-    judged: Sequence[Judged], domain: Domain, demonstrated: Callable[[str], Demonstrations | None], seed: int
+    judged: Sequence[Judged],
+    domain: Domain,
+    demonstrated: Callable[[str], Demonstrations | None],
+    seed: int,
+    environments: Sequence[str] = (),
 ) -> dict[str, list[Judged]]:
     """Each reference policy's behaviour by its name; executed where the method's was.
 
@@ -27,16 +31,17 @@ def references(
         domain: whose policies they are.
         demonstrated: what a concept was learned from, by its name.
         seed: of the policies.
+        environments: of the domain's others, in which the method's was executed besides its own.
     """
     loop = None if all(one.rollout is None for one in judged) else domain.closed_loop
-    found = {name: [_planned(name, one, domain, loop, seed) for one in judged] for name in domain.references}
+    found = {name: [_planned(name, one, domain, loop, seed, environments) for one in judged] for name in domain.references}
     for name in loop.policies if loop else ():
-        acted = (_acted(name, one, domain, demonstrated, seed) for one in judged)
+        acted = (_acted(name, one, domain, demonstrated, seed, environments) for one in judged)
         found[name] = [one for one in acted if one is not None]
     return found
 
 
-def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int) -> Judged:
+def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
     """A policy that makes its plan once."""
     key = (name, domain.name, one.task.goal, len(one.states), _hash(one.starts), seed)
     if key not in _KNOWN:
@@ -48,24 +53,37 @@ def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, se
     if loop is None:
         return own
     assert one.starts is not None
-    if (*key, "executed") not in _KNOWN:
-        _KNOWN[*key, "executed"] = roll_out(loop, one.starts, PlanFollower(fixed_plans(plans), loop.act, loop.steps))
-    return own.executed(_KNOWN[*key, "executed"], domain)
+    for place in ("", *environments):
+        if (*key, "executed", place) not in _KNOWN:
+            follower = PlanFollower(fixed_plans(plans), loop.act, loop.steps)
+            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), one.starts, follower)
+        own = own.executed(_KNOWN[*key, "executed", place], domain, place)
+    return own
 
 
 def _acted(
-    name: str, one: Judged, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], seed: int
+    name: str,
+    one: Judged,
+    domain: Domain,
+    demonstrated: Callable[[str], Demonstrations | None],
+    seed: int,
+    environments: Sequence[str],
 ) -> Judged | None:
     """A policy that acts as it goes; ``None`` where it would take too long."""
-    assert domain.closed_loop is not None
+    loop = domain.closed_loop
+    assert loop is not None
     assert one.starts is not None
     known = demonstrations_of(one.task, demonstrated)
-    key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.starts), seed)
-    if key not in _KNOWN:
-        policy = domain.closed_loop.policies[name](one.task.goal, one.starts, known, seed)
-        _KNOWN[key] = policy and roll_out(domain.closed_loop, one.starts, policy)
-    rollout: Rollout | None = _KNOWN[key]
-    return None if rollout is None else one.executed(rollout, domain)
+    for place in ("", *environments):
+        key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.starts), seed, place)
+        if key not in _KNOWN:
+            policy = loop.policies[name](one.task.goal, one.starts, known, seed)
+            _KNOWN[key] = policy and roll_out(loop.inside(place), one.starts, policy)
+        rollout: Rollout | None = _KNOWN[key]
+        if rollout is None:
+            return None
+        one = one.executed(rollout, domain, place)
+    return one
 
 
 def _hash(starts: InitialStates | None) -> str:

@@ -41,7 +41,7 @@ def configuration(
         settings: the evaluator's.
         trainer: what learns. Unusual options of ours count, unless a model is pretrained, which is known by its weights.
     """
-    own = data.hparams.get("demonstrations")
+    own, loop = data.hparams.get("demonstrations"), module.model.domain.closed_loop
     unusual = getattr(trainer, "unusual", {}) if "pretrained" in module.hparams else {}
     hparams = [(key, value) for key, value in _public(module.hparams) if key not in ("pretrained", "output")]
     return {
@@ -49,6 +49,7 @@ def configuration(
         **{f"data/{key}": value for key, value in _public(data.hparams) if key not in ("demonstrations", "root")},
         **{f"evaluation/{key}": value for key, value in settings.items()},
         **{f"trainer/{key}": value for key, value in unusual.items()},
+        **({"environment": loop.identity} if "replan" in settings and loop and loop.identity else {}),
         "model/pretrained": module.model.hash,
         # A trained judge decides values, too; rules have no identity.
         **{f"metric/{name}": metric.identity for name, metric in module.model.domain.metrics.items() if metric.identity},
@@ -89,6 +90,7 @@ def rows(
         "config_hash": config_hash(configured),
     }
     alike = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
+    alike += [configured["environment"]] if "environment" in configured else []
     nobody = {"variant": "", "role": REFERENCE, "K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
 
     policies = domain.closed_loop.policies if domain.closed_loop else {}

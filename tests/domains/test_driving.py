@@ -9,6 +9,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from ftl_lightning.domains.driving import expert, generation
 from ftl_lightning.domains.driving.environment import OBSERVED, SCENARIO, SCENE, TRAFFIC, DrivingEnvironment, origin, scene
+from ftl_lightning.domains.driving.foresight import STEP
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.simulation import advance, restore, save
@@ -147,7 +148,7 @@ def scene_of(name: str, seed: int) -> np.ndarray:
 
 def follow(actions: list[np.ndarray], seed: int = 0) -> tuple[np.ndarray, dict[str, float]]:
     """Traffic ``(time, 35)`` in the roundabout and how it ended."""
-    env = DrivingEnvironment()
+    env = DrivingEnvironment(STEP)
     seen, info = [env.reset(options={"scene": scene_of("roundabout", seed)})[0][TRAFFIC]], {}
     for action in actions:
         observation, _, ended, late, info = env.step(action)
@@ -241,7 +242,7 @@ def test_nobody_starts_where_a_scenario_ends() -> None:
 @pytest.mark.parametrize("name", TRAINING_CONCEPTS)
 def test_who_drives_as_a_recorded_episode_succeeds_as_it_did(name: str) -> None:
     recorded = training_set("train", 1).select(name)
-    env = DrivingEnvironment()
+    env = DrivingEnvironment(STEP)
     env.reset(options={"scene": recorded.initial_states.require_scenes()[0].numpy()})
     length = int(recorded.lengths[0])
     for time in range(1, length):

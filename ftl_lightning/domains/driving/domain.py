@@ -1,5 +1,6 @@
 """The domain object: what the rest of the package knows of driving."""
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -13,6 +14,7 @@ from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Sh
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, DrivingEnvironment, initial_states, scene
 from ftl_lightning.domains.driving.expert import SEARCH
+from ftl_lightning.domains.driving.foresight import BELIEF, SIMULATION, STEP
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED
@@ -99,6 +101,8 @@ DOMAIN = Domain(
     views=VIEWS,
     closed_loop=ClosedLoop(
         environment=DrivingEnvironment,
+        identity=f"{BELIEF} veto",
+        others={f"{veto} veto": partial(DrivingEnvironment, veto) for veto in (SIMULATION, STEP)},
         act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
         steps=MAX_STEPS,
         judge=judge,

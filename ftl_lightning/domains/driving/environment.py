@@ -44,12 +44,19 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     An observation is an initial state (37 numbers). An action is the state (7 numbers) that the controlled vehicle should be in a
     step later; or the drive there (4, see :func:`~ftl_lightning.domains.driving.motion.drive`), for those who do not know where
-    the road turns; or the number of one of the scenario's decisions, for policies that decide themselves. Each decision is tried
-    for a step; the one that comes nearest to the wish (Euclidean, in raw units) without a crash is taken, at random among equals,
-    and to brake if all crash. A decision that would crash is replaced by a random one that does not.
+    the road turns; or the number of one of the scenario's decisions, for policies that decide themselves. Of the decisions that
+    the veto finds least risky (:mod:`ftl_lightning.domains.driving.foresight`) the one that comes nearest to the wish (Euclidean,
+    in raw units) is taken, at random among equals; to brake if all crash. A decision that is riskier than others is replaced by a
+    random one of these.
 
     The information of the last step tells what happened: ``crashed``, ``arrived`` (where the scenario wants the vehicle, and no
     crash), ``passed`` (the count of the paper's code), ``return`` (sum of rewards) and ``length``.
+
+    Args:
+        veto: ``'belief'``, ``'simulation'`` or ``'step'`` (the paper's).
+
+    Raises:
+        UserError: for another one.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
@@ -60,6 +67,8 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (STATE,), np.float32)
 
     def __init__(self, veto: str = BELIEF) -> None:
+        if veto not in VETOES:
+            raise UserError(f"driving veto: expected one of {', '.join(VETOES)}, found {veto!r}")
         self.veto = veto
         self._name = ""
         self._seed = 0

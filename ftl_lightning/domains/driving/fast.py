@@ -14,6 +14,7 @@ from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.objects import Landmark, RoadObject
 
 LaneIndex = tuple[str, str, int]
@@ -108,10 +109,14 @@ class FastNetwork(RoadNetwork):
         if heading is None:
             return super().get_closest_lane_index(position, heading)
         x, y = position.tolist()
-        # Nearly all lanes are farther than the one it was on, which takes one look at each. Of equally near lanes the first counts.
-        bound = math.inf if likely is None else math.nextafter(self.get_lane(likely).nearer(x, y, heading, math.inf), math.inf)
-        best, found = bound, self._lanes[0][0]
-        for index, lane in self._lanes:
+        lanes = self._lanes
+        best, found = math.inf, lanes[0][0]
+        if likely is not None:
+            # Nearly all lanes are farther than the one it was on. Of equally near lanes the first counts.
+            best = math.nextafter(self.get_lane(likely).nearer(x, y, heading, math.inf), math.inf)
+            off_x, off_y, reach = self._middles[0] - x, self._middles[1] - y, self._middles[2] + best
+            lanes = [lanes[number] for number in (off_x * off_x + off_y * off_y <= reach * reach).nonzero()[0].tolist()]
+        for index, lane in lanes:
             if (distance := lane.nearer(x, y, heading, best)) is not None:
                 best, found = distance, index
         return found
@@ -191,6 +196,18 @@ class FastVehicle(IDMVehicle):
             self.lane = network.get_lane(self.lane_index)
         else:
             self.on_state_update()
+
+
+class FastController(MDPVehicle):
+    """The controlled vehicle."""
+
+    def on_state_update(self) -> None:
+        network = self.road.network
+        if type(network) is not FastNetwork or self.road.record_history:
+            super().on_state_update()
+            return
+        self.lane_index = network.get_closest_lane_index(self.position, self.heading, self.lane_index)
+        self.lane = network.get_lane(self.lane_index)
 
 
 class FastRoad(Road):
@@ -291,5 +308,21 @@ def accelerate(road: Road) -> None:
             lane._centre = tuple(map(float, lane.center))
         lane.__class__ = _LANES.get(type(lane), type(lane))
     network._lanes = list(network.lanes_dict().items())
+    network._middles = np.array([_around(lane) for _, lane in network._lanes]).T
     network.__class__ = FastNetwork
     road.__class__ = _ROADS.get(type(road), type(road))
+    for vehicle in road.vehicles:
+        if type(vehicle) is MDPVehicle:
+            vehicle.__class__ = FastController
+
+
+def _around(lane: Any) -> tuple[float, float, float]:
+    """Middle and radius of a circle that a lane's line stays within."""
+    line = np.array([lane.position(s, 0) for s in np.linspace(0, lane.length, 50)])
+    middle = (line.min(axis=0) + line.max(axis=0)) / 2
+    return float(middle[0]), float(middle[1]), float(np.linalg.norm(line - middle, axis=1).max()) + ROUND
+
+
+ROUND = 8.0
+"""Metres that are added to circles around lanes, for what lies between the points looked at, and for sine lanes' distance beyond
+their ends, which is not quite a distance."""
