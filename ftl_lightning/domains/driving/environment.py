@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -104,9 +105,15 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
                 f"driving scene: expected the start of {name!r} that seed {start} gives, found another; episodes start at "
                 "starts, not in the middle of a drive"
             )
-        return self._observation(), {}
+        return self.observation(), {}
 
-    def _observation(self) -> Seen:
+    @property
+    def simulation(self) -> AbstractEnv:
+        """highway-env's environment of the scenario."""
+        return self._env
+
+    def observation(self) -> Seen:
+        """What is observed now."""
         number = np.array([NAMES.index(self._name)], dtype=np.float32)
         return {TRAFFIC: observe(self._env).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
 
@@ -119,15 +126,18 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         wish = np.asarray(action, dtype=np.float64)
         if wish.shape not in ((STATE,), (DRIVE,), (1,)) or not np.isfinite(wish).all():
             raise UserError(f"driving action: expected {STATE} finite numbers, {DRIVE} or 1, found {wish.tolist()}")
-        chosen = self._decided(wish)
+        chosen = self.decide(wish)
         reward, ended = advance(self._env, chosen)
         self._return += reward
         self._length += 1
         info = self._outcome() if ended or self._length >= MAX_STEPS else {}
-        return self._observation(), reward, ended, self._length >= MAX_STEPS, info
+        return self.observation(), reward, ended, self._length >= MAX_STEPS, info
 
-    def _decided(self, wish: NDArray[np.float64]) -> int:
-        """The decision that is nearest to a wish among those of least risk; to brake if all crash."""
+    def decide(self, wish: NDArray[np.float64]) -> int:
+        """The decision that is nearest to a wish (see the class) among those of least risk; to brake if all crash.
+
+        The simulation stays as it is; draws among equals are used up.
+        """
         now = observe(self._env)[0].astype(np.float64)
         self._beliefs.look()
         rng = np.random.default_rng([self._seed, self._length])

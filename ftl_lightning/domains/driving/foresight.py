@@ -114,6 +114,15 @@ class Beliefs:
         return found
 
 
+def meaning(env: AbstractEnv, decision: int) -> Meaning:
+    """What a decision makes of the vehicle: two that make the same of it are one, such as speeding up at the highest speed."""
+    now = save(env)
+    env.action_type.act(decision)
+    found = env.vehicle.target_speed, env.vehicle.target_lane_index
+    restore(env, now)
+    return found
+
+
 class Worlds:
     """The worlds that a veto looks into at one moment.
 
@@ -155,7 +164,7 @@ class Worlds:
     def state(self, decision: int) -> NDArray[np.float64] | None:
         """The state ``(7,)`` that a decision leads to in the first world in which it does not crash; ``None`` if there is none."""
         with self._imagining():
-            key = self._meaning(decision)
+            key = self._key(decision)
             for world in range(len(self._worlds)):
                 if (after := self._followed(key, decision, world)) is not None:
                     restore(self._env, after)
@@ -165,18 +174,15 @@ class Worlds:
     def risk(self, decision: int) -> float:
         """The share of worlds in which a decision crashes, or all that may be decided next."""
         with self._imagining():
-            key = self._meaning(decision)
+            key = self._key(decision)
             if key not in self._risks:
                 lost = [not self._survives(self._followed(key, decision, world)) for world in range(len(self._worlds))]
                 self._risks[key] = sum(lost) / len(lost)
             return self._risks[key]
 
-    def _meaning(self, decision: int) -> Meaning:
-        """What a decision makes of the vehicle: two that make the same of it are one, such as speeding up at the highest speed."""
+    def _key(self, decision: int) -> Meaning:
         restore(self._env, self._worlds[0])
-        self._env.action_type.act(decision)
-        ego = self._env.vehicle
-        return ego.target_speed, ego.target_lane_index
+        return meaning(self._env, decision)
 
     def _followed(self, key: Meaning, decision: int, world: int) -> Snapshot | None:
         """A world after a decision; ``None`` if it crashes there."""

@@ -1,28 +1,34 @@
-"""Reference policies: what one decision always, chance, a look-up and the expert achieve from the same starts."""
+"""Reference policies: what one decision always, chance, a look-up, regressions and the expert achieve from the same starts."""
 
+import itertools
 from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.demonstrations.features import InitialStates, Observed
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving.environment import STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.generation import episode
+from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.scenarios import make
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.seeding import generator
 
+Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
 SHOWN = 100
-"""Demonstrations of a training scenario that the look-up knows."""
+"""Demonstrations of a training scenario that the look-up and the regressions know."""
+MLP_STEPS = 400
 
 
 def _decision(goal: str, name: str) -> float:
     return float(make(goal).action_type.actions_indexes[name])
 
 
-def _always(name: str) -> Callable[[str, InitialStates, Demonstrations | None, int], Policy]:
+def _always(name: str) -> Make:
     """The same decision, replaced by a random one that does not crash where it would."""
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
@@ -39,13 +45,66 @@ def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
     return lambda observed, rows, step: torch.stack([torch.randint(count, (1,), generator=draws[row]).float() for row in rows])
 
 
-def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
-    """What comes next in the demonstration that was nearest to what is seen now, from here."""
+def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Observed, Tensor]:
+    """What is seen ``(n, *shape)`` by name and the next state ``(n, 7)``, of every step of the demonstrations."""
     known = training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
     pairs = [(row, time) for row, length in enumerate(known.lengths.tolist()) for time in range(length - 1)]
-    seen = torch.stack([known.observed[TRAFFIC][row, time, :STATE] for row, time in pairs])
-    following = torch.stack([known.states[row, time + 1] for row, time in pairs])
-    return lambda observed, rows, step: following[torch.cdist(observed[TRAFFIC][:, :STATE], seen).argmin(dim=1)]
+    rows, times = torch.tensor(pairs).T
+    return {name: values[rows, times] for name, values in known.observed.items()}, known.states[rows, times + 1]
+
+
+def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
+    """What comes next in the demonstration that was nearest to what is seen now, from here."""
+    seen, following = _transitions(goal, demonstrations)
+    places = seen[TRAFFIC][:, :STATE]
+    return lambda observed, rows, step: following[torch.cdist(observed[TRAFFIC][:, :STATE], places).argmin(dim=1)]
+
+
+def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]]) -> Make:
+    """A drive ``(n, 4)`` that is predicted from the view that our models have too.
+
+    Args:
+        fit: ``(inputs (n, 35), drives (n, 4), generator) -> prediction``, both standardised.
+    """
+
+    def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
+        seen, following = _transitions(goal, demonstrations)
+        view = VIEWS["steps"].observe
+        inputs, drives = view(seen)[TRAFFIC], drive(seen[TRAFFIC][:, :STATE], following)
+        middle, spread = inputs.mean(dim=0), inputs.std(dim=0).clamp(min=1e-3)
+        mean, scale = drives.mean(dim=0), drives.std(dim=0).clamp(min=1e-3)
+        predict = fit((inputs - middle) / spread, (drives - mean) / scale, generator("cpu", seed))
+        return lambda observed, rows, step: predict((view(observed)[TRAFFIC] - middle) / spread) * scale + mean
+
+    return policy
+
+
+def _ridge(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
+    """Least squares with a penalty of 1 on standardised inputs."""
+    one = torch.cat((inputs, torch.ones(len(inputs), 1)), dim=1).double()
+    weights = torch.linalg.solve(one.T @ one + torch.eye(one.shape[1], dtype=torch.double), one.T @ drives.double()).float()
+    return lambda seen: seen @ weights[:-1] + weights[-1]
+
+
+def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
+    """Two hidden layers of 64, 400 steps of all transitions."""
+    sizes = (inputs.shape[1], 64, 64, drives.shape[1])
+    weights = [torch.randn(a, b, generator=draw) / a**0.5 for a, b in itertools.pairwise(sizes)]
+    layers = [value.requires_grad_() for weight in weights for value in (weight, torch.zeros(weight.shape[1]))]
+
+    def predict(seen: Tensor) -> Tensor:
+        for number in range(0, len(layers), 2):
+            seen = seen @ layers[number] + layers[number + 1]
+            seen = torch.nn.functional.silu(seen) if number < len(layers) - 2 else seen
+        return seen
+
+    optimizer = torch.optim.AdamW(layers, lr=3e-3, weight_decay=0.1)
+    with torch.enable_grad():
+        for _ in range(MLP_STEPS):
+            optimizer.zero_grad()
+            (predict(inputs) - drives).square().mean().backward()
+            optimizer.step()
+    return lambda seen: predict(seen).detach()
 
 
 def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
@@ -61,6 +120,8 @@ POLICIES = {
     "random": _random,
     "FASTER": _always("FASTER"),
     "nearest demonstration": _nearest,
+    "ridge regression": _regression(_ridge),
+    "MLP regression": _regression(_mlp),
     "expert (oracle)": _expert,
 }
 """All pass the planner's veto of crashes."""

@@ -1,0 +1,168 @@
+"""What five drives teach: how often policies decide as the expert does, on drives of the expert from new starts.
+
+    python benchmarks/driving_decisions.py --task "roundabout third exit" --drives 30 --out results/driving_decisions.json
+
+The expert drives; at each decision every policy is asked what it would do there. Its wish is turned into a decision by the planner
+and its veto, as in closed loop. Two decisions that make the same of the vehicle, such as keeping and raising the highest speed, are
+the same.
+
+- *agreement*: share of decisions that are the expert's, the mean over drives and its standard error;
+- *go*, *wait*: the same of those decisions by which the expert speeds up, or drives at its highest speed, and of all others;
+- *metres*: how far the distance that a plan drives over the next three decisions is from the expert's, where there are plans.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from ftl_lightning import FewShot
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.encoder import load_encoder
+from ftl_lightning.domains.domain import Policy
+from ftl_lightning.domains.driving import expert
+from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.environment import MAX_STEPS, STATE, TRAFFIC, DrivingEnvironment
+from ftl_lightning.domains.driving.foresight import STEP, VETOES, meaning
+from ftl_lightning.domains.driving.motion import speed
+from ftl_lightning.domains.driving.policies import POLICIES
+from ftl_lightning.domains.driving.scenarios import decision_seconds
+from ftl_lightning.domains.driving.simulation import advance
+from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
+from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.progress import bar
+from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
+from ftl_lightning.tensor_file import write_text
+
+SEED = 880
+"""Of the drives."""
+AHEAD = 3
+"""Decisions over which distances are compared."""
+SHOWN = ("FASTER", "IDLE", "random", "nearest demonstration", "ridge regression", "MLP regression")
+
+
+def policies(few: FewShot, task: str, count: int, seed: int) -> dict[str, Policy]:
+    """What is asked, by name: ours, learned from five drives; the task's text; the empty concept; reference lines."""
+    model, loop = few.model, DOMAIN.closed_loop
+    assert isinstance(model, GenerativeModel)
+    assert loop is not None
+    shown = DOMAIN.source(None).draw(task, 5, DEMONSTRATION_SEED + seed)
+    text = load_encoder("table", DOMAIN.concepts.table, "main")([task])
+    concepts: dict[str, Composition] = {
+        "ours": few.learn(shown, name=task, seed=seed),
+        "language": Composition(model.standardise(text), torch.tensor([1.2])),
+        "empty concept": Composition(model.empty[None], torch.zeros(1)),
+    }
+    found: dict[str, Policy] = {}
+    for name, concept in concepts.items():
+        draws = [generator("cpu", seed, row) for row in range(count)]
+        make = sampled_plans(model, [concept] * count, few.tuned.sampling, draws)
+        found[name] = PlanFollower(make, planner(model, loop), 1)
+    starts = few.starts(task, count, SEED)
+    for name in SHOWN:
+        policy = POLICIES[name](task, starts, shown, seed)
+        assert policy is not None
+        found[name] = policy
+    return found
+
+
+def asked(task: str, count: int, veto: str, told: Mapping[str, Policy]) -> dict[str, list[dict[str, float]]]:
+    """What each policy would have done at each decision of the expert's drives, by its name.
+
+    Returns:
+        For each decision the number of its ``drive``, ``go`` (1 or 0), ``agreed``, and ``metres``, the error of the distance.
+    """
+    environments = [DrivingEnvironment(veto) for _ in range(count)]
+    starts = DOMAIN.source(None).starts(task, count, EVALUATION_SEED + SEED)
+    seen = [
+        env.reset(options={"scene": scene.numpy()})[0] for env, scene in zip(environments, starts.require_scenes(), strict=True)
+    ]
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in told}
+    driven: dict[int, list[float]] = {row: [] for row in range(count)}
+    planned: list[tuple[dict[str, float], int, int, float]] = []
+    rows, seconds = list(range(count)), decision_seconds(task)
+    with bar(f"{count} drives of the expert", MAX_STEPS, lines=False) as moved:
+        for step in range(MAX_STEPS):
+            moved()
+            observed = {name: torch.stack([torch.from_numpy(seen[row][name]) for row in rows]) for name in starts.observed}
+            wishes = {name: policy(observed, rows, step) for name, policy in told.items()}
+            going = []
+            for place, row in enumerate(rows):
+                env = environments[row]
+                simulation = env.simulation
+                decided = expert.plan(simulation, task)
+                named = simulation.action_type.actions_indexes
+                does = meaning(simulation, decided)
+                go = does == meaning(simulation, named["FASTER"])
+                for name, wish in wishes.items():
+                    own = meaning(simulation, env.decide(wish[place].numpy().astype(np.float64)))
+                    said = {"drive": row, "go": float(go), "agreed": float(own == does)}
+                    found[name].append(said)
+                    if isinstance(policy := told[name], PlanFollower):
+                        ahead = speed(policy.followed[row][-1][1 : AHEAD + 1])[:, 0]
+                        planned.append((said, row, step, float(ahead.sum()) * seconds))
+                _, ended = advance(simulation, decided)
+                seen[row] = env.observation()
+                driven[row].append(float(speed(torch.from_numpy(seen[row][TRAFFIC][:STATE]))[0]) * seconds)
+                if not ended:
+                    going.append(row)
+            rows = going
+            if not rows:
+                break
+    for said, row, step, metres in planned:
+        if len(driven[row]) >= step + AHEAD:
+            said["metres"] = abs(metres - sum(driven[row][step : step + AHEAD]))
+    return found
+
+
+def summary(said: list[dict[str, float]]) -> dict[str, float]:
+    """Agreement, go, wait and metres."""
+    drives = sorted({one["drive"] for one in said})
+    each = [np.mean([one["agreed"] for one in said if one["drive"] == drive]) for drive in drives]
+    kinds = {"go": 1.0, "wait": 0.0}
+    shares = {name: [one["agreed"] for one in said if one["go"] == go] for name, go in kinds.items()}
+    metres = [one["metres"] for one in said if "metres" in one]
+    return {
+        "agreement": float(np.mean([one["agreed"] for one in said])),
+        "standard error": float(np.std(each, ddof=1) / len(each) ** 0.5),
+        **{name: float(np.mean(own)) for name, own in shares.items() if own},
+        **({"metres": float(np.mean(metres))} if metres else {}),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pretrained", default="driving")
+    parser.add_argument("--task", default="roundabout third exit")
+    parser.add_argument("--drives", type=int, default=30)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the five demonstrations and of learning")
+    parser.add_argument("--veto", choices=tuple(VETOES), default=STEP, help="of the planner")
+    parser.add_argument("--out", help="JSON file")
+    options = parser.parse_args()
+    few = FewShot.from_pretrained(options.pretrained)
+    found: dict[str, list[dict[str, float]]] = {}
+    for seed in options.seeds:
+        told = policies(few, options.task, options.drives, seed)
+        for name, said in asked(options.task, options.drives, options.veto, told).items():
+            found.setdefault(name, []).append(summary(said))
+    content = {}
+    for name, seeds in found.items():
+        means = {key: round(float(np.mean([one[key] for one in seeds])), 3) for key in seeds[0]}
+        spread = float(np.std([one["agreement"] for one in seeds], ddof=1)) if len(seeds) > 1 else 0.0
+        content[name] = means | {"spread over seeds": round(spread, 3)}
+        print(f"{name:24s}", content[name], flush=True)
+    if options.out:
+        about = {
+            "model": few.model.hash,
+            "task": options.task,
+            "drives": options.drives,
+            "veto": options.veto,
+            "seeds": options.seeds,
+        }
+        write_text(options.out, json.dumps(about | {"policies": content}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
