@@ -66,10 +66,12 @@ def test_the_shipped_demonstrations() -> None:
 
 def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
     options = ["--data.steps=3", "--model.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
-    assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET]) == 0
+    beside = "--evaluation.environments=[step veto]"
+    assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, beside]) == 0
     rows = pd.read_csv("logs/driving/invert/results.csv", keep_default_na=False)
     ours = rows[rows["K"] == 2]
-    outcomes = {f"closed loop {name}" for name in ("success", "strict success", "crash", "return", "length")}
+    names = ("success", "strict success", "crash", "return", "length")
+    outcomes = {f"closed loop {name}{veto}" for name in names for veto in ("", " (step veto)")}
     assert outcomes <= set(ours["metric"])
     assert {metric for metric in set(ours["metric"]) - outcomes if not metric.startswith(("won against", "lost against"))} == {
         "novelty"
@@ -79,10 +81,20 @@ def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
         "random",
         "FASTER",
         "nearest demonstration",
+        "ridge regression",
+        "MLP regression",
         "expert (oracle)",
     }
-    oracle = rows[(rows["method"] == "expert (oracle)") & (rows["metric"] == "closed loop strict success")]
-    assert oracle["value"].tolist() == [1.0]
+    for veto in ("", " (step veto)"):
+        oracle = rows[(rows["method"] == "expert (oracle)") & (rows["metric"] == f"closed loop strict success{veto}")]
+        assert oracle["value"].tolist() == [1.0]
+
+
+def test_an_environment_that_there_is_not(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = ["invert", *INVERT, f"--model.pretrained={model}", *QUIET, "--data.demonstrations_per_concept=2"]
+    assert main([*run, "--evaluation.environments=[crystal ball]"]) == 2
+    told = "evaluation.environments: expected one of simulation veto, step veto, found 'crystal ball'"
+    assert told in capsys.readouterr().err
 
 
 def test_cells_share_what_reference_policies_did(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
