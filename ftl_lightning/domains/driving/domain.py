@@ -18,7 +18,7 @@ from ftl_lightning.domains.driving.foresight import BELIEF, SIMULATION, STEP
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED
-from ftl_lightning.domains.driving.scenarios import make, observe, scenario
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.views import VIEWS
@@ -92,6 +92,8 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
+        descriptions=(*TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # others are driven by a concept of these
+        reads=SCENARIOS.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
     source=lambda root: Expert(),

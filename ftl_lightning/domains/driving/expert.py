@@ -3,12 +3,15 @@
 import heapq
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
+from ftl_lightning.domains.driving.foresight import FRAMES, Beliefs, meaning
 from ftl_lightning.domains.driving.scenarios import arrived, make, observe
 from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
 
@@ -39,7 +42,13 @@ SEARCH = {
     "intersection": Search(75, 0.9, hold=2),
     "roundabout": Search(75, 0.9),
     "roundabout third exit": Search(75, 0.9),
+    "roundabout of three lanes": Search(75, 0.9),
+    "roundabout of one lane": Search(75, 0.9),
 }
+
+IDLE = 1
+BELIEFS, EXPANSIONS = 4, 8
+"""Worlds that the blind expert imagines at a decision, and in each how many decisions it simulates for every action there is."""
 
 
 def plan(env: AbstractEnv, name: str) -> int:
@@ -49,20 +58,61 @@ def plan(env: AbstractEnv, name: str) -> int:
     best there is, 1 a step. After the budget is spent the action with the best sequence so far, by what it has earned, is taken.
     """
     search = SEARCH[name]
+    with _searching(env, search):
+        values = _values(env, name, search, env.get_available_actions(), search.budget)
+    return max(values, key=lambda action: values[action], default=IDLE)
+
+
+def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
+    """The action to take now for one who sees no more than its pupils: the same search in imagined worlds.
+
+    An action's value is the mean of what the best sequence after it earns in each.
+
+    Args:
+        env: left as it was.
+        name: of the scenario.
+        beliefs: what is known; they have looked.
+        rng: draws worlds from them.
+    """
+    search, actual = SEARCH[name], save(env)
+    actions = list({meaning(env, action): action for action in env.get_available_actions()[::-1]}.values())[::-1]
+    totals = dict.fromkeys(actions, 0.0)
+    with _searching(env, replace(search, frequency=FRAMES * env.config["policy_frequency"])):
+        for _ in range(BELIEFS):
+            restore(env, actual)
+            beliefs.draw(rng)
+            for action in actions:
+                totals[action] += _values(env, name, search, [action], EXPANSIONS * len(actions))[action]
+    return max(totals, key=lambda action: totals[action])
+
+
+@contextmanager
+def _searching(env: AbstractEnv, search: Search) -> Iterator[None]:
+    """As coarse as a search is; the environment is left as it was."""
     actual, frequency, vehicles = save(env), env.config["simulation_frequency"], env.road.vehicles
     env.config["simulation_frequency"] = search.frequency
     if search.sight < math.inf:
         ego = env.vehicle
         env.road.vehicles = [v for v in vehicles if v is ego or np.linalg.norm(v.position - ego.position) < search.sight]
+    try:
+        yield
+    finally:
+        env.config["simulation_frequency"] = frequency
+        restore(env, actual)
+
+
+def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence[int], budget: int) -> dict[int, float]:
+    """What the best sequence found after each action earns; none for actions after which nothing was tried."""
     order = itertools.count()
-    best, found = -math.inf, 1
+    root = save(env)
+    found: dict[int, float] = {}
     # Leaves by optimistic value: (-value, order, earned, depth, first action, state).
-    leaves: list[tuple[float, int, float, int, int | None, Snapshot]] = [(0.0, next(order), 0.0, 0, None, save(env))]
-    left = search.budget
+    leaves: list[tuple[float, int, float, int, int | None, Snapshot]] = [(0.0, next(order), 0.0, 0, None, root)]
+    left = budget
     while leaves and left > 0:
         _, _, earned, depth, first, state = heapq.heappop(leaves)
         restore(env, state)
-        for number, action in enumerate(env.get_available_actions()):
+        for number, action in enumerate(first_actions if first is None else env.get_available_actions()):
             if number:
                 restore(env, state)
             left -= 1
@@ -77,22 +127,23 @@ def plan(env: AbstractEnv, name: str) -> int:
             if ended and arrived(env, name) and not env.vehicle.crashed:
                 total += future  # it has arrived for good, or arriving would be worth nothing
             start = action if first is None else first
-            if total > best:
-                best, found = total, start
+            if total > found.get(start, -math.inf):
+                found.pop(start, None)  # of equals the one that was found first stands first
+                found[start] = total
             if not ended:
                 heapq.heappush(leaves, (-(total + future), next(order), total, below, start, save(env)))
-    env.config["simulation_frequency"] = frequency
-    restore(env, actual)
+    restore(env, root)
     return found
 
 
-def drive(name: str, seed: int, env: AbstractEnv | None = None) -> tuple[NDArray[np.float32], bool]:
+def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = False) -> tuple[NDArray[np.float32], bool]:
     """One episode of the expert.
 
     Args:
         name: of the scenario.
         seed: of the episode.
         env: of this scenario, if there is one already.
+        blind: whether it knows no more than what can be seen.
 
     Returns:
         Observations ``(time, 5, 7)``, and whether it succeeded: without a crash, and where the scenario wants it.
@@ -100,7 +151,10 @@ def drive(name: str, seed: int, env: AbstractEnv | None = None) -> tuple[NDArray
     env = env or make(name)
     env.reset(seed=seed)
     seen, ended = [observe(env)], False
+    beliefs, rng = Beliefs(env, name), np.random.default_rng([seed, 1])
     while not ended:
-        _, ended = advance(env, plan(env, name))
+        if blind:
+            beliefs.look()
+        _, ended = advance(env, plan_blind(env, name, beliefs, rng) if blind else plan(env, name))
         seen.append(observe(env))
     return np.stack(seen), not env.vehicle.crashed and arrived(env, name)

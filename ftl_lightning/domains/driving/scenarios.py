@@ -14,7 +14,7 @@ from highway_env.envs.exit_env import ExitEnv
 from highway_env.envs.highway_env import HighwayEnv
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.envs.merge_env import MergeEnv
-from highway_env.envs.roundabout_env import RoundaboutEnv
+from highway_env.envs.roundabout_env import RoundaboutEnv, RoundaboutGenericEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
@@ -101,6 +101,10 @@ class Roundabout(_Accelerated, RoundaboutEnv):
     """Take the second exit of a roundabout with four; four vehicles."""
 
 
+class OtherRoundabout(_Accelerated, RoundaboutGenericEnv):
+    """Take the second exit of a roundabout of another size, with vehicles on all its roads."""
+
+
 class ThirdExit(Roundabout):
     """The same roundabout, its third exit; for validation."""
 
@@ -171,6 +175,18 @@ SCENARIOS = {
         destinations=EXITS,
     ),
     "roundabout third exit": Scenario(ThirdExit, {"duration": 10}, _on(("wx", "wxs"), ("wxs", "wxr")), destinations=EXITS),
+    "roundabout of three lanes": Scenario(
+        OtherRoundabout,
+        {"duration": 12, "roundabout_radius": 28, "roundabout_lanes": 3, "vehicles_count": 7},
+        _on(("nx", "nxs"), ("nxs", "nxr")),
+        destinations=(*EXITS, "wxr"),
+    ),
+    "roundabout of one lane": Scenario(
+        OtherRoundabout,
+        {"duration": 12, "roundabout_radius": 16, "roundabout_lanes": 1, "vehicles_count": 4},
+        _on(("nx", "nxs"), ("nxs", "nxr")),
+        destinations=(*EXITS, "wxr"),
+    ),
 }
 
 

@@ -10,4 +10,12 @@ PAPER = Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),))
 VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),))
 """Another way through the same roundabout."""
 
-SUITES = {"training": TRAINING, "paper": PAPER, "validation": VALIDATION}
+OTHER = Suite(
+    tuple(
+        EvaluationTask("other roundabout", name, learned=("roundabout",))
+        for name in ("roundabout of three lanes", "roundabout of one lane")
+    )
+)
+"""Roundabouts of other sizes, for the concept that was learned in the paper's; nothing was tuned on them."""
+
+SUITES = {"training": TRAINING, "paper": PAPER, "validation": VALIDATION, "other roundabouts": OTHER}
