@@ -88,9 +88,7 @@ def _ridge(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[T
 
 def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
     """Two hidden layers of 64, 400 steps of all transitions."""
-    sizes = (inputs.shape[1], 64, 64, drives.shape[1])
-    weights = [torch.randn(a, b, generator=draw) / a**0.5 for a, b in itertools.pairwise(sizes)]
-    layers = [value.requires_grad_() for weight in weights for value in (weight, torch.zeros(weight.shape[1]))]
+    layers: list[Tensor] = []
 
     def predict(seen: Tensor) -> Tensor:
         for number in range(0, len(layers), 2):
@@ -98,8 +96,12 @@ def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Ten
             seen = torch.nn.functional.silu(seen) if number < len(layers) - 2 else seen
         return seen
 
-    optimizer = torch.optim.AdamW(layers, lr=3e-3, weight_decay=0.1)
-    with torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad():  # whatever evaluates
+        for before, after in itertools.pairwise((inputs.shape[1], 64, 64, drives.shape[1])):
+            weight = torch.randn(before, after, generator=draw) / before**0.5
+            layers += [weight.requires_grad_(), torch.zeros(after, requires_grad=True)]
+        inputs, drives = inputs.clone(), drives.clone()
+        optimizer = torch.optim.AdamW(layers, lr=3e-3, weight_decay=0.1)
         for _ in range(MLP_STEPS):
             optimizer.zero_grad()
             (predict(inputs) - drives).square().mean().backward()
