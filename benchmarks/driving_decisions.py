@@ -76,6 +76,7 @@ def asked(task: str, count: int, veto: str, told: Mapping[str, Policy]) -> dict[
     """
     environments = [DrivingEnvironment(veto) for _ in range(count)]
     starts = DOMAIN.source(None).starts(task, count, EVALUATION_SEED + SEED)
+    assert starts is not None
     seen = [
         env.reset(options={"scene": scene.numpy()})[0] for env, scene in zip(environments, starts.require_scenes(), strict=True)
     ]

@@ -1,7 +1,6 @@
 """Executing plans: environments step in lock-step, their plans are made in one batch (paper, 'closed loop')."""
 
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -46,7 +45,7 @@ def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout
         name: starts.observed[name][:, None].repeat(1, loop.steps + 1, *(1,) * (starts.observed[name].dim() - 1)) for name in kept
     }
     found = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
-    with bar(f"{count} episodes", loop.steps * math.ceil(count / SIDE_BY_SIDE), lines=False) as advance:
+    with bar(f"{count} episodes", loop.steps * count, lines=False) as advance:
         for rows in torch.arange(count).split(SIDE_BY_SIDE):
             _lock_step(loop, rows.tolist(), found, policy, advance)
     return found
@@ -105,11 +104,11 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                 raise
             except Exception as error:  # whatever a simulator raises: the other episodes go on
                 fail(row, f"before its first step: {error!r}")
+                advance(loop.steps)
                 continue
             see(row, 0, seen)
             active.append(row)
         for step in range(loop.steps):
-            advance()
             if not active:
                 break
             actions = policy(take(now, [place[row] for row in active]), active, step).numpy().astype(np.float32)
@@ -117,6 +116,7 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                 raise UserError(f"planner: expected actions of {len(active)} episodes, found shape {actions.shape}")
             going = []
             for row, action in zip(active, actions, strict=True):
+                advance()
                 if not np.isfinite(action).all():
                     fail(row, f"step {step}: the plan is not finite")
                     continue
@@ -131,6 +131,7 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                 found.infos[row].update(info)
                 if not (terminated or truncated):
                     going.append(row)
+            advance((len(active) - len(going)) * (loop.steps - step - 1))  # of those that have ended
             active = going
     finally:
         for environment in environments.values():

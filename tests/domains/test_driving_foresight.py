@@ -40,7 +40,7 @@ def blocked(distance: float) -> Any:
 
 @pytest.mark.parametrize(("veto", "keeps"), [(STEP, True), (SIMULATION, False), (BELIEF, False)])
 def test_who_looks_ahead_sees_a_crash_that_cannot_be_averted_any_more(veto: str, keeps: bool) -> None:
-    env = blocked(65.0)
+    env = blocked(42.0)
     named = env.action_type.actions_indexes
     found = risks(env, "merge", veto)
     assert (found[named["IDLE"]] == 0) == keeps

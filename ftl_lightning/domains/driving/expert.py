@@ -11,7 +11,7 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.driving.foresight import FRAMES, Beliefs, meaning
+from ftl_lightning.domains.driving.foresight import BELIEF, FRAMES, VETOES, Beliefs, Worlds, meaning
 from ftl_lightning.domains.driving.scenarios import arrived, make, observe
 from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
 
@@ -64,9 +64,9 @@ def plan(env: AbstractEnv, name: str) -> int:
 
 
 def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
-    """The action to take now for one who sees no more than its pupils: the same search in imagined worlds.
+    """The action to take now for one who sees no more than its pupils: the same search in imagined worlds, with the same veto.
 
-    An action's value is the mean of what the best sequence after it earns in each.
+    An action's value is the mean of what the best sequence after it earns in each. The best of least risk is taken.
 
     Args:
         env: left as it was.
@@ -83,7 +83,13 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
             beliefs.draw(rng)
             for action in actions:
                 totals[action] += _values(env, name, search, [action], EXPANSIONS * len(actions))[action]
-    return max(totals, key=lambda action: totals[action])
+    worlds = Worlds(env, VETOES[BELIEF], beliefs, rng)
+    risks: dict[int, float] = {}
+    for action in sorted(actions, key=lambda action: -totals[action]):
+        risks[action] = worlds.risk(action)
+        if risks[action] == 0:
+            return action
+    return min(risks, key=lambda action: risks[action])
 
 
 @contextmanager

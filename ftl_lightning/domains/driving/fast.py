@@ -201,6 +201,9 @@ class FastVehicle(IDMVehicle):
 class FastController(MDPVehicle):
     """The controlled vehicle."""
 
+    lane_index: Any
+    lane: Any
+
     def on_state_update(self) -> None:
         network = self.road.network
         if type(network) is not FastNetwork or self.road.record_history:

@@ -6,8 +6,8 @@ Three kinds, the same for every method and every reference line:
 - ``simulation``: it is followed for some decisions in the true simulation;
 - ``belief``: likewise, in worlds that are imagined from what can be seen, see :class:`Beliefs`.
 
-A decision is as risky as the share of worlds in which it crashes, or in which braking, keeping the speed and speeding up after it
-all do (proposals are simulated and scored likewise in PDM-Closed; Dauner et al., 2023).
+A decision is as risky as the share of worlds in which it crashes, or in which everything that may be decided after it does
+(proposals are simulated and scored likewise in PDM-Closed; Dauner et al., 2023).
 """
 
 import itertools
@@ -44,8 +44,8 @@ FRAMES = 5
 """Of an imagined world between two decisions."""
 SIGHT = 100.0
 """Metres from the controlled vehicle, within which others are imagined."""
-AFTERWARDS = ("IDLE", "SLOWER", "FASTER")
-"""What may be decided after the decision in question."""
+AFTERWARDS = ("IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT")
+"""What may be decided after the decision in question, in the order in which it is tried."""
 Meaning = tuple[float, tuple[str, str, int]]
 """Target speed and lane."""
 
@@ -172,12 +172,12 @@ class Worlds:
         return None
 
     def risk(self, decision: int) -> float:
-        """The share of worlds in which a decision crashes, or all that may be decided next."""
+        """The share of worlds in which a decision crashes, or all that may be decided after it."""
         with self._imagining():
             key = self._key(decision)
             if key not in self._risks:
-                lost = [not self._survives(self._followed(key, decision, world)) for world in range(len(self._worlds))]
-                self._risks[key] = sum(lost) / len(lost)
+                after = [self._followed(key, decision, world) for world in range(len(self._worlds))]
+                self._risks[key] = sum(not self._survives(one, self._foresight.depth - 1) for one in after) / len(after)
             return self._risks[key]
 
     def _key(self, decision: int) -> Meaning:
@@ -192,17 +192,17 @@ class Worlds:
             self._after[key, world] = None if self._env.vehicle.crashed else save(self._env)
         return self._after[key, world]
 
-    def _survives(self, after: Snapshot | None) -> bool:
-        """Whether something that may be decided after a decision does not crash."""
-        if after is None or self._foresight.depth == 1:
+    def _survives(self, after: Snapshot | None, left: int) -> bool:
+        """Whether some decisions can follow, as many as are left, without a crash."""
+        if after is None or not left:
             return after is not None
         env = self._env
-        for name in AFTERWARDS:
+        named = env.action_type.actions_indexes
+        for name in filter(named.__contains__, AFTERWARDS):
             restore(env, after)
-            for _ in range(self._foresight.depth - 1):
-                if env.vehicle.crashed or env._is_terminated() or env._is_truncated():
-                    break
-                advance(env, env.action_type.actions_indexes[name])
-            if not env.vehicle.crashed:
+            if env._is_terminated() or env._is_truncated():
+                return True
+            advance(env, named[name])
+            if not env.vehicle.crashed and self._survives(save(env) if left > 1 else after, left - 1):
                 return True
         return False
