@@ -23,9 +23,9 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving import expert
-from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.domain import DOMAIN, Expert
 from ftl_lightning.domains.driving.environment import MAX_STEPS, STATE, TRAFFIC, DrivingEnvironment
-from ftl_lightning.domains.driving.foresight import STEP, VETOES, meaning
+from ftl_lightning.domains.driving.foresight import STEP, VETOES, Beliefs, meaning
 from ftl_lightning.domains.driving.motion import speed
 from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.scenarios import decision_seconds
@@ -43,12 +43,12 @@ AHEAD = 3
 SHOWN = ("FASTER", "IDLE", "random", "nearest demonstration", "ridge regression", "MLP regression")
 
 
-def policies(few: FewShot, task: str, count: int, seed: int) -> dict[str, Policy]:
+def policies(few: FewShot, task: str, count: int, seed: int, blind: bool) -> dict[str, Policy]:
     """What is asked, by name: ours, learned from five drives; the task's text; the empty concept; reference lines."""
     model, loop = few.model, DOMAIN.closed_loop
     assert isinstance(model, GenerativeModel)
     assert loop is not None
-    shown = DOMAIN.source(None).draw(task, 5, DEMONSTRATION_SEED + seed)
+    shown = Expert(blind=blind).draw(task, 5, DEMONSTRATION_SEED + seed)
     text = load_encoder("table", DOMAIN.concepts.table, "main")([task])
     concepts: dict[str, Composition] = {
         "ours": few.learn(shown, name=task, seed=seed),
@@ -68,7 +68,7 @@ def policies(few: FewShot, task: str, count: int, seed: int) -> dict[str, Policy
     return found
 
 
-def asked(task: str, count: int, veto: str, told: Mapping[str, Policy]) -> dict[str, list[dict[str, float]]]:
+def asked(task: str, count: int, veto: str, told: Mapping[str, Policy], blind: bool) -> dict[str, list[dict[str, float]]]:
     """What each policy would have done at each decision of the expert's drives, by its name.
 
     Returns:
@@ -80,6 +80,8 @@ def asked(task: str, count: int, veto: str, told: Mapping[str, Policy]) -> dict[
     seen = [
         env.reset(options={"scene": scene.numpy()})[0] for env, scene in zip(environments, starts.require_scenes(), strict=True)
     ]
+    beliefs = [Beliefs(env.simulation, task) for env in environments]
+    draws = [np.random.default_rng([SEED, row]) for row in range(count)]
     found: dict[str, list[dict[str, float]]] = {name: [] for name in told}
     driven: dict[int, list[float]] = {row: [] for row in range(count)}
     planned: list[tuple[dict[str, float], int, int, float]] = []
@@ -93,7 +95,11 @@ def asked(task: str, count: int, veto: str, told: Mapping[str, Policy]) -> dict[
             for place, row in enumerate(rows):
                 env = environments[row]
                 simulation = env.simulation
-                decided = expert.plan(simulation, task)
+                if blind:
+                    beliefs[row].look()
+                    decided = expert.plan_blind(simulation, task, beliefs[row], draws[row])
+                else:
+                    decided = expert.plan(simulation, task)
                 named = simulation.action_type.actions_indexes
                 does = meaning(simulation, decided)
                 go = does == meaning(simulation, named["FASTER"])
@@ -140,13 +146,14 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=30)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the five demonstrations and of learning")
     parser.add_argument("--veto", choices=tuple(VETOES), default=STEP, help="of the planner")
+    parser.add_argument("--blind", action="store_true", help="the expert knows no more than what can be seen")
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
     few = FewShot.from_pretrained(options.pretrained)
     found: dict[str, list[dict[str, float]]] = {}
     for seed in options.seeds:
-        told = policies(few, options.task, options.drives, seed)
-        for name, said in asked(options.task, options.drives, options.veto, told).items():
+        told = policies(few, options.task, options.drives, seed, options.blind)
+        for name, said in asked(options.task, options.drives, options.veto, told, options.blind).items():
             found.setdefault(name, []).append(summary(said))
     content = {}
     for name, seeds in found.items():
@@ -160,6 +167,7 @@ def main() -> None:
             "task": options.task,
             "drives": options.drives,
             "veto": options.veto,
+            "blind expert": options.blind,
             "seeds": options.seeds,
         }
         write_text(options.out, json.dumps(about | {"policies": content}, indent=2) + "\n")

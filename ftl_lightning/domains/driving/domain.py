@@ -29,11 +29,19 @@ RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
 class Expert:
-    """Episodes of the expert that succeeded: those that ship, and new ones."""
+    """Episodes of the expert that succeeded: those that ship, and new ones.
+
+    Args:
+        root: folder of a user's own episodes of the training scenarios, in place of those that ship.
+        blind: whether new ones are of the expert that knows no more than what can be seen.
+    """
+
+    def __init__(self, root: Path | None = None, blind: bool = False) -> None:
+        self.root, self.blind = root, blind
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """The same for every seed: the expert takes half an hour for them."""
-        return training_set(name, count)
+        return training_set(name, count, self.root)
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
         settings = {
@@ -44,8 +52,9 @@ class Expert:
             "config": scenario(task).config,
             "search": SEARCH[task],
             "beyond": HORIZON,
+            **({"blind": True} if self.blind else {}),
         }
-        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress))
+        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Scenes ``(count, 37)`` of new episodes."""
@@ -96,7 +105,7 @@ DOMAIN = Domain(
         reads=SCENARIOS.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
-    source=lambda root: Expert(),
+    source=Expert,
     observed=FEATURES_SEEN,
     headline="closed loop strict success",
     show=Show(deferred(f"{RENDERING}:render")),

@@ -14,6 +14,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.environment import FEATURES_SEEN, OBSERVED, SCENARIO, SEEDS, STATE, TRAFFIC, scene
 from ftl_lightning.domains.driving.expert import SEARCH
+from ftl_lightning.domains.driving.foresight import BELIEF, VETOES
 from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
@@ -35,13 +36,14 @@ def episode_seed(seed: int, number: int) -> int:
     return zlib.crc32(f"{seed} {number}".encode()) % SEEDS
 
 
-def shard(name: str, seed: int) -> Path:
+def shard(name: str, seed: int, blind: bool = False) -> Path:
     """File of one episode."""
-    key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__])
+    belief = [expert.BELIEFS, expert.EXPANSIONS, VETOES[BELIEF].__dict__] if blind else []
+    key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__, *belief])
     return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
 
 
-def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
+def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool]:
     """Observations ``(time, 5, 7)`` of the expert and whether it succeeded, from the cache if they are there.
 
     Kept is what the rules of the scenario decide. An episode at which the simulation fails counts as rejected this time alone.
@@ -49,7 +51,7 @@ def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
     Raises:
         UserError: where the machine fails, which says nothing of the episode.
     """
-    path = shard(name, seed)
+    path = shard(name, seed, blind)
     if path.is_file():
         try:
             tensors, header = load_tensors(path, KIND)
@@ -57,7 +59,7 @@ def episode(name: str, seed: int) -> tuple[np.ndarray, bool]:
         except UserError:
             path.unlink()  # damaged from outside: driven again
     try:
-        seen, succeeded = expert.drive(name, seed)
+        seen, succeeded = expert.drive(name, seed, blind=blind)
     except (MemoryError, OSError) as error:
         raise UserError(f"driving {name!r}, seed {seed}: the machine failed ({error!r}); run it again, it goes on here") from error
     except Exception as error:  # whatever the simulation raises: the other episodes go on
@@ -79,12 +81,12 @@ def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
     return np.concatenate((seen, beyond))
 
 
-def _made(job: tuple[str, int]) -> tuple[np.ndarray, bool]:
+def _made(job: tuple[str, int, bool]) -> tuple[np.ndarray, bool]:
     return episode(*job)
 
 
-def _episodes(name: str, seeds: list[int], workers: int) -> Iterator[tuple[np.ndarray, bool]]:
-    jobs = [(name, seed) for seed in seeds]
+def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterator[tuple[np.ndarray, bool]]:
+    jobs = [(name, seed, blind) for seed in seeds]
     if workers == 1:
         yield from map(_made, jobs)
         return
@@ -93,7 +95,9 @@ def _episodes(name: str, seeds: list[int], workers: int) -> Iterator[tuple[np.nd
         yield from pool.imap(_made, jobs)
 
 
-def demonstrations(name: str, count: int, seed: int, workers: int, progress: Callable[[], None]) -> Demonstrations:
+def demonstrations(
+    name: str, count: int, seed: int, workers: int, progress: Callable[[], None], blind: bool = False
+) -> Demonstrations:
     """The first ``count`` successful episodes of a scenario, in the order of their seeds, whatever the number of workers.
 
     Args:
@@ -102,6 +106,7 @@ def demonstrations(name: str, count: int, seed: int, workers: int, progress: Cal
         seed: decides the episodes' seeds.
         workers: processes.
         progress: called after each successful episode.
+        blind: whether the expert knows no more than what can be seen.
 
     Raises:
         UserError: if too few episodes succeed.
@@ -109,7 +114,7 @@ def demonstrations(name: str, count: int, seed: int, workers: int, progress: Cal
     kept: list[tuple[int, np.ndarray]] = []
     driven = 0
     seeds = [episode_seed(seed, number) for number in range(MOST * count)]
-    for number, (seen, succeeded) in enumerate(_episodes(name, seeds, workers)):
+    for number, (seen, succeeded) in enumerate(_episodes(name, seeds, workers, blind)):
         driven = number + 1
         if succeeded:
             kept.append((seeds[number], seen))
@@ -132,5 +137,12 @@ def demonstrations(name: str, count: int, seed: int, workers: int, progress: Cal
         observed={TRAFFIC: traffic, SCENARIO: scenes[:, None, OBSERVED : OBSERVED + 1].repeat(1, longest, 1)},
         per_step=tuple(FEATURES_SEEN),
         scenes=scenes,
-        provenance={"generator": NAME, "seed": seed, "count": count, "driven": driven, "rejected": driven - count},
+        provenance={
+            "generator": NAME,
+            "seed": seed,
+            "count": count,
+            "driven": driven,
+            "rejected": driven - count,
+            **({"expert": "blind"} if blind else {}),
+        },
     )

@@ -13,17 +13,22 @@ HELD_OUT = 10
 """So many of the shipped episodes of each scenario, its last, are for validation."""
 
 
-def training_set(name: Split, count: int) -> Demonstrations:
+def training_set(name: Split, count: int, folder: Path | None = None) -> Demonstrations:
     """The first ``count`` shipped episodes of each training scenario; of ``'validation'``, of those that are held out.
 
     The expert takes half an hour for them, so they are the same for every seed.
 
+    Args:
+        name: of the split.
+        count: of each scenario.
+        folder: of others, a file for each scenario as ``generate`` writes them.
+
     Raises:
-        UserError: if fewer ship.
+        UserError: if there are fewer, or no file.
     """
     parts = []
     for scenario in TRAINING_CONCEPTS:
-        shipped = Demonstrations.load(SHIPPED / f"{scenario}.safetensors")
+        shipped = Demonstrations.load((folder or SHIPPED) / f"{scenario}.safetensors")
         rows = list(range(len(shipped)))
         pool = rows[-HELD_OUT:] if name == "validation" else rows[:-HELD_OUT]
         if count > len(pool):
