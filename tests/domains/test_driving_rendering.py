@@ -37,3 +37,17 @@ def test_an_episodes_pictures_have_one_size_and_end_when_nothing_moves() -> None
     pictures = film(episode, torch.stack([states[:8]] * 5))
     assert len(pictures) == 4
     assert len({picture.shape for picture in pictures}) == 1
+
+
+def test_a_crash_and_an_arrival_are_captioned() -> None:
+    shipped = Demonstrations.load(SHIPPED / "exit.safetensors").rows([0])
+    states = shipped.states[0]
+    observed = {name: values[:, :1].repeat(1, 3, 1) for name, values in shipped.observed.items()}
+    observed[TRAFFIC][0, :, :7] = states[:3]
+    films = []
+    for told in ({"crashed": True}, {"arrived": True, "crashed": False}, {"arrived": False}):
+        episode = Rollout(shipped.initial_states, observed, torch.zeros(1, dtype=torch.bool), [told])
+        films.append(film(episode, torch.stack([states[:8]] * 2)))
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert (films[one][0] == films[other][0]).all()
+        assert (films[one][-1] != films[other][-1]).any()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates, Observed, take
 from ftl_lightning.domains.driving.environment import NAMES, SCENARIO, TRAFFIC
-from ftl_lightning.domains.driving.scenarios import VEHICLES, make
+from ftl_lightning.domains.driving.scenarios import VEHICLES, decision_seconds, make
 from ftl_lightning.domains.rollout import Rollout
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
@@ -114,7 +114,8 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     """Pictures ``(height, width, 3)`` of an episode, one a decision, until nothing moves any more.
 
-    What was driven is green; the plan ``(time, 8, 7)`` that decided where to go next is orange.
+    What was driven is green; the plan ``(time, 8, 7)`` that decided where to go next is orange. The caption says the scenario, the
+    time, the speed and, in the last picture, how the episode ended.
     """
     episode = take(rollout.observed, 0)
     observations = episode[TRAFFIC]
@@ -125,6 +126,8 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     near = np.clip(planned[np.isfinite(planned).all(axis=1)], ways.min(axis=0) - PLAN_REACH, ways.max(axis=0) + PLAN_REACH)
     window = _window(np.concatenate((ways, near)))
     width, height = np.sqrt(1.7 * AREA) * np.sqrt((window[1] - window[0]) / (window[1] - window[0])[::-1])
+    name, told = NAMES[int(episode[SCENARIO][0].item())], rollout.infos[0]
+    ended = "crashed" if told.get("crashed") else "arrived" if told.get("arrived") else "time is up" if told else "broke off"
     pictures = []
     for time in range(end):
         figure = Figure(figsize=(max(width, 4.0), height + 0.4), dpi=90, layout="constrained")
@@ -132,6 +135,8 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         axes = figure.subplots()
         _draw(axes, take(episode, time), plans[time].numpy() if time < len(plans) else None, window)
         axes.plot(*ways[: time + 1].T, color=EGO, linewidth=1.5, zorder=1)
+        now = f"{name}, {time * decision_seconds(name):g} s, {observations[time, 3:5].norm():.0f} m/s"
+        axes.set_title(f"{now}: {ended}" if time == end - 1 else now, fontsize=9)
         figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False, fontsize=7, columnspacing=1)
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())

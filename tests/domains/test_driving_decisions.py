@@ -1,0 +1,63 @@
+"""What five drives teach: agreement of decisions and errors of distance, of policies of which it is known."""
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.domains.driving import expert
+from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.environment import STATE, TRAFFIC
+from ftl_lightning.domains.driving.scenarios import decision_seconds
+from ftl_lightning.evaluation.closed_loop import PlanFollower
+from ftl_lightning.seeding import EVALUATION_SEED
+
+TASK = "roundabout third exit"
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> dict[str, Any]:
+    return runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "driving_decisions.py"))
+
+
+def test_who_plans_what_the_expert_drives_agrees_and_drives_as_far(benchmark: dict[str, Any]) -> None:
+    loop = DOMAIN.closed_loop
+    assert loop is not None
+    starts = DOMAIN.source(None).starts(TASK, 1, EVALUATION_SEED + benchmark["SEED"])
+    assert starts is not None
+    driven = torch.from_numpy(expert.drive(TASK, int(starts.require_scenes()[0, -1]))[0])[:, 0]
+    padded = torch.cat((driven, driven[-1:].expand(8, -1)))
+
+    def known(observed: Observed, rows: list[int]) -> Tensor:
+        now = (driven - observed[TRAFFIC][0, :STATE]).norm(dim=1).argmin()
+        return padded[None, now : now + 8]
+
+    def standing(observed: Observed, rows: list[int]) -> Tensor:
+        return (observed[TRAFFIC][:, :STATE] * torch.tensor([1, 1, 1, 0, 0, 1, 1]))[:, None].expand(-1, 8, -1)
+
+    told = {"known": PlanFollower(known, loop.act, 1), "standing": PlanFollower(standing, loop.act, 1)}
+    found = benchmark["asked"](TASK, 1, "step", told, False)
+    knows, stands = (benchmark["summary"]([*found[name], dict(found[name][0], drive=1)]) for name in told)
+    assert knows["agreement"] == knows["go"] == 1
+    assert knows["metres"] == pytest.approx(0, abs=1e-4)
+    assert stands["agreement"] < 1
+    three = benchmark["AHEAD"]
+    speeds = driven[1:, 3:5].norm(dim=1) * decision_seconds(TASK)
+    ways = [float(speeds[step : step + three].sum()) for step in range(len(speeds) - three + 1)]
+    assert stands["metres"] == pytest.approx(sum([*ways, ways[0]]) / (len(ways) + 1), rel=1e-4)
+
+
+def test_go_is_speeding_up_and_wait_is_all_else(benchmark: dict[str, Any]) -> None:
+    said = [
+        {"drive": 0.0, "go": 1.0, "agreed": 1.0},
+        {"drive": 0.0, "go": 0.0, "agreed": 0.0},
+        {"drive": 1.0, "go": 0.0, "agreed": 1.0},
+    ]
+    found = benchmark["summary"](said)
+    assert found["agreement"] == pytest.approx(2 / 3)
+    assert (found["go"], found["wait"]) == (1.0, 0.5)
+    assert found["standard error"] == pytest.approx(0.25)
