@@ -25,6 +25,7 @@ class Stage:
         grid: options with a list of values each; the cells are their product.
         done: a file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content
             is not looked at: remove it after a change of the stage's configuration.
+        seeds: of the ablation's seeds those that the stage runs for; empty for all.
     """
 
     verb: Literal["fit", "invert"]
@@ -34,9 +35,12 @@ class Stage:
     grid: Mapping[str, list[Any]] = field(default_factory=dict)
     done: str = ""
     name: str = ""
+    seeds: Sequence[int] = ()
 
     def cells(self, seed: int) -> Iterator["Cell"]:
         """Every cell for one seed."""
+        if self.seeds and seed not in self.seeds:
+            return
         for texts in itertools.product(*self.each.values()):
             names = {"seed": str(seed), **dict(zip(self.each, texts, strict=True))}
             for values in itertools.product(*self.grid.values()):
