@@ -43,15 +43,15 @@ AHEAD = 3
 SHOWN = ("FASTER", "IDLE", "random", "nearest demonstration", "ridge regression", "MLP regression")
 
 
-def policies(few: FewShot, task: str, count: int, seed: int, blind: bool) -> dict[str, Policy]:
-    """What is asked, by name: ours, learned from five drives; the task's text; the empty concept; reference lines."""
+def policies(few: FewShot, task: str, concept: str, count: int, seed: int, blind: bool) -> dict[str, Policy]:
+    """What is asked, by name: ours, learned from five drives; the concept's text; the empty concept; reference lines."""
     model, loop = few.model, DOMAIN.closed_loop
     assert isinstance(model, GenerativeModel)
     assert loop is not None
-    shown = Expert(blind=blind).draw(task, 5, DEMONSTRATION_SEED + seed)
-    text = load_encoder("table", DOMAIN.concepts.table, "main")([task])
+    shown = Expert(blind=blind).draw(concept, 5, DEMONSTRATION_SEED + seed)
+    text = load_encoder("table", DOMAIN.concepts.table, "main")([concept])
     concepts: dict[str, Composition] = {
-        "ours": few.learn(shown, name=task, seed=seed),
+        "ours": few.learn(shown, name=concept, seed=seed),
         "language": Composition(model.standardise(text), torch.tensor([1.2])),
         "empty concept": Composition(model.empty[None], torch.zeros(1)),
     }
@@ -143,6 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pretrained", default="driving")
     parser.add_argument("--task", default="roundabout third exit")
+    parser.add_argument("--concept", help="what the five drives show, if it is another scenario")
     parser.add_argument("--drives", type=int, default=30)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the five demonstrations and of learning")
     parser.add_argument("--veto", choices=tuple(VETOES), default=STEP, help="of the planner")
@@ -152,7 +153,7 @@ def main() -> None:
     few = FewShot.from_pretrained(options.pretrained)
     found: dict[str, list[dict[str, float]]] = {}
     for seed in options.seeds:
-        told = policies(few, options.task, options.drives, seed, options.blind)
+        told = policies(few, options.task, options.concept or options.task, options.drives, seed, options.blind)
         for name, said in asked(options.task, options.drives, options.veto, told, options.blind).items():
             found.setdefault(name, []).append(summary(said))
     content = {}
@@ -165,6 +166,7 @@ def main() -> None:
         about = {
             "model": few.model.hash,
             "task": options.task,
+            "concept": options.concept or options.task,
             "drives": options.drives,
             "veto": options.veto,
             "blind expert": options.blind,

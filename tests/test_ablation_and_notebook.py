@@ -45,6 +45,11 @@ def test_a_cell_is_named_by_what_its_configuration_does_not_say() -> None:
     assert [str(cell) for cell in stage.cells(0)] == ["invert agent, bc, flat, seed 0"]
 
 
+def test_a_stage_may_run_for_some_seeds_alone() -> None:
+    stage = Stage("invert", "b.yaml", seeds=[0, 2])
+    assert [len(list(stage.cells(seed))) for seed in range(4)] == [1, 0, 1, 0]
+
+
 @pytest.mark.parametrize("path", sorted((CONF / "ablation").glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_cell_of_an_ablation_has_a_name_of_its_own(path: Path) -> None:
     plan = load(path)
