@@ -43,15 +43,15 @@ AHEAD = 3
 SHOWN = ("FASTER", "IDLE", "random", "nearest demonstration", "ridge regression", "MLP regression")
 
 
-def policies(few: FewShot, task: str, concept: str, count: int, seed: int, blind: bool) -> dict[str, Policy]:
+def policies(few: FewShot, task: str, learned: str, count: int, seed: int, blind: bool) -> dict[str, Policy]:
     """What is asked, by name: ours, learned from five drives; the concept's text; the empty concept; reference lines."""
     model, loop = few.model, DOMAIN.closed_loop
     assert isinstance(model, GenerativeModel)
     assert loop is not None
-    shown = Expert(blind=blind).draw(concept, 5, DEMONSTRATION_SEED + seed)
-    text = load_encoder("table", DOMAIN.concepts.table, "main")([concept])
+    shown = Expert(blind=blind).draw(learned, 5, DEMONSTRATION_SEED + seed)
+    text = load_encoder("table", DOMAIN.concepts.table, "main")([learned])
     concepts: dict[str, Composition] = {
-        "ours": few.learn(shown, name=concept, seed=seed),
+        "ours": few.learn(shown, name=learned, seed=seed),
         "language": Composition(model.standardise(text), torch.tensor([1.2])),
         "empty concept": Composition(model.empty[None], torch.zeros(1)),
     }
