@@ -1,5 +1,7 @@
 """Closed loop: lock-step, replanning, plans that are not finite, independence of the batch."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +18,7 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import ClosedLoop
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation import closed_loop
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, reset, roll_out, sampled_plans
 from ftl_lightning.evaluation.tensorboard import gif
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
@@ -89,6 +92,19 @@ def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: 
     assert found.observed["place"][0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
     assert found.observed["place"][1, -1, 0] == -1
     assert "episode 0, step 2: the plan is not finite" in caplog.text
+
+
+def test_the_bar_moves_with_every_step_of_every_episode_and_reaches_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+
+    @contextmanager
+    def counted(title: str, total: int, lines: bool = True) -> Iterator[Any]:
+        yield lambda steps=1: told.append(steps)
+        assert sum(told) == total == 3 * LOOP.steps
+
+    monkeypatch.setattr(closed_loop, "bar", counted)
+    roll_out(LOOP, begin(0.0, -9.0, 100.0), PlanFollower(ahead, LOOP.act, 1))
+    assert told.count(1) >= 4 + LOOP.steps + 1  # one arrives, one runs on, one breaks at once
 
 
 def test_all_episodes_may_fail() -> None:
