@@ -67,6 +67,7 @@ class Evaluator(pl.Callback):
             for all but the user's own demonstrations.
         diversity: also measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.diversity`; adds rows and
             changes none.
+        variant: what tables tell of this run beside the method's name, in place of the method's own words.
         seed: of the samples.
     """
 
@@ -84,6 +85,7 @@ class Evaluator(pl.Callback):
         results: str | None = None,
         references: bool | None = None,
         diversity: bool = True,
+        variant: str | None = None,
         seed: int = 0,
     ) -> None:
         try:
@@ -113,6 +115,7 @@ class Evaluator(pl.Callback):
         self.results = results
         self.references = references
         self.diversity = diversity
+        self.variant = variant
         self.seed = seed
         self.judged: list[Judged] = []
         self.root: Path | None = None
@@ -248,7 +251,7 @@ class Evaluator(pl.Callback):
                 real = self.real(module, self.judged)
                 self.judged = [known.added(one) for known, one in zip(real, self.judged, strict=True)]
                 beside |= lines(real) if compared else {}
-            found = rows(module, domain, self.judged, beside, configured)
+            found = rows(module, domain, self.judged, beside, configured, self.variant)
         if found:  # before anything is drawn, which may fail
             path = self.results or Path(trainer.log_dir or trainer.default_root_dir) / "results.csv"
             append_rows(path, found)

@@ -135,8 +135,9 @@ def latest(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.drop_duplicates(_SUBJECT, keep="last")
 
 
-COMPARISON, CURVES = "comparison", "curves"
-"""Names of results files that are shown apart from ablations: all methods, and numbers of demonstrations and components."""
+COMPARISON, CURVES, CHANGES = "comparison", "curves", "changes"
+"""Names of results files that are shown apart from ablations: all methods; numbers of demonstrations and components; ours with one
+of its changes to the paper's form taken away at a time."""
 
 
 def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
@@ -147,7 +148,7 @@ def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
     """
     path = Path(path)
     files = _files(path) if path.is_dir() else [path]
-    own = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES))]
+    own = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES))]
     return pd.concat([read_rows(file) for file in own], ignore_index=True) if own else pd.DataFrame(columns=COLUMNS)
 
 

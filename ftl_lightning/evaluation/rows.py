@@ -69,6 +69,7 @@ def rows(
     judged: Sequence[Judged],
     references: Mapping[str, Sequence[Judged]],
     configured: Mapping[str, Any],
+    variant: str | None = None,
 ) -> list[Row]:
     """The method's numbers, its comparison with policies from the same initial states, and the reference lines' numbers.
 
@@ -78,11 +79,12 @@ def rows(
         judged: what it did.
         references: what reference policies did, by name.
         configured: see :func:`configuration`.
+        variant: told beside the method's name, in place of the module's own words.
     """
     hparams = module.hparams
     ours = {
         "method": module.method,
-        "variant": module.variant,
+        "variant": module.variant if variant is None else variant,
         "role": METHOD,
         "K": hparams.get("components", 0),
         "omega": str(hparams.get("omega", hparams.get("guidance", "none"))),

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
+from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
+from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.comparison import compared, comparison_table, methods, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time
@@ -38,7 +39,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         UserError: if there are no results, or the Markdown file has no marks.
     """
     rows = read_rows(results)
-    ablations, comparison, curves = (read_study(results, name) for name in ("", COMPARISON, CURVES))
+    ablations, comparison, curves, changes = (read_study(results, name) for name in ("", COMPARISON, CURVES, CHANGES))
     measured = read_frontier(results).dropna(subset=["accuracy", "coverage"])
     if count := replaced(ablations):
         print(f"{results}: {count} rows are left out, since the same was measured again later in another configuration")
@@ -56,6 +57,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         if name in set(curves["domain"]):
             found.append(_written(curves_table(domain, curves), out / name))
             _save(growth(domain, curves), out / name / "curves.png")
+        if name in set(changes["domain"]):
+            found.append(_written(changes_table(domain, changes), out / name))
         if name in set(measured["domain"]):
             _save(frontier(domain, measured), out / name / "frontier.png")
             found.append(_written(frontier_table(domain, measured), out / name))

@@ -208,6 +208,11 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable
     assert len(labels) == 1 + 12 + 10 * 2
 
 
+def test_a_run_may_have_words_of_its_own_in_tables(invert: Callable[..., Path]) -> None:
+    log = invert("--evaluation.suites=[paper]", "--evaluation.references=false", "--evaluation.variant=without a hat")
+    assert set(read_rows(log / "results.csv")["variant"]) == {"without a hat"}
+
+
 def test_figures_frame_right_green_and_wrong_red(tmp_path: Path) -> None:
     domain = load_domain("object_rearrangement")
     states = domain.source(None).draw("circle right of square", 2, 0).states

@@ -86,6 +86,16 @@ def test_tables_stand_beside_the_papers_numbers(results: Path) -> None:
     assert "±" not in found["accuracy"].latex()
 
 
+def test_what_each_change_is_worth_has_a_table_of_its_own_in_the_order_of_its_rows(results: Path, tmp_path: Path) -> None:
+    append_rows(
+        results / "changes.csv", [row("new concept", "one", 0.9, variant="ours"), row("new concept", "one", 0.2, variant="flat")]
+    )
+    assert main(["report", "--results", str(results), "--out", str(tmp_path / "out")]) == 0
+    found = (tmp_path / "out" / DOMAIN.name / "changes.md").read_text()
+    assert found.index("| ours | 0.90 |") < found.index("| flat | 0.20 |")
+    assert "ours" not in (tmp_path / "out" / DOMAIN.name / "accuracy.md").read_text()
+
+
 def test_the_report_writes_files_and_updates_a_readme(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     readme = tmp_path / "README.md"
     readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")

@@ -1,0 +1,28 @@
+"""What each change to the paper's form is worth: ours, and ours with one change taken away at a time."""
+
+import pandas as pd
+
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.results import METHOD, latest
+from ftl_lightning.reporting.tables import MISSING, Table, select, summarise
+
+
+def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
+    """One line for each variant in the order of the rows, one column for each setting with the domain's main metric.
+
+    Args:
+        domain: the domain.
+        results: rows of the results file.
+    """
+    rows = select(latest(select(results, domain=domain.name, role=METHOD)), metric=domain.main_metric)
+    settings = list(dict.fromkeys(rows["setting"]))
+    lines = []
+    for variant in dict.fromkeys(rows["variant"]):
+        own = rows[rows["variant"] == variant]
+        numbers = [summarise(own[own["setting"] == setting]) for setting in settings]
+        lines.append([variant, *(MISSING if number is None else str(number) for number in numbers)])
+    caption = (
+        f"{domain.name}: {domain.main_metric} of ours, and with one change to the paper's form taken away at a time. "
+        "Mean ± standard error over tasks (spread over seeds)"
+    )
+    return Table("changes", caption, pd.DataFrame(lines, columns=["variant", *settings], dtype=str))
