@@ -1,0 +1,47 @@
+"""What looking ahead costs: seconds of episodes that follow a learned concept's plans, with each veto.
+
+    python benchmarks/driving_vetoes.py [--out results/driving_vetoes.json]
+
+A minute or two, on one thread.
+"""
+
+import argparse
+import json
+import time
+
+import torch
+
+from ftl_lightning import FewShot
+from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.foresight import BELIEF, VETOES
+from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
+from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
+from ftl_lightning.tensor_file import write_text
+
+TASK = "roundabout"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--out", help="JSON file")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    few, source, loop = FewShot.from_pretrained("driving"), DOMAIN.source(None), DOMAIN.closed_loop
+    assert loop is not None
+    concept = few.learn(source.draw(TASK, 5, DEMONSTRATION_SEED), name=TASK)
+    starts = few.starts(TASK, options.episodes, 0)
+    found = {}
+    for veto in VETOES:
+        draws = [generator("cpu", 0, row) for row in range(options.episodes)]
+        make = sampled_plans(few.model, [concept] * options.episodes, few.tuned.sampling, draws)
+        begun = time.perf_counter()
+        roll_out(loop.inside("" if veto == BELIEF else f"{veto} veto"), starts, PlanFollower(make, planner(few.model, loop), 1))
+        found[veto] = round(time.perf_counter() - begun, 1)
+        print(f"{options.episodes} episodes, {veto}: {found[veto]} s", flush=True)
+    if options.out:
+        write_text(options.out, json.dumps({"episodes": options.episodes, "seconds": found}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
