@@ -284,7 +284,7 @@ def test_demonstrations_do_not_depend_on_workers_and_go_on_where_they_stopped(
     first.write_bytes(first.read_bytes()[:-20])  # damaged: driven again
     two = generation.demonstrations("merge", 2, 0, 2, lambda: None)
     assert two.hash == alone.hash
-    monkeypatch.setattr(expert, "drive", lambda *_: pytest.fail("driven though it was kept"))
+    monkeypatch.setattr(expert, "drive", lambda *_, **options: pytest.fail("driven though it was kept"))
     assert generation.demonstrations("merge", 2, 0, 1, lambda: None).hash == alone.hash
 
 
@@ -292,7 +292,7 @@ def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     whole = np.ones((3, 5, 7), dtype=np.float32)
 
-    def drive(name: str, seed: int) -> tuple[np.ndarray, bool]:
+    def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
         if seed == generation.episode_seed(0, 0):
             raise RuntimeError("the simulator broke")
         return whole, seed != generation.episode_seed(0, 1)
@@ -302,7 +302,7 @@ def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: 
     assert (found.provenance["driven"], found.provenance["rejected"]) == (4, 2)
     assert not generation.shard("merge", generation.episode_seed(0, 0)).exists()  # next time it is driven again
     assert generation.shard("merge", generation.episode_seed(0, 1)).exists()
-    monkeypatch.setattr(expert, "drive", lambda *_: (whole, False))
+    monkeypatch.setattr(expert, "drive", lambda *_, **options: (whole, False))
     with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
         generation.demonstrations("exit", 1, 0, 1, lambda: None)
 
@@ -311,14 +311,14 @@ def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: 
 def test_a_machine_that_fails_decides_nothing(failure: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
-    def fail(name: str, seed: int) -> tuple[np.ndarray, bool]:
+    def fail(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
         raise failure
 
     with monkeypatch.context() as broken:
         broken.setattr(expert, "drive", fail)
         with pytest.raises(UserError, match=r"driving 'merge', seed \d+: the machine failed"):
             generation.demonstrations("merge", 1, 0, 1, lambda: None)
-    monkeypatch.setattr(expert, "drive", lambda *_: (np.ones((3, 5, 7), dtype=np.float32), True))
+    monkeypatch.setattr(expert, "drive", lambda *_, **options: (np.ones((3, 5, 7), dtype=np.float32), True))
     assert generation.demonstrations("merge", 1, 0, 1, lambda: None).provenance["rejected"] == 0
 
 
