@@ -20,8 +20,9 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.execution import Execution, closed_loop_of
-from ftl_lightning.learning.concept_model import CONFIG, DIFFUSION, ConceptModel
+from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.model_config import CONFIG, DIFFUSION
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
 from ftl_lightning.ranges import expect_count

@@ -36,7 +36,7 @@ def check(cells: Sequence[Cell]) -> None:
 def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.concepts.encoder import load_encoder
     from ftl_lightning.domains.registry import load_domain
-    from ftl_lightning.learning.concept_model import read_config
+    from ftl_lightning.learning.model_config import read_config
     from ftl_lightning.learning.pretrained import MODELS, model_class
     from ftl_lightning.lightning_cli import parse
 

@@ -7,12 +7,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ftl_lightning.learning.diffusion_pretraining import PretrainingModule
     from ftl_lightning.learning.inversion_module import InversionModule
-    from ftl_lightning.learning.pretraining import PretrainingModule
 
 __all__ = ["InversionModule", "PretrainingModule"]
 
-_MODULES = {"InversionModule": "inversion_module", "PretrainingModule": "pretraining"}
+_MODULES = {"InversionModule": "inversion_module", "PretrainingModule": "diffusion_pretraining"}
 
 
 def __getattr__(name: str) -> Any:

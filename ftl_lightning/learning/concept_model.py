@@ -2,15 +2,13 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
@@ -18,17 +16,16 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, Observed, expect_features
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.domain import Domain, View
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.ranges import LARGEST, expect_range
-from ftl_lightning.schema import built, expect_type, read_json
+from ftl_lightning.learning.model_config import CONFIG, VERSION, ModelConfig, expect_domain, find_view, read_config
+from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weights
+from ftl_lightning.schema import built
 from ftl_lightning.tensor_file import (
-    FORMAT,
     bytes_hash,
     expect_finite,
     file_hash,
@@ -39,14 +36,8 @@ from ftl_lightning.tensor_file import (
 )
 
 KIND = "generative model"
-CONFIG, WEIGHTS, EXAMPLES = "config.json", "model.safetensors", "demonstrations.safetensors"
-"""Files of a model's folder; the last one only of a model of a user's own data."""
-VERSION = 2
-"""Of the configuration's form. Form 1, which still loads, did not name observed features."""
-LONGEST = 10_000
-"""States in a plan; networks over time have the same weights for any number."""
-DIFFUSION = "diffusion"
-"""The kind of a model whose configuration names none."""
+EXAMPLES = "demonstrations.safetensors"
+"""In the folder of a model of a user's own data."""
 
 
 class Draws(NamedTuple):
@@ -54,96 +45,6 @@ class Draws(NamedTuple):
 
     t: Tensor
     noise: Tensor
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelConfig(Sizes):
-    """What is needed to build a model before its weights are read, beside the sizes; each method adds what its network needs.
-
-    Attributes:
-        domain: name of the domain.
-        training_concepts: texts, in the order of the model's table of training embeddings.
-        encoder: identity of the text encoder.
-        view: name of the domain's view that the model sees behaviour with; empty for as it is.
-        perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
-        image_encoder: arguments of the observed images' encoders, see :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`.
-        feature_dropout: of observed vectors by name, how often each is hidden (0 after normalisation) in training.
-        metrics: of a user's own data, what plans are judged by, see :mod:`ftl_lightning.domains.from_file`.
-        training: how it was trained, for the record.
-
-    Raises:
-        UserError: at construction, for a size out of its range.
-    """
-
-    domain: str
-    training_concepts: tuple[str, ...]
-    encoder: str
-    view: str = ""
-    perturb: bool = False
-    image_encoder: Mapping[str, Any] = field(default_factory=dict)
-    feature_dropout: Mapping[str, float] = field(default_factory=dict)
-    metrics: Mapping[str, float] = field(default_factory=dict)
-    training: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        expect_range("horizon", self.horizon, 1, LONGEST)
-        expect_range("state_dim", self.state_dim, 1, LARGEST)
-        expect_range("concept_dim", self.concept_dim, 1, LARGEST)
-        expect_range("observed, image_dim", self.vector_dim, 0, LARGEST)
-
-
-def find_view(domain: Domain, name: str) -> View | None:
-    """A domain's view by its name; ``None`` for the empty one.
-
-    Raises:
-        UserError: for a name that is none.
-    """
-    if not name:
-        return None
-    if name not in domain.views:
-        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {short(name)!r}")
-    return domain.views[name]
-
-
-def read_config(folder: str | Path) -> dict[str, Any]:
-    """What the configuration of a pretrained model says, with its ``hash`` and ``kind``.
-
-    Raises:
-        UserError: naming the file, if it is missing or something else.
-    """
-    path = Path(folder) / CONFIG
-    try:
-        found = read_json(path)
-    except OSError as error:
-        raise UserError(f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit") from error
-    with about(path):
-        version = found.pop("format", None) if isinstance(found, dict) else None
-        if type(version) is not int or version not in (FORMAT, VERSION):
-            raise UserError(
-                f"expected the configuration of a pretrained model, found something else (its format is not {FORMAT} or {VERSION})"
-            )
-        content: dict[str, Any] = {"kind": DIFFUSION} | found
-        for key in ("kind", "hash", "domain"):
-            expect_type(content.get(key), str, key)
-        if version == FORMAT:
-            _upgrade(content)
-        return content
-
-
-def _upgrade(content: dict[str, Any]) -> None:
-    """Bring a configuration of form 1 to form 2, in place: features are those of its domain and view."""
-    size = content.pop("initial_state_dim", 0)
-    for key in ("entities", "looks", "state_columns"):
-        content.pop(key, None)
-    features = _features(content["domain"], expect_type(content.get("view", ""), str, "view")) if size else {}
-    content["observed"] = {name: asdict(feature) for name, feature in features.items()}
-
-
-def _features(domain: str, view: str) -> Mapping[str, Feature]:
-    """What is observed in a domain through one of its views."""
-    found = load_domain(domain)
-    seen = find_view(found, view)
-    return found.observed if seen is None else seen.features
 
 
 class ConceptModel(nn.Module, ABC):
@@ -425,12 +326,12 @@ class ConceptModel(nn.Module, ABC):
                 if examples is None
                 else own_domain(examples, config.training_concepts, config.horizon, config.metrics)
             )
-            _expect_domain(config, domain)
+            expect_domain(config, domain)
             # First on paper: a file of a few bytes can name sizes that no memory holds.
-            with torch.device("meta"), _at_most(sum(value.numel() for value in tensors.values())):
+            with torch.device("meta"), at_most(sum(value.numel() for value in tensors.values())):
                 expected = cls._blank(config, domain).state_dict()
         with about(weights):
-            _expect_weights(tensors, expected)
+            expect_weights(tensors, expected)
         model = cls._blank(config, domain)
         model.examples = examples
         model.load_state_dict(tensors)
@@ -447,73 +348,6 @@ class ConceptModel(nn.Module, ABC):
             torch.zeros(1 + len(config.training_concepts), config.concept_dim),
             Normalization(initial, initial) if config.measured_dim else None,
         )
-
-
-MOST_PARAMETERS = 10_000
-"""Of tensors that are learned in a model that is read from files."""
-SPARE = 4
-"""So many times the numbers of a file may be made while a network is built: layers that are stacked afterwards are made twice."""
-
-
-@contextmanager
-def _at_most(numbers: int) -> Iterator[None]:
-    """Build a network of about so many numbers; larger ones are not built to their end.
-
-    Raises:
-        UserError: for a network that is larger, or that cannot be built.
-    """
-    tensors, left = 0, SPARE * numbers
-
-    def count(module: nn.Module, name: str, parameter: Tensor | None) -> None:
-        nonlocal tensors, left
-        if parameter is not None:
-            tensors, left = tensors + 1, left - parameter.numel()
-        if tensors > MOST_PARAMETERS or left < 0:
-            raise UserError(f"expected the sizes of the {numbers} numbers in {WEIGHTS}, found those of a larger network")
-
-    handle = register_module_parameter_registration_hook(count)
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:  # torch and the networks raise many kinds for sizes that do not go together
-        raise UserError(f"expected sizes that make a network, found others ({short(str(error), 100)})") from error
-    finally:
-        handle.remove()
-
-
-def _expect_domain(config: ModelConfig, domain: Domain) -> None:
-    """Refuse sizes that are not those of the domain's behaviour.
-
-    Raises:
-        UserError: naming the key.
-    """
-    if config.state_dim != (columns := len(domain.plans.columns)):
-        raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
-    view = find_view(domain, config.view)
-    expected = domain.observed if view is None else view.features
-    for name, feature in config.observed.items():
-        if name not in expected or not feature.fits(expected[name]):
-            told = expected[name].words if name in expected else f"one of {', '.join(expected) or 'no features'}"
-            raise UserError(f"key 'observed.{short(name)}': expected {told}, found {short(feature.words)}")
-
-
-def _expect_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Refuse tensors that are not those of a model, or hold numbers that are none.
-
-    Raises:
-        UserError: naming the first one.
-    """
-    for name in [*expected, *found]:
-        if name not in found or name not in expected:
-            told = "expected it, found nothing" if name not in found else "expected nothing, found it"
-            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: {told}")
-        own, like = found[name], expected[name]
-        if own.shape != like.shape or own.is_floating_point() != like.is_floating_point():
-            kinds = [f"{str(one.dtype).removeprefix('torch.')} {tuple(one.shape)}" for one in (like, own)]
-            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: expected {kinds[0]}, found {kinds[1]}")
-        if own.is_floating_point() and own.numel() and not torch.stack(own.aminmax()).isfinite().all():
-            raise UserError(f"key {short(name)!r}: expected finite numbers, found others; take another copy of both files")
 
 
 def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:

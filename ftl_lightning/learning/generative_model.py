@@ -18,7 +18,8 @@ from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.learning.concept_model import DIFFUSION, Draws, ModelConfig, TextConceptModel
+from ftl_lightning.learning.concept_model import Draws, TextConceptModel
+from ftl_lightning.learning.model_config import DIFFUSION, ModelConfig
 from ftl_lightning.schema import built
 
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.learning.concept_model import CONFIG, ConceptModel, read_config
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.model_config import CONFIG, read_config
 from ftl_lightning.shipped import pretrained_folder
 
 MODELS = {

@@ -1,4 +1,4 @@
-"""Pretraining: a model of behaviour given concepts is fitted to a domain's demonstrations. Ours is Eq. 1 of the paper."""
+"""Pretraining: a model of behaviour given concepts is fitted to a domain's demonstrations, by whatever method."""
 
 import copy
 import math
@@ -18,20 +18,15 @@ from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion import PAPER_SIZE
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
-from ftl_lightning.diffusion.prediction import loss_weights
-from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
-from ftl_lightning.learning.codes import Codes
-from ftl_lightning.learning.concept_model import ConceptModel, find_view, joined_vectors
-from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
+from ftl_lightning.learning.model_config import find_view
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import expect_finite
@@ -353,123 +348,3 @@ def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
                 f"concepts: {concepts[int(same[0])]!r} and {text!r} have the same embedding; expected texts that "
                 "data.encoder tells apart: change one"
             )
-
-
-class PretrainingModule(Pretraining):
-    """Trains a denoiser on a domain's pairs of behaviour and concept.
-
-    Args:
-        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
-        denoiser_args: its arguments other than the sizes.
-        paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
-        diffusion_steps: T.
-        condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
-            (the published code draws once a batch).
-        learning_rate, warmup_steps, weight_decay, ema_decay, guidance, view, perturb, output, seed: see :class:`Pretraining`.
-        image_encoder, feature_dropout: likewise.
-        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
-            which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
-        loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
-            weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
-        loss_discount: state k of a window weighs so much to the power of k: below 1 for plans that are made anew before they end.
-        code_share: of the samples are also told a rough code of their own behaviour, which varies over the window, see
-            :class:`~ftl_lightning.learning.codes.Codes`: so the network has seen concepts that do, and concepts that no text
-            names. 0 is the paper's form.
-        code_knots, code_size, code_noise: see there.
-        compile: compile the denoiser for training (worth it on GPUs).
-    """
-
-    method = OURS
-
-    def __init__(
-        self,
-        denoiser: str = "MLPDenoiser",
-        denoiser_args: Mapping[str, Any] | None = None,
-        paper_size: bool = False,
-        diffusion_steps: int = 100,
-        condition_dropout: float = 0.1,
-        learning_rate: float = 1e-3,
-        warmup_steps: int = 200,
-        weight_decay: float = 0.01,
-        ema_decay: float = 0.999,
-        guidance: float = 1.2,
-        prediction: str = "epsilon",
-        loss: str = "epsilon",
-        loss_discount: float = 1.0,
-        view: str = "",
-        perturb: bool = False,
-        code_share: float = 0.0,
-        code_knots: int = 8,
-        code_size: int = 16,
-        code_noise: float = 0.3,
-        compile: bool = False,
-        output: str | None = None,
-        seed: int = 0,
-        image_encoder: Mapping[str, Any] | None = None,
-        feature_dropout: Mapping[str, float] | None = None,
-    ) -> None:
-        super().__init__(
-            learning_rate,
-            warmup_steps,
-            weight_decay,
-            ema_decay,
-            guidance,
-            view,
-            perturb,
-            output,
-            seed,
-            image_encoder,
-            feature_dropout,
-        )
-        self.save_hyperparameters()
-        self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
-        if not 0 <= code_share <= 1:
-            raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
-        expect_range("model.condition_dropout", condition_dropout, 0, 1)
-        expect_range("model.loss_discount", loss_discount, 0, 1)
-        expect_range("model.code_noise", code_noise, 0)
-        for name, count in (("diffusion_steps", diffusion_steps), ("code_knots", code_knots), ("code_size", code_size)):
-            expect_range(f"model.{name}", count, 1)
-        self.codes = Codes(code_share, code_knots, code_size, code_noise) if code_share else None
-
-    def build(
-        self,
-        shared: Mapping[str, Any],
-        data: PretrainingData,
-        normalization: Normalization,
-        embeddings: Tensor,
-        initial_normalization: Normalization | None,
-    ) -> GenerativeModel:
-        names = ("denoiser", "diffusion_steps", "prediction")
-        config = DiffusionConfig(**shared, denoiser_args=self.denoiser_args, **{name: self.hparams[name] for name in names})
-        return GenerativeModel(config, data.domain, normalization, embeddings, initial_normalization)
-
-    def configure_model(self) -> None:
-        super().configure_model()
-        if self.hparams["compile"] and isinstance(self.raw, GenerativeModel):
-            self.raw.denoiser.compile()
-
-    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Eq. 1; while fitting, concepts are dropped."""
-        assert isinstance(model, GenerativeModel)
-        states, seen = model.perturbed(batch.states, batch.observed, draw)
-        clean = model.encode(states, seen)
-        context = model.observe(seen)
-        count = len(clean)
-        dropout = self.hparams["condition_dropout"] if model.training else 0.0
-        removed = torch.rand(count, generator=draw, device=self.device) < dropout
-        concepts = torch.cat((model.empty[None], model.training_embeddings))
-        index = torch.where(removed, 0, batch.concepts + 1)
-        if self.codes is not None and model.training:
-            concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
-        t = torch.randint(self.hparams["diffusion_steps"], (count,), generator=draw, device=self.device)
-        noise = torch.randn(clean.shape, generator=draw, device=self.device)
-        losses = denoising_loss(
-            lambda x, t: model.denoiser(x, t, concepts, index, context),
-            clean,
-            noise,
-            t,
-            model.alpha_bar,
-            self.hparams["loss_discount"],
-        )
-        return losses * loss_weights(self.hparams["loss"], model.alpha_bar)[t]

@@ -17,10 +17,10 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.baselines.cloning import CloningPretraining
 from ftl_lightning.learning.baselines.in_context import InContextPretraining
 from ftl_lightning.learning.baselines.prompting import InContextAdaptation
+from ftl_lightning.learning.diffusion_pretraining import PretrainingModule
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion_module import InversionModule
 from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.learning.pretraining import PretrainingModule
 from ftl_lightning.seeding import generator
 from ftl_lightning.trainer import Trainer
 

@@ -9,7 +9,8 @@ from torch import Tensor
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.model_config import ModelConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,8 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.baselines.additive import AdditiveModel, added
-from ftl_lightning.learning.concept_model import ConceptModel, ModelConfig
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.model_config import ModelConfig
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
 from ftl_lightning.ranges import expect_range
 

@@ -1,0 +1,130 @@
+"""The configuration of a pretrained model: what its ``config.json`` says."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.domains.domain import Domain, View
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.ranges import LARGEST, expect_range
+from ftl_lightning.schema import expect_type, read_json
+from ftl_lightning.tensor_file import FORMAT
+
+CONFIG = "config.json"
+"""In a model's folder."""
+VERSION = 2
+"""Of the configuration's form. Form 1, which still loads, did not name observed features."""
+LONGEST = 10_000
+"""States in a plan; networks over time have the same weights for any number."""
+DIFFUSION = "diffusion"
+"""The kind of a model whose configuration names none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig(Sizes):
+    """What is needed to build a model before its weights are read, beside the sizes; each method adds what its network needs.
+
+    Attributes:
+        domain: name of the domain.
+        training_concepts: texts, in the order of the model's table of training embeddings.
+        encoder: identity of the text encoder.
+        view: name of the domain's view that the model sees behaviour with; empty for as it is.
+        perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
+        image_encoder: arguments of the observed images' encoders, see :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`.
+        feature_dropout: of observed vectors by name, how often each is hidden (0 after normalisation) in training.
+        metrics: of a user's own data, what plans are judged by, see :mod:`ftl_lightning.domains.from_file`.
+        training: how it was trained, for the record.
+
+    Raises:
+        UserError: at construction, for a size out of its range.
+    """
+
+    domain: str
+    training_concepts: tuple[str, ...]
+    encoder: str
+    view: str = ""
+    perturb: bool = False
+    image_encoder: Mapping[str, Any] = field(default_factory=dict)
+    feature_dropout: Mapping[str, float] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        expect_range("horizon", self.horizon, 1, LONGEST)
+        expect_range("state_dim", self.state_dim, 1, LARGEST)
+        expect_range("concept_dim", self.concept_dim, 1, LARGEST)
+        expect_range("observed, image_dim", self.vector_dim, 0, LARGEST)
+
+
+def find_view(domain: Domain, name: str) -> View | None:
+    """A domain's view by its name; ``None`` for the empty one.
+
+    Raises:
+        UserError: for a name that is none.
+    """
+    if not name:
+        return None
+    if name not in domain.views:
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {short(name)!r}")
+    return domain.views[name]
+
+
+def read_config(folder: str | Path) -> dict[str, Any]:
+    """What the configuration of a pretrained model says, with its ``hash`` and ``kind``.
+
+    Raises:
+        UserError: naming the file, if it is missing or something else.
+    """
+    path = Path(folder) / CONFIG
+    try:
+        found = read_json(path)
+    except OSError as error:
+        raise UserError(f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit") from error
+    with about(path):
+        version = found.pop("format", None) if isinstance(found, dict) else None
+        if type(version) is not int or version not in (FORMAT, VERSION):
+            raise UserError(
+                f"expected the configuration of a pretrained model, found something else (its format is not {FORMAT} or {VERSION})"
+            )
+        content: dict[str, Any] = {"kind": DIFFUSION} | found
+        for key in ("kind", "hash", "domain"):
+            expect_type(content.get(key), str, key)
+        if version == FORMAT:
+            _upgrade(content)
+        return content
+
+
+def _upgrade(content: dict[str, Any]) -> None:
+    """Bring a configuration of form 1 to form 2, in place: features are those of its domain and view."""
+    size = content.pop("initial_state_dim", 0)
+    for key in ("entities", "looks", "state_columns"):
+        content.pop(key, None)
+    features = _features(content["domain"], expect_type(content.get("view", ""), str, "view")) if size else {}
+    content["observed"] = {name: asdict(feature) for name, feature in features.items()}
+
+
+def _features(domain: str, view: str) -> Mapping[str, Feature]:
+    """What is observed in a domain through one of its views."""
+    found = load_domain(domain)
+    seen = find_view(found, view)
+    return found.observed if seen is None else seen.features
+
+
+def expect_domain(config: ModelConfig, domain: Domain) -> None:
+    """Refuse sizes that are not those of the domain's behaviour.
+
+    Raises:
+        UserError: naming the key.
+    """
+    if config.state_dim != (columns := len(domain.plans.columns)):
+        raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
+    view = find_view(domain, config.view)
+    expected = domain.observed if view is None else view.features
+    for name, feature in config.observed.items():
+        if name not in expected or not feature.fits(expected[name]):
+            told = expected[name].words if name in expected else f"one of {', '.join(expected) or 'no features'}"
+            raise UserError(f"key 'observed.{short(name)}': expected {told}, found {short(feature.words)}")
