@@ -1,5 +1,6 @@
 """The domain object: what the rest of the package knows of driving."""
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split, deferred
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, DrivingEnvironment, initial_states, scene
-from ftl_lightning.domains.driving.expert import SEARCH
+from ftl_lightning.domains.driving.expert import BLIND, SEARCH
 from ftl_lightning.domains.driving.foresight import BELIEF, SIMULATION, STEP
 from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.motion import turned
@@ -52,7 +53,7 @@ class Expert:
             "config": scenario(task).config,
             "search": SEARCH[task],
             "beyond": HORIZON,
-            **({"blind": True} if self.blind else {}),
+            **({"blind": asdict(BLIND)} if self.blind else {}),
         }
         return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
 

@@ -47,8 +47,24 @@ SEARCH = {
 }
 
 IDLE = 1
-BELIEFS, EXPANSIONS = 4, 8
-"""Worlds that the blind expert imagines at a decision, and in each how many decisions it simulates for every action there is."""
+
+
+@dataclass(frozen=True)
+class Blind:
+    """How the expert searches that knows no more than what can be seen.
+
+    Attributes:
+        beliefs: worlds that it imagines at a decision.
+        expansions: decisions that it simulates in each for every action there is.
+        tolerated: risk that it takes: without any it waits until the time is up, since somebody may always come.
+    """
+
+    beliefs: int = 4
+    expansions: int = 8
+    tolerated: float = 1 / 8
+
+
+BLIND = Blind()
 
 
 def plan(env: AbstractEnv, name: str) -> int:
@@ -66,7 +82,8 @@ def plan(env: AbstractEnv, name: str) -> int:
 def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
     """The action to take now for one who sees no more than its pupils: the same search in imagined worlds, with the same veto.
 
-    An action's value is the mean of what the best sequence after it earns in each. The best of least risk is taken.
+    An action's value is the mean of what the best sequence after it earns in each. The best of tolerated risk is taken, or if there
+    is none, the best of least.
 
     Args:
         env: left as it was.
@@ -78,16 +95,16 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
     actions = list({meaning(env, action): action for action in env.get_available_actions()[::-1]}.values())[::-1]
     totals = dict.fromkeys(actions, 0.0)
     with _searching(env, replace(search, frequency=FRAMES * env.config["policy_frequency"])):
-        for _ in range(BELIEFS):
+        for _ in range(BLIND.beliefs):
             restore(env, actual)
             beliefs.draw(rng)
             for action in actions:
-                totals[action] += _values(env, name, search, [action], EXPANSIONS * len(actions))[action]
+                totals[action] += _values(env, name, search, [action], BLIND.expansions * len(actions))[action]
     worlds = Worlds(env, VETOES[BELIEF], beliefs, rng)
     risks: dict[int, float] = {}
     for action in sorted(actions, key=lambda action: -totals[action]):
         risks[action] = worlds.risk(action)
-        if risks[action] == 0:
+        if risks[action] <= BLIND.tolerated:
             return action
     return min(risks, key=lambda action: risks[action])
 

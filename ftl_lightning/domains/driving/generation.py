@@ -38,7 +38,7 @@ def episode_seed(seed: int, number: int) -> int:
 
 def shard(name: str, seed: int, blind: bool = False) -> Path:
     """File of one episode."""
-    belief = [expert.BELIEFS, expert.EXPANSIONS, VETOES[BELIEF].__dict__] if blind else []
+    belief = [expert.BLIND.__dict__, VETOES[BELIEF].__dict__] if blind else []
     key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__, *belief])
     return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
 
