@@ -1,7 +1,7 @@
 """Condition encoders: what a denoiser reads from observed features.
 
 Each has two halves: ``observe`` reads the features once a plan, ``attend`` brings in the concept at every step of denoising. The
-paper's encoder takes vectors as one; two others treat exchangeable entities alike.
+paper's encoder takes vectors as one, and so does another that sees the concept, too; two treat exchangeable entities alike.
 """
 
 from abc import ABC, abstractmethod
@@ -45,6 +45,27 @@ class FlatEncoder(ConditionEncoder):
 
     def attend(self, context: Context, concept: Tensor) -> Tensor:
         return context[0]
+
+
+class JointEncoder(ConditionEncoder):
+    """All vectors and the concept through one network. The paper does not say where the two meet.
+
+    Args:
+        sizes: of which the observed vectors' and the concept's are used.
+        width: of the features.
+    """
+
+    def __init__(self, sizes: Sizes, width: int) -> None:
+        super().__init__()
+        inputs = sizes.vector_dim + sizes.concept_dim
+        self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+
+    def observe(self, vector: Tensor) -> Context:
+        return (vector,)
+
+    def attend(self, context: Context, concept: Tensor) -> Tensor:
+        features: Tensor = self.net(torch.cat((context[0], concept), dim=-1))
+        return features
 
 
 def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
@@ -144,7 +165,12 @@ class SetEncoder(ConditionEncoder):
         return context[0]
 
 
-ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {"flat": FlatEncoder, "entities": EntityEncoder, "set": SetEncoder}
+ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {
+    "flat": FlatEncoder,
+    "joint": JointEncoder,
+    "entities": EntityEncoder,
+    "set": SetEncoder,
+}
 
 
 def condition_encoder(name: str, sizes: Sizes, width: int) -> ConditionEncoder:

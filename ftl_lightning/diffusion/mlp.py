@@ -24,7 +24,8 @@ class MLPDenoiser(nn.Module):
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
         time_dim: features of the timestep; even.
         dropout: of the hidden layers, in training.
-        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.conditions`.
+        initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'`` or ``'set'``,
+            see :mod:`ftl_lightning.diffusion.conditions`.
         initial_dim: features of what is observed.
     """
 

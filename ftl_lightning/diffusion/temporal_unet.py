@@ -91,7 +91,8 @@ class TemporalUNet(nn.Module):
         sizes: of plans, concepts and observed features; the horizon is a multiple of 2 to the number of levels less one.
         width: channels of the first level, and columns of each of the condition's three parts; the paper's size is 128.
         multipliers: channels of the levels, in widths.
-        initial_encoder: ``'flat'`` (the paper's), ``'entities'`` or ``'set'``, see :mod:`ftl_lightning.diffusion.conditions`.
+        initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'`` or ``'set'``,
+            see :mod:`ftl_lightning.diffusion.conditions`.
         film: the condition scales and shifts channels; false for the paper's form, which adds it.
         broadcast: the features of what is observed are also channels of the input at every time; false for the paper's form.
         clock: channels that tell a state's place in the plan, in addition to the states; even, 0 for the paper's form, whose

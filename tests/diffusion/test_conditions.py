@@ -148,5 +148,5 @@ def test_features_may_come_in_any_order_and_others_do_not_matter() -> None:
 
 
 def test_a_name_that_is_no_encoder() -> None:
-    with pytest.raises(UserError, match="initial_encoder: expected one of flat, entities, set, found 'deep'"):
+    with pytest.raises(UserError, match="initial_encoder: expected one of flat, joint, entities, set, found 'deep'"):
         condition_encoder("deep", Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8)

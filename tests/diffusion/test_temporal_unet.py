@@ -85,7 +85,7 @@ def test_exchanging_entities_changes_nothing_unless_the_encoder_is_flat() -> Non
     x, t, concepts, index, initial = inputs()
     swapped = initial.clone()
     swapped[:, [4, 5, 7, 8]] = initial[:, [7, 8, 4, 5]]
-    for encoder, same in (("entities", True), ("set", True), ("flat", False)):
+    for encoder, same in (("entities", True), ("set", True), ("flat", False), ("joint", False)):
         net = unet(initial_encoder=encoder)
         out = noise(net, x, t, concepts, index, initial)
         assert torch.allclose(out, noise(net, x, t, concepts, index, swapped), atol=1e-6) == same
@@ -119,7 +119,7 @@ def test_a_concept_tells_entities_apart_by_their_attributes() -> None:
     [
         ({"horizon": 12}, {}, "horizon: expected a multiple of 8"),
         ({}, {"width": 12}, "width: expected a multiple of 8"),
-        ({}, {"initial_encoder": "deep"}, "initial_encoder: expected one of flat, entities, set"),
+        ({}, {"initial_encoder": "deep"}, "initial_encoder: expected one of flat, joint, entities, set"),
         ({"observed": {"world": Feature((10,))}}, {"initial_encoder": "entities"}, "expected flat"),
         ({"observed": {"world": Feature((10,))}}, {"initial_encoder": "set"}, "expected flat"),
     ],

@@ -85,7 +85,7 @@ def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pyt
         (["--data.horizon=0"], "data.horizon: expected 1 or more"),
         (["--evaluation.replan=0"], "evaluation.replan: expected 1 or more"),
         (["--model.prediction=x"], "prediction: expected one of epsilon, v, clean, displacement"),
-        (["--model.denoiser_args={initial_encoder: deep}"], "initial_encoder: expected one of flat, entities"),
+        (["--model.denoiser_args={initial_encoder: deep}"], "initial_encoder: expected one of flat, joint, entities"),
     ],
 )
 def test_mistakes(options: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
