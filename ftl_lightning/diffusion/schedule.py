@@ -23,6 +23,23 @@ def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999)
     return torch.cumprod(1 - beta, dim=0).float()
 
 
+def timesteps(spread: Tensor, steps: int, power: float) -> Tensor:
+    """Timesteps ``T (1 - u^power)``: the higher the power, the more of them are noisy.
+
+    Args:
+        spread: u, even in [0, 1).
+        steps: T.
+        power: 1 spreads timesteps evenly (the paper's); with 3 half of them are of the noisiest eighth, with 10 of the noisiest
+            fifteenth.
+
+    Returns:
+        int64, of the shape of ``spread``.
+    """
+    if power != 1:
+        spread = 1 - spread**power
+    return (spread * steps).long().clamp(max=steps - 1)
+
+
 def _per_sample(values: Tensor, like: Tensor) -> Tensor:
     return values.reshape(-1, *(1,) * (like.dim() - 1))
 

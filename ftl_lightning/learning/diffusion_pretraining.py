@@ -9,7 +9,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion import PAPER_SIZE
 from ftl_lightning.diffusion.prediction import loss_weights
-from ftl_lightning.diffusion.schedule import denoising_loss
+from ftl_lightning.diffusion.schedule import denoising_loss, timesteps
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError
@@ -36,8 +36,7 @@ class PretrainingModule(Pretraining):
             which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: whose squared error is minimised, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others
             weigh noisy timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
-        timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 10
-            four of five are of the noisiest tenth, at which the concept decides.
+        timestep_power: see :func:`ftl_lightning.diffusion.schedule.timesteps`; 1 is the paper's.
         loss_discount: state k of a window weighs so much to the power of k: below 1 for plans that are made anew before they end.
         code_share: of the samples are also told a rough code of their own behaviour, which varies over the window, see
             :class:`~ftl_lightning.learning.codes.Codes`: so the network has seen concepts that do, and concepts that no text
@@ -131,7 +130,11 @@ class PretrainingModule(Pretraining):
         index = torch.where(removed, 0, batch.concepts + 1)
         if self.codes is not None and model.training:
             concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
-        t = self._timesteps(count, draw)
+        total, power = self.hparams["diffusion_steps"], self.hparams["timestep_power"]
+        if power == 1:
+            t = torch.randint(total, (count,), generator=draw, device=self.device)
+        else:
+            t = timesteps(torch.rand(count, generator=draw, device=self.device), total, power)
         noise = torch.randn(clean.shape, generator=draw, device=self.device)
         losses = denoising_loss(
             lambda x, t: model.denoiser(x, t, concepts, index, context),
@@ -142,10 +145,3 @@ class PretrainingModule(Pretraining):
             self.hparams["loss_discount"],
         )
         return losses * loss_weights(self.hparams["loss"], model.alpha_bar)[t]
-
-    def _timesteps(self, count: int, draw: torch.Generator) -> Tensor:
-        total, power = self.hparams["diffusion_steps"], self.hparams["timestep_power"]
-        if power == 1:
-            return torch.randint(total, (count,), generator=draw, device=self.device)
-        spread = 1 - torch.rand(count, generator=draw, device=self.device) ** power
-        return (spread * total).long().clamp(max=total - 1)

@@ -14,7 +14,7 @@ from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss
+from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss, timesteps
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError, short
@@ -107,12 +107,9 @@ class GenerativeModel(TextConceptModel):
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws:
         """Noise and stratified timesteps ``T (1 - u^power)``, u even in [0, 1)."""
-        total, device = len(self.alpha_bar), draw.device
+        device = draw.device
         spread = (torch.arange(samples, device=device) + torch.rand(samples, generator=draw, device=device)) / samples
-        if timestep_power != 1:
-            spread = 1 - spread**timestep_power
-        t = (spread * total).long().clamp(max=total - 1)
-        t = t[torch.randperm(samples, generator=draw, device=device)]
+        t = timesteps(spread, len(self.alpha_bar), timestep_power)[torch.randperm(samples, generator=draw, device=device)]
         return Draws(t, torch.randn((samples, self.config.horizon, self.config.state_dim), generator=draw, device=device))
 
     def observe(self, observed: Observed) -> Context:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -100,16 +101,17 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(capsys: p
     assert not (LOG / "pretrained").exists()
 
 
-def test_condition_dropout_is_drawn_per_sample() -> None:
+def given(batch_size: int, **options: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    """Timesteps and rows of the concepts that the network is given in the first step of a fit."""
     from ftl_lightning.domains.object_rearrangement.datamodule import ObjectRearrangementData
     from ftl_lightning.trainer import Trainer
 
     seen = []
-    module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 1, "condition_dim": 8}, condition_dropout=0.5)
-    data = ObjectRearrangementData(samples_per_concept=5, validation_per_concept=1, batch_size=400, steps_per_epoch=1)
+    module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 1, "condition_dim": 8}, **options)
+    data = ObjectRearrangementData(samples_per_concept=5, validation_per_concept=1, batch_size=batch_size, steps_per_epoch=1)
 
     def spy(module: torch.nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
-        seen.append(inputs[3].detach().clone())  # rows of the concepts, the empty one first
+        seen.append((inputs[1].clone(), inputs[3].clone()))
 
     trainer = Trainer(
         max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False, limit_val_batches=0, accelerator="cpu"
@@ -120,7 +122,20 @@ def test_condition_dropout_is_drawn_per_sample() -> None:
     module.configure_model()
     module.raw.denoiser.register_forward_pre_hook(spy)
     trainer.fit(module, datamodule=data)
-    assert 140 < (seen[0] == 0).sum() < 260  # neither none nor all, as once a batch would give
+    return seen[0]
+
+
+def test_condition_dropout_is_drawn_per_sample() -> None:
+    _, rows = given(400, condition_dropout=0.5)
+    assert 140 < (rows == 0).sum() < 260  # neither none nor all, as once a batch would give
+
+
+@pytest.mark.parametrize(("power", "noisiest"), [(1.0, 0.10), (3.0, 0.46), (10.0, 0.79)])
+def test_a_power_draws_noisy_timesteps(power: float, noisiest: float) -> None:
+    timesteps, _ = given(2000, timestep_power=power)
+    assert timesteps.min() >= 0
+    assert timesteps.max() == 99
+    assert (timesteps >= 90).float().mean().item() == pytest.approx(noisiest, abs=0.05)
 
 
 def test_a_task_of_texts_is_composed_with_the_guidance_weight_and_against_others(tiny: Path) -> None:
