@@ -8,12 +8,15 @@ the same.
 
 - *agreement*: share of decisions that are the expert's, the mean over drives and its standard error;
 - *go*, *wait*: the same of those decisions by which the expert speeds up, or drives at its highest speed, and of all others;
-- *metres*: how far the distance that a plan drives over the next three decisions is from the expert's, where there are plans.
+- *metres*: how far the distance that a plan drives over the next three decisions is from the expert's, where there are plans;
+- *held-out loss*: mean squared error of the clean plan (Eq. 2 with the loss ``clean``) on drives of the expert from new starts, at
+  all timesteps alike.
 """
 
 import argparse
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,6 +24,7 @@ import torch
 from ftl_lightning import FewShot
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import load_encoder
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN, Expert
@@ -31,6 +35,7 @@ from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.scenarios import decision_seconds
 from ftl_lightning.domains.driving.simulation import advance
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
+from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.progress import bar
 from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
@@ -43,18 +48,36 @@ AHEAD = 3
 SHOWN = ("FASTER", "IDLE", "random", "nearest demonstration", "ridge regression", "MLP regression")
 
 
-def policies(few: FewShot, task: str, learned: str, count: int, seed: int, blind: bool) -> dict[str, Policy]:
-    """What is asked, by name: ours, learned from five drives; the concept's text; the empty concept; reference lines."""
-    model, loop = few.model, DOMAIN.closed_loop
+def told_concepts(few: FewShot, name: str, shown: Demonstrations, seed: int) -> dict[str, Composition]:
+    """A concept that is learned from drives, its text, and the empty concept."""
+    model = few.model
     assert isinstance(model, GenerativeModel)
-    assert loop is not None
-    shown = Expert(blind=blind).draw(learned, 5, DEMONSTRATION_SEED + seed)
-    text = load_encoder("table", DOMAIN.concepts.table, "main")([learned])
-    concepts: dict[str, Composition] = {
-        "ours": few.learn(shown, name=learned, seed=seed),
+    text = load_encoder("table", DOMAIN.concepts.table, "main")([name])
+    return {
+        "ours": few.learn(shown, name=name, seed=seed),
         "language": Composition(model.standardise(text), torch.tensor([1.2])),
         "empty concept": Composition(model.empty[None], torch.zeros(1)),
     }
+
+
+@torch.no_grad()
+def held_out_loss(model: ConceptModel, concept: Composition, drives: Demonstrations) -> float:
+    """Mean squared error of the clean plan, over all decisions of drives."""
+    length = drives.lengths - 1  # where a decision is made
+    rows = torch.repeat_interleave(torch.arange(len(drives)), length)
+    starts = torch.cat([torch.arange(int(count)) for count in length])
+    states, observed = drives.windows(rows, starts, model.window)
+    draws = model.draws(len(rows), 1.0, generator("cpu", SEED))
+    alone = replace(concept, embeddings=concept.embeddings[None], weights=concept.weights[None])
+    return float(model.losses(states, observed, alone, draws, "clean").mean())
+
+
+def policies(
+    few: FewShot, task: str, concepts: Mapping[str, Composition], shown: Demonstrations, count: int, seed: int
+) -> dict[str, Policy]:
+    """What is asked, by name: plans of concepts, and reference lines."""
+    model, loop = few.model, DOMAIN.closed_loop
+    assert loop is not None
     found: dict[str, Policy] = {}
     for name, concept in concepts.items():
         draws = [generator("cpu", seed, row) for row in range(count)]
@@ -151,11 +174,17 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
     few = FewShot.from_pretrained(options.pretrained)
+    learned, expert_drives = options.concept or options.task, Expert(blind=options.blind)
+    others = expert_drives.draw(options.task, options.drives, EVALUATION_SEED + SEED)
     found: dict[str, list[dict[str, float]]] = {}
     for seed in options.seeds:
-        told = policies(few, options.task, options.concept or options.task, options.drives, seed, options.blind)
+        shown = expert_drives.draw(learned, 5, DEMONSTRATION_SEED + seed)
+        concepts = told_concepts(few, learned, shown, seed)
+        told = policies(few, options.task, concepts, shown, options.drives, seed)
         for name, said in asked(options.task, options.drives, options.veto, told, options.blind).items():
             found.setdefault(name, []).append(summary(said))
+        for name, concept in concepts.items():
+            found[name][-1]["held-out loss"] = held_out_loss(few.model, concept, others)
     content = {}
     for name, seeds in found.items():
         means = {key: round(float(np.mean([one[key] for one in seeds])), 3) for key in seeds[0]}
@@ -166,7 +195,7 @@ def main() -> None:
         about = {
             "model": few.model.hash,
             "task": options.task,
-            "concept": options.concept or options.task,
+            "concept": learned,
             "drives": options.drives,
             "veto": options.veto,
             "blind expert": options.blind,
