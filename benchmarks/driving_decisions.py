@@ -25,6 +25,7 @@ from ftl_lightning import FewShot
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN, Expert
@@ -73,17 +74,16 @@ def held_out_loss(model: ConceptModel, concept: Composition, drives: Demonstrati
 
 
 def policies(
-    few: FewShot, task: str, concepts: Mapping[str, Composition], shown: Demonstrations, count: int, seed: int
+    few: FewShot, task: str, concepts: Mapping[str, Composition], shown: Demonstrations, starts: InitialStates, seed: int
 ) -> dict[str, Policy]:
     """What is asked, by name: plans of concepts, and reference lines."""
     model, loop = few.model, DOMAIN.closed_loop
     assert loop is not None
     found: dict[str, Policy] = {}
     for name, concept in concepts.items():
-        draws = [generator("cpu", seed, row) for row in range(count)]
-        make = sampled_plans(model, [concept] * count, few.tuned.sampling, draws)
+        draws = [generator("cpu", seed, row) for row in range(len(starts))]
+        make = sampled_plans(model, [concept] * len(starts), few.tuned.sampling, draws)
         found[name] = PlanFollower(make, planner(model, loop), 1)
-    starts = few.starts(task, count, SEED)
     for name in SHOWN:
         policy = POLICIES[name](task, starts, shown, seed)
         assert policy is not None
@@ -91,15 +91,16 @@ def policies(
     return found
 
 
-def asked(task: str, count: int, veto: str, told: Mapping[str, Policy], blind: bool) -> dict[str, list[dict[str, float]]]:
+def asked(
+    task: str, starts: InitialStates, veto: str, told: Mapping[str, Policy], blind: bool
+) -> dict[str, list[dict[str, float]]]:
     """What each policy would have done at each decision of the expert's drives, by its name.
 
     Returns:
         For each decision the number of its ``drive``, ``go`` (1 or 0), ``agreed``, and ``metres``, the error of the distance.
     """
+    count = len(starts)
     environments = [DrivingEnvironment(veto) for _ in range(count)]
-    starts = DOMAIN.source(None).starts(task, count, EVALUATION_SEED + SEED)
-    assert starts is not None
     seen = [
         env.reset(options={"scene": scene.numpy()})[0] for env, scene in zip(environments, starts.require_scenes(), strict=True)
     ]
@@ -175,13 +176,14 @@ def main() -> None:
     options = parser.parse_args()
     few = FewShot.from_pretrained(options.pretrained)
     learned, expert_drives = options.concept or options.task, Expert(blind=options.blind)
+    starts = few.starts(options.task, options.drives, SEED)
     others = expert_drives.draw(options.task, options.drives, EVALUATION_SEED + SEED)
     found: dict[str, list[dict[str, float]]] = {}
     for seed in options.seeds:
         shown = expert_drives.draw(learned, 5, DEMONSTRATION_SEED + seed)
         concepts = told_concepts(few, learned, shown, seed)
-        told = policies(few, options.task, concepts, shown, options.drives, seed)
-        for name, said in asked(options.task, options.drives, options.veto, told, options.blind).items():
+        told = policies(few, options.task, concepts, shown, starts, seed)
+        for name, said in asked(options.task, starts, options.veto, told, options.blind).items():
             found.setdefault(name, []).append(summary(said))
         for name, concept in concepts.items():
             found[name][-1]["held-out loss"] = held_out_loss(few.model, concept, others)
