@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
+from ftl_lightning.domains.driving.expert import BLIND, plan_blind
 from ftl_lightning.domains.driving.foresight import BELIEF, FRAMES, SIMULATION, STEP, VETOES, Beliefs, Worlds
 from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make
 from ftl_lightning.domains.driving.simulation import save
@@ -151,3 +152,32 @@ def test_an_episode_repeats(veto: str) -> None:
         faster = np.array([env._env.action_type.actions_indexes["FASTER"]], dtype=np.float32)
         ways.append([env.step(faster)[0]["traffic"].tolist() for _ in range(3)])
     assert ways[0] == ways[1]
+
+
+def decided(env: Any, name: str) -> int:
+    beliefs = Beliefs(env, name)
+    beliefs.look()
+    return plan_blind(env, name, beliefs, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["roundabout", "merge"])
+def test_the_blind_expert_knows_nothing_that_cannot_be_seen(name: str) -> None:
+    for seed in range(3):
+        env, other = start(name, seed), start(name, seed)
+        hide(other, np.random.default_rng(seed))
+        assert decided(env, name) == decided(other, name)
+
+
+@pytest.mark.parametrize("keeping", [BLIND.tolerated, BLIND.tolerated + 0.1])
+def test_the_blind_expert_takes_the_best_decision_of_tolerated_risk(keeping: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = start("roundabout", 0)
+    named = env.action_type.actions_indexes
+    earned = {named["FASTER"]: 3.0, named["IDLE"]: 2.0, named["SLOWER"]: 1.0}
+    risk = {named["FASTER"]: 1.0, named["IDLE"]: keeping, named["SLOWER"]: 0.0}
+
+    def values(env: Any, name: str, search: Any, first: list[int], budget: int) -> dict[int, float]:
+        return {first[0]: earned.get(first[0], 0.0)}
+
+    monkeypatch.setattr("ftl_lightning.domains.driving.expert._values", values)
+    monkeypatch.setattr(Worlds, "risk", lambda self, decision: risk.get(decision, 1.0))
+    assert decided(env, "roundabout") == named["IDLE" if keeping <= BLIND.tolerated else "SLOWER"]
