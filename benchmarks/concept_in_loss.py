@@ -4,7 +4,7 @@
     python benchmarks/concept_in_loss.py --pretrained logs/changes/agent-paper0/pretrained --out results/concept_in_loss.json
 
 The loss is the squared error of the noise (Eq. 1), from where each demonstration starts. *others* and *none* are what it grows by
-if the model is told another training concept (the mean of all) or the empty one. Where they are 0 the model does not use the concept.
+if the model is told another training concept (the mean of all) or the empty one: 0 where the model does not use the concept.
 """
 
 import argparse
