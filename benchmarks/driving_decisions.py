@@ -91,10 +91,14 @@ def policies(
     return found
 
 
+Key = tuple[str, int]
+"""A policy's name and the seed of its demonstrations."""
+
+
 def asked(
-    task: str, starts: InitialStates, veto: str, told: Mapping[str, Policy], blind: bool
-) -> dict[str, list[dict[str, float]]]:
-    """What each policy would have done at each decision of the expert's drives, by its name.
+    task: str, starts: InitialStates, veto: str, told: Mapping[Key, Policy], blind: bool
+) -> dict[Key, list[dict[str, float]]]:
+    """What each policy would have done at each decision of the expert's drives.
 
     Returns:
         For each decision the number of its ``drive``, ``go`` (1 or 0), ``agreed``, and ``metres``, the error of the distance.
@@ -106,7 +110,7 @@ def asked(
     ]
     beliefs = [Beliefs(env.simulation, task) for env in environments]
     draws = [np.random.default_rng([SEED, row]) for row in range(count)]
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in told}
+    found: dict[Key, list[dict[str, float]]] = {name: [] for name in told}
     driven: dict[int, list[float]] = {row: [] for row in range(count)}
     planned: list[tuple[dict[str, float], int, int, float]] = []
     rows, seconds = list(range(count)), decision_seconds(task)
@@ -178,15 +182,18 @@ def main() -> None:
     learned, expert_drives = options.concept or options.task, Expert(blind=options.blind)
     starts = few.starts(options.task, options.drives, SEED)
     others = expert_drives.draw(options.task, options.drives, EVALUATION_SEED + SEED)
-    found: dict[str, list[dict[str, float]]] = {}
+    concepts: dict[Key, Composition] = {}
+    told: dict[Key, Policy] = {}
     for seed in options.seeds:
         shown = expert_drives.draw(learned, 5, DEMONSTRATION_SEED + seed)
-        concepts = told_concepts(few, learned, shown, seed)
-        told = policies(few, options.task, concepts, shown, starts, seed)
-        for name, said in asked(options.task, starts, options.veto, told, options.blind).items():
-            found.setdefault(name, []).append(summary(said))
-        for name, concept in concepts.items():
-            found[name][-1]["held-out loss"] = held_out_loss(few.model, concept, others)
+        own = told_concepts(few, learned, shown, seed)
+        concepts |= {(name, seed): concept for name, concept in own.items()}
+        told |= {(name, seed): policy for name, policy in policies(few, options.task, own, shown, starts, seed).items()}
+    found: dict[str, list[dict[str, float]]] = {}
+    for key, said in asked(options.task, starts, options.veto, told, options.blind).items():
+        found.setdefault(key[0], []).append(summary(said))
+        if key in concepts:
+            found[key[0]][-1]["held-out loss"] = held_out_loss(few.model, concepts[key], others)
     content = {}
     for name, seeds in found.items():
         means = {key: round(float(np.mean([one[key] for one in seeds])), 3) for key in seeds[0]}
