@@ -60,7 +60,7 @@ def main() -> None:
     for name, points in curves.items():
         print(f"{name:40s}", " ".join(f"{step}: {value:.2f}" for step, value in points))
     if options.out:
-        write_text(options.out, json.dumps({"tag": options.tag, "steps and values": curves}, indent=1) + "\n")
+        write_text(options.out, json.dumps({"tag": options.tag, "steps and values": curves}) + "\n")
     if options.figure:
         matplotlib.use("Agg")
         with atomic(Path(options.figure)) as temporary:
