@@ -8,13 +8,16 @@ from ftl_lightning.reporting.tables import MISSING, Table, select, summarise
 
 
 def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """One line for each variant in the order of the rows, one column for each setting with the domain's main metric.
+    """One line for each variant in the order of the rows, one column for each setting with the domain's headline, or if it was
+    not measured, its main metric.
 
     Args:
         domain: the domain.
         results: rows of the results file.
     """
-    rows = select(latest(select(results, domain=domain.name, role=METHOD)), metric=domain.main_metric)
+    rows = latest(select(results, domain=domain.name, role=METHOD))
+    metric = domain.headline if domain.headline in set(rows["metric"]) else domain.main_metric
+    rows = select(rows, metric=metric)
     settings = list(dict.fromkeys(rows["setting"]))
     lines = []
     for variant in dict.fromkeys(rows["variant"]):
@@ -22,7 +25,7 @@ def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
         numbers = [summarise(own[own["setting"] == setting]) for setting in settings]
         lines.append([variant, *(MISSING if number is None else str(number) for number in numbers)])
     caption = (
-        f"{domain.name}: {domain.main_metric} of ours, and with one change to the paper's form taken away at a time. "
+        f"{domain.name}: {metric} of ours, and with one change to the paper's form taken away at a time. "
         "Mean ± standard error over tasks (spread over seeds)"
     )
     return Table("changes", caption, pd.DataFrame(lines, columns=["variant", *settings], dtype=str))

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -9,6 +10,7 @@ from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
@@ -133,6 +135,20 @@ def test_curves_keep_the_other_axis_as_usual(results: Path) -> None:
     cells = curves_table(DOMAIN, read_study(results, "curves")).cells.set_index("of")
     assert cells.loc["demonstrations", ["1", "2", "4", "5"]].tolist() == ["0.10", "0.20", "-", "0.50"]
     assert cells.loc["K", ["1", "2", "4", "5"]].tolist() == ["-", "0.50", "0.70", "-"]
+
+
+def test_changes_stand_in_their_order_with_the_headline_if_it_was_measured(tmp_path: Path) -> None:
+    told = [("ours", 0.9), ("noise is predicted", 0.4), ("flat", 0.5)]
+    rows = [row("FTL-IGM", task, value + shift, variant=name) for name, value in told for task, shift in (("a", 0.0), ("b", 0.02))]
+    append_rows(tmp_path / "changes.csv", [*rows, row("expert (oracle)", "a", 1.0, role="reference", variant="", K=0, omega="")])
+    found = changes_table(DOMAIN, read_study(tmp_path, "changes")).cells
+    assert found["variant"].tolist() == [name for name, _ in told]
+    assert found["new concept"].tolist() == ["0.91 ± 0.01", "0.41 ± 0.01", "0.51 ± 0.01"]
+    assert read_study(tmp_path).empty  # not among ablations
+    driven = [replace(one, domain="driving", metric=name) for one in rows[:1] for name in ("closed loop success", "crash")]
+    append_rows(tmp_path / "changes.csv", [*driven, replace(driven[0], metric="closed loop strict success", value=0.1)])
+    driving = load_domain("driving")
+    assert changes_table(driving, read_study(tmp_path, "changes")).cells["new concept"].tolist() == ["0.10"]
 
 
 def test_ablations_comparison_and_curves_are_not_mixed(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
