@@ -8,11 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from ftl_lightning import FewShot
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.environment import STATE, TRAFFIC
 from ftl_lightning.domains.driving.scenarios import decision_seconds
+from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.evaluation.closed_loop import PlanFollower
 from ftl_lightning.seeding import EVALUATION_SEED
 
@@ -39,8 +41,8 @@ def test_who_plans_what_the_expert_drives_agrees_and_drives_as_far(benchmark: di
     def standing(observed: Observed, rows: list[int]) -> Tensor:
         return (observed[TRAFFIC][:, :STATE] * torch.tensor([1, 1, 1, 0, 0, 1, 1]))[:, None].expand(-1, 8, -1)
 
-    told = {"known": PlanFollower(known, loop.act, 1), "standing": PlanFollower(standing, loop.act, 1)}
-    found = benchmark["asked"](TASK, 1, "step", told, False)
+    told = {("known", 0): PlanFollower(known, loop.act, 1), ("standing", 0): PlanFollower(standing, loop.act, 1)}
+    found = benchmark["asked"](TASK, starts, "step", told, False)
     knows, stands = (benchmark["summary"]([*found[name], dict(found[name][0], drive=1)]) for name in told)
     assert knows["agreement"] == knows["go"] == 1
     assert knows["metres"] == pytest.approx(0, abs=1e-4)
@@ -61,3 +63,11 @@ def test_go_is_speeding_up_and_wait_is_all_else(benchmark: dict[str, Any]) -> No
     assert found["agreement"] == pytest.approx(2 / 3)
     assert (found["go"], found["wait"]) == (1.0, 0.5)
     assert found["standard error"] == pytest.approx(0.25)
+
+
+def test_the_held_out_loss_is_least_of_the_concept_that_drives_are_of(benchmark: dict[str, Any]) -> None:
+    few = FewShot.from_pretrained("driving")
+    drives = training_set("validation", 5).select("merge")
+    losses = {name: benchmark["held_out_loss"](few.model, few[name], drives) for name in few.training_concepts}
+    assert min(losses, key=lambda name: losses[name]) == "merge"
+    assert losses["merge"] == benchmark["held_out_loss"](few.model, few["merge"], drives)  # the same noise every time
