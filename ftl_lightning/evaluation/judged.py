@@ -85,13 +85,26 @@ def share(values: Tensor) -> float:
     return float(metric.compute())
 
 
-def paired(one: Judged, other: Judged, domain: Domain) -> dict[str, Tensor]:
-    """In which episodes ``(sample,)`` one succeeds and another, from the same initial state, does not, and the reverse."""
-    assert domain.closed_loop is not None
+def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
+    """In which episodes ``(sample,)`` one succeeds and a policy, from the same initial state, does not, and the reverse.
+
+    Args:
+        one: what a method did.
+        other: what the policy did.
+        policy: its name.
+        domain: whose headline decides, if it is an outcome, else success.
+
+    Returns:
+        both by their metric's name, in the domain's own environment and in each other in which both acted.
+    """
     name = domain.headline.removeprefix(f"{CLOSED} ")
     compared = name if name != domain.headline else SUCCESS
-    ours, theirs = (judged.outcomes[compared] for judged in (one, other))
-    return {WON: ours & ~theirs, LOST: theirs & ~ours}
+    found: dict[str, Tensor] = {}
+    for place, ours in one.outcomes.items():
+        if place in other.outcomes and (place == compared or place.startswith(f"{compared} (")):
+            theirs, named = other.outcomes[place], f"{policy}{place.removeprefix(compared)}"
+            found |= {f"{WON}{named}": ours & ~theirs, f"{LOST}{named}": theirs & ~ours}
+    return found
 
 
 def standard_error(values: Sequence[float]) -> float:

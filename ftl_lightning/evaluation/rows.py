@@ -110,7 +110,7 @@ def rows(
         for other in references.get(name, ())
         for one in judged
         if one.task == other.task
-        for row in of(one, ours, {f"{what}{name}": share(only) for what, only in paired(one, other, domain).items()})
+        for row in of(one, ours, {metric: share(only) for metric, only in paired(one, other, name, domain).items()})
     ]
     return [
         *(row for one in judged for row in of(one, ours, one.values)),

@@ -75,6 +75,11 @@ def policies(domain: Domain) -> Sequence[str]:
     return tuple(domain.closed_loop.policies) if domain.closed_loop else ()
 
 
+def environments(domain: Domain) -> Sequence[str]:
+    """Behind the names of outcomes: nothing in the domain's own environment, the names of its others in these."""
+    return ("", *(f" ({name})" for name in domain.closed_loop.others)) if domain.closed_loop else ()
+
+
 def published(domain: Domain) -> tuple[Published, ...]:
     """The paper's numbers; none where there is no paper, and then tables have no columns for them."""
     return domain.paper.numbers if domain.paper else ()

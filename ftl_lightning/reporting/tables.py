@@ -13,6 +13,7 @@ from ftl_lightning.evaluation.results import METHOD, REFERENCE, labels, latest
 from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.reporting.shown import (
     component_tasks,
+    environments,
     learned_settings,
     lookup,
     main_omega,
@@ -268,12 +269,12 @@ def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
 
 
 def _paired(domain: Domain, every: pd.DataFrame) -> Table:
-    """Our successes less those of reference policies from the same starts, over all seeds."""
+    """Our successes less those of reference policies from the same starts, over all seeds, in each environment."""
     ours, _ = main_rows(every, main_omega(domain))
     learned, _ = _columns(ours[ours["metric"].str.startswith(WON)])
     lines = []
     for setting in settings(domain, ours):
-        for policy in policies(domain):
+        for policy in (f"{name}{place}" for place in environments(domain) for name in policies(domain)):
             counted = [against(select(ours, setting=setting, label=label), policy) for label in learned]
             line = [MISSING if counts is None else episodes(*counts) for counts in counted]
             if set(line) - {MISSING}:

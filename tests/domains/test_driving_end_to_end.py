@@ -76,16 +76,17 @@ def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
     assert {metric for metric in set(ours["metric"]) - outcomes if not metric.startswith(("won against", "lost against"))} == {
         "novelty"
     }
-    assert {metric.removeprefix("won against ") for metric in set(ours["metric"]) if metric.startswith("won")} == {
-        "IDLE",
-        "random",
-        "FASTER",
-        "nearest demonstration",
-        "ridge regression",
-        "MLP regression",
-        "expert (oracle)",
-    }
+    regressions = ("nearest demonstration", "ridge regression", "MLP regression")
+    policies = ("IDLE", "random", "FASTER", *regressions, "expert (oracle)")
+    for outcome in ("won", "lost"):
+        shown = {metric for metric in set(ours["metric"]) if metric.startswith(outcome)}
+        assert shown == {f"{outcome} against {name}{veto}" for name in policies for veto in ("", " (step veto)")}
+    value = rows.set_index(["method", "metric"])["value"]
     for veto in ("", " (step veto)"):
+        for name in policies:  # what only the one wins, less what only the other does, is the difference of their rates
+            won, lost = (value["FTL-IGM", f"{outcome} against {name}{veto}"] for outcome in ("won", "lost"))
+            rates = [value[method, f"closed loop strict success{veto}"] for method in ("FTL-IGM", name)]
+            assert won - lost == pytest.approx(rates[0] - rates[1])
         oracle = rows[(rows["method"] == "expert (oracle)") & (rows["metric"] == f"closed loop strict success{veto}")]
         assert oracle["value"].tolist() == [1.0]
 

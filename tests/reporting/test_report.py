@@ -132,6 +132,20 @@ def test_the_main_table_shows_what_there_is_and_says_how_it_was_learned(tmp_path
     assert table.cells["FTL-IGM (free)"].tolist() == ["0.80", "0.70 (K = 1, learned weights)"]
 
 
+def test_paired_episodes_have_a_line_for_each_policy_in_each_environment(tmp_path: Path) -> None:
+    driving = load_domain("driving")
+    shares = {"": (0.2, 0.1), " (step veto)": (0.0, 0.4)}
+    rows = [
+        row("new initial state", "roundabout", value, domain="driving", omega="learned", metric=f"{outcome} against FASTER{place}")
+        for place, found in shares.items()
+        for outcome, value in zip(("won", "lost"), found, strict=True)
+    ]
+    append_rows(tmp_path / "r.csv", rows)
+    cells = next(table.cells for table in tables(driving, read_rows(tmp_path / "r.csv")) if table.name == "paired")
+    assert cells["compared with"].tolist() == ["FASTER", "FASTER (step veto)"]
+    assert [cell.split(" ")[0] for cell in cells["FTL-IGM (free)"]] == ["+0.10", "-0.40"]
+
+
 def test_settings_of_ones_own_come_last_and_components_apart(tmp_path: Path) -> None:
     named = ("component 1", "own demonstrations", "another", "new concept", "training concept")
     append_rows(tmp_path / "r.csv", [row(setting, "one", 0.5) for setting in named])
