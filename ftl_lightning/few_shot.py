@@ -1,5 +1,6 @@
 """The few-shot learner in Python: load a pretrained model, learn a concept, sample, compose, judge, draw, execute."""
 
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
@@ -21,8 +22,10 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.execution import Execution, closed_loop_of
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.hub import card as model_card
+from ftl_lightning.learning.hub import download, upload
 from ftl_lightning.learning.inversion import invert
-from ftl_lightning.learning.model_config import CONFIG, DIFFUSION
+from ftl_lightning.learning.model_config import DIFFUSION
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
 from ftl_lightning.ranges import expect_count
@@ -98,7 +101,7 @@ class FewShot:
         """
         folder = pretrained_folder(name)
         if not folder.is_dir() and str(name).count("/") == 1 and not str(name).startswith((".", "~")):
-            folder = _from_hub(str(name))
+            folder = download(str(name))
         model = load_model(folder).to(device)
         if settings is None:
             group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
@@ -377,7 +380,7 @@ class FewShot:
         self.model.save(folder)
         if not (card := folder / "README.md").is_file():
             with atomic(card) as temporary:
-                temporary.write_text(_card(self.model), encoding="utf-8")
+                temporary.write_text(model_card(self.model), encoding="utf-8")
 
     def push_to_hub(self, repository: str, private: bool = False) -> str:
         """Upload the model to the Hugging Face Hub as ``owner/name``; needs a network and a login.
@@ -385,42 +388,9 @@ class FewShot:
         Returns:
             Where it is.
         """
-        import tempfile
-
-        from huggingface_hub import HfApi
-
-        hub = HfApi()
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder)
-            hub.create_repo(repository, private=private, exist_ok=True)
-            return str(hub.upload_folder(repo_id=repository, folder_path=folder))
-
-
-def _from_hub(repository: str) -> Path:
-    """The folder of a model that is downloaded from the Hugging Face Hub, or was before.
-
-    Raises:
-        UserError: if it cannot be had.
-    """
-    from huggingface_hub import snapshot_download
-
-    try:
-        return Path(snapshot_download(repository, allow_patterns=["*.json", "*.safetensors", "*.md"]))
-    except Exception as error:  # the Hub, the network and the cache raise kinds of their own
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{repository}: expected a folder, a model that ships or one on the Hub, found none ({reason})") from error
-
-
-def _card(model: ConceptModel) -> str:
-    """A short model card with the Hub's metadata."""
-    texts = "\n".join(f"- {text}" for text in model.config.training_concepts)
-    return (
-        "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning]\n---\n"
-        f"# {model.name} on {model.domain.name}\n\nHash {model.hash}; plans of {model.config.horizon} states of "
-        f"{model.config.state_dim} numbers. Text encoder: {model.config.encoder}.\n\nTraining concepts:\n\n{texts}\n\n"
-        f'    from ftl_lightning import FewShot\n    model = FewShot.from_pretrained("FOLDER OR NAME")\n\n'
-        f"Files: `{CONFIG}`, `model.safetensors` (weights in half precision).\n"
-    )
+            return upload(folder, repository, private)
 
 
 def _sum(parts: Iterable[Composition]) -> Composition:
