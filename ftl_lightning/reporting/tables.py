@@ -1,5 +1,6 @@
 """Tables from results, each number beside the paper's: Markdown to read, LaTeX to paste."""
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -272,17 +273,18 @@ def _paired(domain: Domain, every: pd.DataFrame) -> Table:
     """Our successes less those of reference policies from the same starts, over all seeds, in each environment."""
     ours, _ = main_rows(every, main_omega(domain))
     learned, _ = _columns(ours[ours["metric"].str.startswith(WON)])
-    lines = []
+    lines, elsewhere = [], ""
     for setting in settings(domain, ours):
-        for policy in (f"{name}{place}" for place in environments(domain) for name in policies(domain)):
-            counted = [against(select(ours, setting=setting, label=label), policy) for label in learned]
+        for place, name in itertools.product(environments(domain), policies(domain)):
+            counted = [against(select(ours, setting=setting, label=label), f"{name}{place}") for label in learned]
             line = [MISSING if counts is None else episodes(*counts) for counts in counted]
             if set(line) - {MISSING}:
-                lines.append([setting, policy, *line])
+                lines.append([setting, f"{name}{place}", *line])
+                elsewhere = "; an environment other than the domain's own is named behind the policy" if place else elsewhere
     compared = domain.headline.removeprefix(f"{CLOSED} ")
     caption = (
         f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
-        "(of these learned concepts: the episodes of a seed share one)"
+        f"(of these learned concepts: the episodes of a seed share one){elsewhere}"
     )
     return make_table(domain, "paired", caption, lines, ["setting", "compared with", *learned])
 
