@@ -4,6 +4,7 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import METHOD, latest
+from ftl_lightning.reporting.shown import decisive
 from ftl_lightning.reporting.tables import MISSING, Table, select, summarise
 
 
@@ -16,7 +17,7 @@ def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
         results: rows of the results file.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
-    metric = domain.headline if domain.headline in set(rows["metric"]) else domain.main_metric
+    metric = decisive(domain, rows)
     rows = select(rows, metric=metric)
     settings = list(dict.fromkeys(rows["setting"]))
     lines = []

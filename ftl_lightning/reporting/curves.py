@@ -4,7 +4,7 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import METHOD, latest
-from ftl_lightning.reporting.shown import main_omega
+from ftl_lightning.reporting.shown import decisive, main_omega
 from ftl_lightning.reporting.tables import LEARNED, MISSING, Table, select, summarise
 
 AXES = {"demonstrations": "K", "K": "demonstrations"}
@@ -13,7 +13,7 @@ USUAL = {"demonstrations": 5, "K": 2}
 
 
 def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """The rows of a domain's main metric in which what else could grow is as usual.
+    """The rows of a domain's headline, or if it was not measured, its main metric, in which what else could grow is as usual.
 
     Demonstrations grow with the main tables' guidance weight, components with learned weights: with a fixed one for each, guidance
     would grow with them. Settings that start where the demonstrations did are left out: they have no more samples than these.
@@ -25,7 +25,7 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
     omega = main_omega(domain) if axis == "demonstrations" else LEARNED
-    rows = select(rows, metric=domain.main_metric, omega=omega, **{AXES[axis]: USUAL[AXES[axis]]})
+    rows = select(rows, metric=decisive(domain, rows), omega=omega, **{AXES[axis]: USUAL[AXES[axis]]})
     return rows[(rows["K"] > 0) & (rows["demonstrations"] > 0) & (rows["n"] > rows["demonstrations"])]
 
 
@@ -37,8 +37,9 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
         for setting in dict.fromkeys(rows["setting"]):
             numbers = [summarise(rows[(rows["setting"] == setting) & (rows[axis] == count)]) for count in counts]
             lines.append([setting, axis, *(MISSING if number is None else str(number) for number in numbers)])
+    metric = next((name for rows in grown.values() for name in rows["metric"]), domain.main_metric)
     caption = (
-        f"{domain.name}: as demonstrations (with K = 2) and components K (from five demonstrations, learned weights) grow. "
-        "Mean ± standard error over tasks (spread over seeds)"
+        f"{domain.name}: {metric} as demonstrations (with K = 2) and components K (from five demonstrations, learned weights) "
+        "grow. Mean ± standard error over tasks (spread over seeds)"
     )
     return Table("curves", caption, pd.DataFrame(lines, columns=["setting", "of", *map(str, counts)], dtype=str))

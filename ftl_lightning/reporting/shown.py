@@ -70,6 +70,11 @@ def metrics(domain: Domain) -> tuple[str, ...]:
     return tuple(name for name in names if name)
 
 
+def decisive(domain: Domain, rows: pd.DataFrame) -> str:
+    """The one metric of a small table: the domain's headline, or its main metric in rows without the headline."""
+    return domain.headline if domain.headline in set(rows["metric"]) else domain.main_metric
+
+
 def policies(domain: Domain) -> Sequence[str]:
     """Reference policies that act from the same initial states as the method."""
     return tuple(domain.closed_loop.policies) if domain.closed_loop else ()

@@ -137,6 +137,19 @@ def test_curves_keep_the_other_axis_as_usual(results: Path) -> None:
     assert cells.loc["K", ["1", "2", "4", "5"]].tolist() == ["-", "0.50", "0.70", "-"]
 
 
+def test_curves_are_of_the_headline_where_it_was_measured(tmp_path: Path) -> None:
+    driven = {"domain": "driving", "setting": "new initial state", "task": "roundabout", "K": 2, "omega": "learned"}
+    rows = [
+        row("FTL-IGM", value=value, metric=metric, demonstrations=count, config_hash=f"{count}", **driven)  # type: ignore[arg-type]
+        for count in (1, 5)
+        for metric, value in (("closed loop success", 0.9), ("closed loop strict success", count / 10))
+    ]
+    append_rows(tmp_path / "curves.csv", rows)
+    table = curves_table(load_domain("driving"), read_study(tmp_path, "curves"))
+    assert table.cells.set_index("of").loc["demonstrations", ["1", "5"]].tolist() == ["0.10", "0.50"]
+    assert table.caption.startswith("driving: closed loop strict success as demonstrations ")
+
+
 def test_changes_stand_in_their_order_with_the_headline_if_it_was_measured(tmp_path: Path) -> None:
     told = [("ours", 0.9), ("noise is predicted", 0.4), ("flat", 0.5)]
     rows = [row("FTL-IGM", task, value + shift, variant=name) for name, value in told for task, shift in (("a", 0.0), ("b", 0.02))]
