@@ -53,11 +53,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pretrained", default="agent")
     parser.add_argument("--count", type=int, default=50, help="demonstrations of each training concept")
+    parser.add_argument("--split", choices=("train", "validation"), default="validation", help="train: those it has seen")
     parser.add_argument("--timesteps", type=int, nargs="+", default=TIMESTEPS)
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
     few = FewShot.from_pretrained(options.pretrained)
-    shown = few.domain.source(None).split("validation", options.count, 0)
+    shown = few.domain.source(None).split(options.split, options.count, 0)
     found = {t: losses(few.model, shown, t) for t in options.timesteps}
     for t, told in found.items():
         print(f"{t:4d}", " ".join(f"{name} {value:+.6f}" for name, value in told.items()))
