@@ -1,6 +1,7 @@
 """What five drives teach: how often policies decide as the expert does, on drives of the expert from new starts.
 
-    python benchmarks/driving_decisions.py --task "roundabout third exit" --drives 30 --out results/driving_decisions.json
+    python benchmarks/driving_decisions.py --task "roundabout third exit" --drives 30
+    python benchmarks/driving_decisions.py --task roundabout --pretrained logs/ablation/driving-steps{0,1,2}/pretrained
 
 The expert drives; at each decision every policy is asked what it would do there. Its wish is turned into a decision by the planner
 and its veto, as in closed loop. Two decisions that make the same of the vehicle, such as keeping and raising the highest speed, are
@@ -169,7 +170,7 @@ def summary(said: list[dict[str, float]]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pretrained", default="driving")
+    parser.add_argument("--pretrained", nargs="+", default=["driving"], help="a model for all seeds, or one for each")
     parser.add_argument("--task", default="roundabout third exit")
     parser.add_argument("--concept", help="what the five drives show, if it is another scenario")
     parser.add_argument("--drives", type=int, default=30)
@@ -178,13 +179,16 @@ def main() -> None:
     parser.add_argument("--blind", action="store_true", help="the expert knows no more than what can be seen")
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
-    few = FewShot.from_pretrained(options.pretrained)
+    if len(options.pretrained) not in (1, len(options.seeds)):
+        parser.error(f"--pretrained: expected one model or one for each of {len(options.seeds)} seeds")
+    models = [FewShot.from_pretrained(name) for name in options.pretrained]
+    of_seed = dict(zip(options.seeds, models if len(models) > 1 else models * len(options.seeds), strict=True))
     learned, expert_drives = options.concept or options.task, Expert(blind=options.blind)
-    starts = few.starts(options.task, options.drives, SEED)
+    starts = models[0].starts(options.task, options.drives, SEED)
     others = expert_drives.draw(options.task, options.drives, EVALUATION_SEED + SEED)
     concepts: dict[Key, Composition] = {}
     told: dict[Key, Policy] = {}
-    for seed in options.seeds:
+    for seed, few in of_seed.items():
         shown = expert_drives.draw(learned, 5, DEMONSTRATION_SEED + seed)
         own = told_concepts(few, learned, shown, seed)
         concepts |= {(name, seed): concept for name, concept in own.items()}
@@ -193,16 +197,18 @@ def main() -> None:
     for key, said in asked(options.task, starts, options.veto, told, options.blind).items():
         found.setdefault(key[0], []).append(summary(said))
         if key in concepts:
-            found[key[0]][-1]["held-out loss"] = held_out_loss(few.model, concepts[key], others)
-    content = {}
+            found[key[0]][-1]["held-out loss"] = held_out_loss(of_seed[key[1]].model, concepts[key], others)
+    content: dict[str, dict[str, object]] = {}
     for name, seeds in found.items():
         means = {key: round(float(np.mean([one[key] for one in seeds])), 3) for key in seeds[0]}
         spread = float(np.std([one["agreement"] for one in seeds], ddof=1)) if len(seeds) > 1 else 0.0
-        content[name] = means | {"spread over seeds": round(spread, 3)}
+        content[name] = {**means, "spread over seeds": round(spread, 3)}
+        if len(models) > 1:
+            content[name]["agreement of each model"] = [round(one["agreement"], 3) for one in seeds]
         print(f"{name:24s}", content[name], flush=True)
     if options.out:
         about = {
-            "model": few.model.hash,
+            "model": ", ".join(few.model.hash for few in models),
             "task": options.task,
             "concept": learned,
             "drives": options.drives,
