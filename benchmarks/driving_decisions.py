@@ -169,12 +169,6 @@ def summary(said: list[dict[str, float]]) -> dict[str, float]:
     }
 
 
-def setting(text: str) -> tuple[str, Any]:
-    """``'off_span=0.3'``: a key and its value in JSON."""
-    key, value = text.split("=", 1)
-    return key, json.loads(value)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pretrained", nargs="+", default=["driving"], help="a model for all seeds, or one for each")
@@ -184,9 +178,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the five demonstrations and of learning")
     parser.add_argument("--veto", choices=tuple(VETOES), default=STEP, help="of the planner")
     parser.add_argument("--blind", action="store_true", help="the expert knows no more than what can be seen")
-    parser.add_argument(
-        "--learn", type=setting, nargs="+", default=[], help="changed settings of the inversion: off_span=0.3 tolerance=null"
-    )
+    parser.add_argument("--learn", type=json.loads, default={}, help="""changed settings of the inversion: '{"off_span": 0.3}'""")
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
     if len(options.pretrained) not in (1, len(options.seeds)):
@@ -194,14 +186,13 @@ def main() -> None:
     models = [FewShot.from_pretrained(name) for name in options.pretrained]
     of_seed = dict(zip(options.seeds, models if len(models) > 1 else models * len(options.seeds), strict=True))
     learned, expert_drives = options.concept or options.task, Expert(blind=options.blind)
-    changes = dict(options.learn)
     starts = models[0].starts(options.task, options.drives, SEED)
     others = expert_drives.draw(options.task, options.drives, EVALUATION_SEED + SEED)
     concepts: dict[Key, Composition] = {}
     told: dict[Key, Policy] = {}
     for seed, few in of_seed.items():
         shown = expert_drives.draw(learned, 5, DEMONSTRATION_SEED + seed)
-        own = told_concepts(few, learned, shown, seed, changes)
+        own = told_concepts(few, learned, shown, seed, options.learn)
         concepts |= {(name, seed): concept for name, concept in own.items()}
         told |= {(name, seed): policy for name, policy in policies(few, options.task, own, shown, starts, seed).items()}
     found: dict[str, list[dict[str, float]]] = {}
@@ -222,7 +213,7 @@ def main() -> None:
             "model": ", ".join(few.model.hash for few in models),
             "task": options.task,
             "concept": learned,
-            **({"changed": changes} if changes else {}),
+            **({"changed": options.learn} if options.learn else {}),
             "drives": options.drives,
             "veto": options.veto,
             "blind expert": options.blind,

@@ -18,6 +18,7 @@ LATER = (
     ("mode_samples", 8),
     ("tolerance", None),
     ("knots", 1),
+    ("guidance_scale", 1.0),
     ("adapter", 0),
     ("adapter_learning_rate", 1e-3),
     ("adapter_scope", "concept"),

@@ -233,6 +233,8 @@ class Inversion(nn.Module):
         empty = self._final(raw, torch.zeros_like(weights)) if auto else losses
         embeddings = self.parametrised(raw)
         kind = "learned" if self.settings.omega == "learned" else "fixed"
+        if kind == "learned":
+            weights = weights * self.settings.guidance_scale
         found = {}
         for index, name in enumerate(self.concepts):
             whole, *modes = [run for run in best.tolist() if self.runs[run].concept == index]

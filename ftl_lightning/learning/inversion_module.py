@@ -33,8 +33,8 @@ class InversionModule(Adaptation):
         pretrained: folder of the pretrained model.
         components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
         initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
-        mode_samples, modes, tolerance, knots, adapter, adapter_learning_rate, adapter_scope, loss: likewise.
-        timestep_power, seed: likewise.
+        mode_samples, modes, tolerance, knots, guidance_scale, adapter, adapter_learning_rate, adapter_scope: likewise.
+        loss, timestep_power, seed: likewise.
         training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
             omega, or 1 when weights are learned.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
@@ -60,6 +60,7 @@ class InversionModule(Adaptation):
         modes: int | Literal["each", "auto"] = 1,
         tolerance: float | None = None,
         knots: int = 1,
+        guidance_scale: float = 1.0,
         adapter: int = 0,
         adapter_learning_rate: float = 1e-3,
         adapter_scope: Literal["concept", "all"] = "concept",
@@ -93,10 +94,11 @@ class InversionModule(Adaptation):
         form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
         modes = [] if self.settings.modes in (1, "auto") else [f"modes: {self.settings.modes}"]
         knots = [f"{self.settings.knots} knots"] if self.settings.knots > 1 else []
+        scaled = self.settings.omega == "learned" and self.settings.guidance_scale != 1
+        scale = [f"guidance {self.settings.guidance_scale:g}"] if scaled else []
         adapter = [f"rank {self.settings.adapter}"] if self.settings.adapter else []
-        return ", ".join(
-            [*self.model.traits, form, *modes, *knots, *adapter, *([] if weight is None else [f"training weight {weight:g}"])]
-        )
+        training = [] if weight is None else [f"training weight {weight:g}"]
+        return ", ".join([*self.model.traits, form, *modes, *knots, *scale, *adapter, *training])
 
     def configure_model(self) -> None:
         """Create the parameters once the demonstrations are known. Does nothing the second time."""

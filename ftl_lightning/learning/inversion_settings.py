@@ -38,6 +38,8 @@ class InversionSettings:
             steps, the rate decaying to 0.
         knots: embeddings of a component at even times of the plan, between which the denoiser interpolates; 1 is the paper's form.
             For denoisers that see time, such as the temporal U-Net.
+        guidance_scale: what learned weights are multiplied by at the end; a fixed omega stays. A loss that is not zero leaves a
+            plan between what was demonstrated and what is usual; more than 1 takes it further.
         adapter: rank of a low-rank change of the denoiser in the concept's own branches (LoRA), learned beside the embeddings; 0,
             the paper's form, for none.
         adapter_learning_rate: of that.
@@ -67,6 +69,7 @@ class InversionSettings:
     modes: int | Literal["each", "auto"] = 1
     tolerance: float | None = None
     knots: int = 1
+    guidance_scale: float = 1.0
     adapter: int = 0
     adapter_learning_rate: float = 1e-3
     adapter_scope: Literal["concept", "all"] = "concept"
@@ -81,6 +84,7 @@ class InversionSettings:
         for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate", "initial_spread", "seed"):
             expect_range(f"model.{name}", getattr(self, name), 0)
         expect_range("model.initial_omega", self.initial_omega)
+        expect_range("model.guidance_scale", self.guidance_scale, 0)
         if self.omega != "learned":
             expect_range("model.omega", self.omega)
         if isinstance(self.modes, int) and self.modes < 1:

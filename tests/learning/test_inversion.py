@@ -379,6 +379,17 @@ def test_alone_a_task_is_generated_from_modes_and_composed_or_in_part_from_the_c
         assert any(torch.equal(concept.embeddings[1], row) for row in found.embeddings)
 
 
+@pytest.mark.parametrize(("omega", "factor", "told"), [("learned", 1.25, "guidance 1.25"), (1.2, 1.0, "free")])
+def test_the_guidance_scale_multiplies_learned_weights_and_no_others(tiny: Path, omega: Any, factor: float, told: str) -> None:
+    plain, scaled = (learn(tiny, omega=omega, guidance_scale=scale) for scale in (1.0, 1.25))
+    assert scaled.variant.endswith(told)
+    for name, one in plain.learned().items():
+        other = scaled.learned()[name]
+        assert torch.equal(other.weights, factor * one.weights)
+        assert torch.equal(other.embeddings, one.embeddings)
+        assert other.origin.loss == one.origin.loss  # of what was learned
+
+
 def test_the_projector_names_the_components_of_every_mode(tiny: Path) -> None:
     for modes, count in ((1, 0), (2, 2)):
         module = learn(tiny, modes=modes)
