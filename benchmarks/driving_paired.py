@@ -18,11 +18,10 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
 from ftl_lightning.learning.baselines.in_context import InContextModel
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.reporting.paired import episodes
-from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
+from ftl_lightning.seeding import DEMONSTRATION_SEED
 from ftl_lightning.tensor_file import write_text
 
 OURS = "ours"
@@ -48,14 +47,10 @@ def concept(few: FewShot, method: str, shown: Demonstrations, name: str, seed: i
 
 def arrived(few: FewShot, told: Composition, task: str, count: int, seed: int) -> dict[str, Tensor]:
     """In which episodes ``(episode,)`` the concept succeeds, and crashes, with each veto."""
-    starts, loop = few.starts(task, count, seed), DOMAIN.closed_loop
-    assert loop is not None
+    starts = few.starts(task, count, seed)
     found: dict[str, Tensor] = {}
     for name, environment in ENVIRONMENTS.items():
-        draws = [generator("cpu", seed, 1, row) for row in range(count)]
-        make = sampled_plans(few.model, [told] * count, few.tuned.sampling, draws)
-        happened = roll_out(loop.inside(environment), starts, PlanFollower(make, planner(few.model, loop), 1))
-        outcomes = DOMAIN.judge(task, happened)
+        outcomes = DOMAIN.judge(task, few.execute(told, starts, task, replan=1, environment=environment, seed=seed).rollout)
         found |= {name: outcomes["strict success"].bool(), f"{name}, crash": outcomes["crash"].bool()}
     return found
 

@@ -14,8 +14,7 @@ import torch
 from ftl_lightning import FewShot
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.foresight import BELIEF, VETOES
-from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
-from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
+from ftl_lightning.seeding import DEMONSTRATION_SEED
 from ftl_lightning.tensor_file import write_text
 
 TASK = "roundabout"
@@ -27,16 +26,13 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    few, source, loop = FewShot.from_pretrained("driving"), DOMAIN.source(None), DOMAIN.closed_loop
-    assert loop is not None
-    concept = few.learn(source.draw(TASK, 5, DEMONSTRATION_SEED), name=TASK)
+    few = FewShot.from_pretrained("driving")
+    concept = few.learn(DOMAIN.source(None).draw(TASK, 5, DEMONSTRATION_SEED), name=TASK)
     starts = few.starts(TASK, options.episodes, 0)
     found = {}
     for veto in VETOES:
-        draws = [generator("cpu", 0, row) for row in range(options.episodes)]
-        make = sampled_plans(few.model, [concept] * options.episodes, few.tuned.sampling, draws)
         begun = time.perf_counter()
-        roll_out(loop.inside("" if veto == BELIEF else f"{veto} veto"), starts, PlanFollower(make, planner(few.model, loop), 1))
+        few.execute(concept, starts, replan=1, environment="" if veto == BELIEF else f"{veto} veto")
         found[veto] = round(time.perf_counter() - begun, 1)
         print(f"{options.episodes} episodes, {veto}: {found[veto]} s", flush=True)
     if options.out:

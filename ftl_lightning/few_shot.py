@@ -344,6 +344,7 @@ class FewShot:
         goal: str = "",
         *,
         replan: int | None = None,
+        environment: str = "",
         seed: int = 0,
         **changes: Any,
     ) -> Execution:
@@ -354,15 +355,19 @@ class FewShot:
             scenes: that episodes start from ``(episode, scene)``, or initial states with scenes, such as :meth:`starts` draws.
             goal: what episodes are judged by; empty for nothing.
             replan: steps that a plan is followed before a new one is made; ``None`` for the tuned number.
+            environment: another of the domain's, such as driving's ``'step veto'``; empty for its own.
             seed: of the noise.
             changes: as in :meth:`sample`.
 
         Raises:
-            UserError: in a domain without an environment.
+            UserError: in a domain without an environment, or without one of this name.
         """
         from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, reset, roll_out, sampled_plans
 
         loop = closed_loop_of(self.domain)
+        if environment and environment not in loop.others:
+            raise UserError(f"environment: expected {' or '.join(loop.others) or 'none'}, found {environment!r}")
+        loop = loop.inside(environment)
         if goal:
             self._judging.expect_goal(goal)
         if replan is not None and replan < 1:

@@ -316,6 +316,17 @@ def test_a_concept_is_executed_in_the_domains_environment(drives: FewShot) -> No
         drives.execute(concept, starts, goal, replan=0)
     with pytest.raises(UserError, match=r"goal: expected a task of agent, such as .*, found 'fly'"):
         drives.execute(concept, starts, "fly")
+    with pytest.raises(UserError, match="environment: expected none, found 'step veto'"):
+        drives.execute(concept, starts, goal, environment="step veto")
+
+
+def test_a_concept_is_executed_in_another_environment_of_the_domain() -> None:
+    few = FewShot.from_pretrained("driving")
+    starts, concept, goal = few.starts("roundabout", 4), 2.0 * few["merge"], "roundabout"
+    own, other = (few.execute(concept, starts, goal, environment=name).rollout.observed["traffic"] for name in ("", "step veto"))
+    assert not torch.equal(own, other)
+    with pytest.raises(UserError, match="environment: expected simulation veto or step veto, found 'luck'"):
+        few.execute(concept, starts, goal, environment="luck")
 
 
 # Keeping and sharing

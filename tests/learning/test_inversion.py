@@ -93,6 +93,7 @@ def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, 
         ({"mode_samples": 0}, r"model\.mode_samples: expected 1 or more, found 0"),
         ({"modes": 0}, r"model\.modes: expected 1 or more, 'each' or 'auto', found 0"),
         ({"modes": "some"}, r"model\.modes: expected a number, 'each' or 'auto', found 'some'"),
+        ({"guidance_scale": -1.0}, r"model\.guidance_scale: expected .* found -1"),
         ({"tolerance": 1}, r"model\.tolerance: expected null or a share from 0 up to 1, found 1"),
         ({"tolerance": -0.1}, r"model\.tolerance: expected null or a share from 0 up to 1, found -0.1"),
         ({"loss": "displacement"}, r"model\.loss: expected one of epsilon, v, clean, found 'displacement'"),
@@ -408,9 +409,9 @@ def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Pa
 
     plain = of()
     assert plain["model/components"] == 2
-    assert not {"model/modes", "model/tolerance"} & plain.keys()
-    assert of(modes=1, tolerance=None) == plain
-    for changes in ({"modes": 2}, {"modes": "auto"}, {"tolerance": 0.0}, {"tolerance": 0.01}):
+    assert not {"model/modes", "model/tolerance", "model/guidance_scale"} & plain.keys()
+    assert of(modes=1, tolerance=None, guidance_scale=1.0) == plain
+    for changes in ({"modes": 2}, {"modes": "auto"}, {"tolerance": 0.0}, {"tolerance": 0.01}, {"guidance_scale": 1.25}):
         (key, value), *_ = changes.items()
         assert of(**changes) == plain | {f"model/{key}": value}
 
