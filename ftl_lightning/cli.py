@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf.errors import OmegaConfBaseException
 
-from ftl_lightning import inputs
+from ftl_lightning import inputs, trust
 from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError
 from ftl_lightning.version import __version__
@@ -52,7 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Nothing is ever unpickled, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
-        _dispatch(arguments)
+        with trust.person(arguments) as rest:
+            _dispatch(rest)
     except UserError as error:
         line = " ".join(str(error).split())
         print(f"error: {''.join(one if one.isprintable() else '?' for one in line)}", file=sys.stderr)
@@ -103,8 +104,10 @@ def _dispatch(arguments: list[str]) -> None:
         print(__version__)
     elif verb in COMMANDS:
         inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
-        from jsonargparse import auto_cli
+        from jsonargparse import auto_cli, set_parsing_settings
 
+        # These verbs take no classes.
+        set_parsing_settings(import_path_denylist=["*"], instantiate_subclass_spec_in_any=False)
         commands = importlib.import_module("ftl_lightning.commands")
         name = verb.replace("-", "_")
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
@@ -132,4 +135,8 @@ def _overview() -> str:
     verbs = TRAINER_VERBS | COMMANDS
     width = max(map(len, verbs))
     lines = [f"  {verb:<{width}}  {summary}" for verb, summary in verbs.items()]
-    return "\n".join(("usage: python -m ftl_lightning VERB [--help] [--config FILE] ...", "", *lines))
+    usage = "usage: python -m ftl_lightning VERB [--help] [--config FILE] [--trust MODULE] ..."
+    trusted = (
+        f"{trust.OPTION} MODULE lets a configuration or a model's folder ask for code of this module, in the current folder too"
+    )
+    return "\n".join((usage, "", *lines, "", trusted))

@@ -251,13 +251,11 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.concepts.explanation import explain as explained
     from ftl_lightning.learning.pretrained import find_model, load_model
-    from ftl_lightning.shipped import shipped
+    from ftl_lightning.shipped import MODELS
 
     expect_count("nearest", nearest, 1)
     learned = Concept.load(concept)
-    model = load_model(
-        pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), shipped("pretrained")))
-    )
+    model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), MODELS)))
     model.check(learned, concept)
     names = model.config.training_concepts
     print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")

@@ -93,6 +93,17 @@ def _beside(path: Path, name: str) -> Path:
     raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found}")
 
 
+def read(path: Path) -> dict[str, Any]:
+    """The own keys of one configuration file, as they stand in it.
+
+    Raises:
+        UserError: as :func:`load`.
+    """
+    found = OmegaConf.to_container(_read(path), resolve=False)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
 def _relative(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 

@@ -32,6 +32,7 @@ from ftl_lightning.ranges import expect_count
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 from ftl_lightning.shipped import pretrained_folder, shipped
 from ftl_lightning.tensor_file import atomic
+from ftl_lightning.trust import vouching
 from ftl_lightning.tuned import Tuned
 
 if TYPE_CHECKING:
@@ -87,7 +88,9 @@ class FewShot:
         self._examples: list[Demonstrations] = [] if model.examples is None else [model.examples]
 
     @classmethod
-    def from_pretrained(cls, name: str | Path, settings: str | Path | None = None, device: str = "cpu") -> Self:
+    def from_pretrained(
+        cls, name: str | Path, settings: str | Path | None = None, device: str = "cpu", domain: Domain | str | None = None
+    ) -> Self:
         """Load a model.
 
         Args:
@@ -95,14 +98,17 @@ class FewShot:
                 the Hugging Face Hub, which is the only case that needs a network.
             settings: configuration file of ``invert`` to take settings from; ``None`` for that of the model's domain.
             device: where to compute.
+            domain: of a model of your own, the domain or its name ``'package.module:DOMAIN'``, which is imported. A folder alone
+                never names code: without this, or ``settings`` that name it, its domain is one that an installed package offers.
 
         Raises:
-            UserError: naming the place, if there is no model.
+            UserError: naming the place, if there is no model, or one that asks for code.
         """
         folder = pretrained_folder(name)
         if not folder.is_dir() and str(name).count("/") == 1 and not str(name).startswith((".", "~")):
             folder = download(str(name))
-        model = load_model(folder).to(device)
+        with vouching([] if settings is None else Tuned.domains(settings)):
+            model = load_model(folder, domain).to(device)
         if settings is None:
             group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
             own = shipped(f"conf/{group}invert/{model.config.domain}.yaml")

@@ -95,7 +95,7 @@ def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
     values: dict[str, Any] = {}
     for path in configurations(arguments):
         values |= dict(_flat(load(path), ""))
-    values |= {option.replace(".init_args.", "."): value for option, value in _options(arguments)}
+    values |= {option.replace(".init_args.", "."): value for option, value in options(arguments)}
     if {"help", "print_config"} & values.keys() or "-h" in arguments:
         return
     for option, check in checks.items():
@@ -113,7 +113,7 @@ def _flat(keys: Mapping[str, Any], above: str) -> Iterator[tuple[str, Any]]:
             yield f"{above}{key}", value
 
 
-def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+def options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Every option with its value, given as ``--option=value`` or ``--option value``."""
     for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
         if argument.startswith("--"):

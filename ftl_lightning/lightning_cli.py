@@ -12,9 +12,11 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from ftl_lightning.configuration import expanded
+from ftl_lightning import trust
+from ftl_lightning.configuration import configurations, expanded, parts, read
 from ftl_lightning.errors import UserError, mistake_behind
 from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.inputs import options
 from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.trainer import Trainer
@@ -46,10 +48,24 @@ class CommandLine(LightningCLI):
 
     def instantiate_classes(self) -> None:
         """Build everything; Lightning logs the seeds of model and data as one."""
-        super().instantiate_classes()
+        with trust.vouching(self._domains()):
+            super().instantiate_classes()
         model, data = (getattr(one, "hparams", {}).get("seed") for one in (self.model, self.datamodule))
         if model is not None and data is not None and model != data:
             raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
+
+    def _domains(self) -> list[str]:
+        """The domain that the configuration names, if it does: a pretrained model's folder may ask for the same.
+
+        Raises:
+            UserError: for one of a module that neither is installed nor a person vouches for.
+        """
+        options = (self._get(self.config, "data") or {}).get("init_args") or {}
+        domain = options.get("domain")
+        if not isinstance(domain, str) or ":" not in domain:
+            return []
+        trust.expect_module(domain, "data.domain")
+        return [domain]
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
         """The trainer, with our progress bar in place of Lightning's."""
@@ -150,8 +166,32 @@ def parse(options: list[str]) -> dict[str, Any]:
     return found
 
 
+PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning", "torch", "torchmetrics")
+"""Whose classes configurations name."""
+
+
+def _expect_trusted(arguments: list[str]) -> None:
+    """Let a configuration ask for classes of installed packages alone, and of those that a person vouches for.
+
+    Raises:
+        UserError: naming file, key and module of another one.
+    """
+    packages = set(PACKAGES)
+    asked = [(str(path), read(path)) for given in configurations(arguments) for path in parts(given)]
+    for where, keys in (*asked, ("options", dict(options(arguments)))):
+        trust.expect_classes(keys, where)
+        packages |= trust.allowed(keys)
+    # Whatever else names a class, such as a value that is put together from others, is refused where it would be imported.
+    set_parsing_settings(
+        omegaconf_absolute_to_relative_paths=True,
+        instantiate_subclass_spec_in_any=False,
+        import_path_denylist=["*", *trust.NO_CODE],
+        import_path_allowlist=sorted(packages),
+    )
+
+
 def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> CommandLine:
-    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    _expect_trusted(arguments)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
     warnings.filterwarnings("ignore", message=".*module.s. in eval mode at the start of training.*")  # averaged or frozen

@@ -9,6 +9,8 @@ from pathlib import Path
 FOLDERS = ("conf", "pretrained")
 """What is shipped."""
 _PACKAGE = Path(__file__).parent
+MODELS = _PACKAGE / "pretrained"
+"""The models that ship."""
 
 
 def shipped(path: str | Path) -> Path:
@@ -30,7 +32,7 @@ def shipped(path: str | Path) -> Path:
 
 def shipped_models() -> list[str]:
     """Names of the models that ship, such as ``agent``; baselines apart."""
-    return sorted(path.parent.name for path in (_PACKAGE / "pretrained").glob("*/config.json"))
+    return sorted(path.parent.name for path in MODELS.glob("*/config.json"))
 
 
 def pretrained_folder(name: str | Path) -> Path:

@@ -7,6 +7,7 @@ from typing import Self
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.trust import is_installed, is_vouched
 
 
 @dataclass(frozen=True)
@@ -47,3 +48,18 @@ class Tuned:
             )
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
+
+    @staticmethod
+    def domains(path: str | Path) -> list[str]:
+        """The domain ``module:ATTRIBUTE`` that a configuration file names, if its module is installed or a person vouches for it.
+
+        A model's folder may ask for the same one.
+
+        Raises:
+            UserError: naming the file, if it is none.
+        """
+        from ftl_lightning.configuration import load
+
+        data = load(path).get("data") or {}
+        domain = (data.get("init_args") or {}).get("domain", "")
+        return [domain] if ":" in domain and (is_installed(domain.partition(":")[0]) or is_vouched(domain)) else []

@@ -82,7 +82,7 @@ CONFIGS: list[tuple[str, object, str]] = [
     ("kind", "bc", "config.json: key 'denoiser'"),
     ("domain", "nowhere", "domain: expected one of"),
     ("domain", {}, "key 'domain': expected a text"),
-    ("domain", "json:loads", "expected a Domain"),
+    ("domain", "json:loads", "asks for code, 'json:loads', that no installed package offers: it was not imported"),
     ("domain", "agent", "agent"),
     ("horizon", "8", "key 'horizon': expected a whole number from 0 to 1000000, found '8'"),
     ("horizon", 8.0, "key 'horizon'"),

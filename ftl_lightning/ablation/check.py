@@ -10,6 +10,7 @@ from ftl_lightning.ablation.plan import Cell
 from ftl_lightning.configuration import find
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import pretrained_folder
+from ftl_lightning.trust import expect_module
 
 if TYPE_CHECKING:
     from ftl_lightning.learning.adaptation import Adaptation
@@ -50,6 +51,8 @@ def _check(cell: Cell, made: set[str]) -> None:
         raise UserError(
             f"verb: {cell.config}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)"
         )
+    if ":" in data["domain"]:
+        expect_module(data["domain"], "data.domain")
     domain = load_domain(data["domain"])
     for key, names in (("evaluation.suites", config["evaluation"]["suites"] or ()), ("data.suite", [data["suite"]])):
         if unknown := set(names) - set(domain.concepts.suites):

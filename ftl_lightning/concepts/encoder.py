@@ -96,7 +96,7 @@ class TransformerEncoder:
 
         model = self._load()
         try:
-            tokenizer = AutoTokenizer.from_pretrained(self.name, revision=self.revision)
+            tokenizer = AutoTokenizer.from_pretrained(self.name, revision=self.revision, trust_remote_code=False)
         except (OSError, ValueError) as error:
             raise UserError(f"encoder: {self.name}: expected a tokenizer, found none ({str(error).splitlines()[0]})") from error
         tokens = tokenizer(list(texts), padding=True, return_tensors="pt")
@@ -108,10 +108,12 @@ class TransformerEncoder:
         from transformers import AutoConfig, AutoModel, T5EncoderModel
 
         try:
-            config = AutoConfig.from_pretrained(self.name, revision=self.revision)
+            config = AutoConfig.from_pretrained(self.name, revision=self.revision, trust_remote_code=False)
             kind = T5EncoderModel if config.model_type == "t5" else AutoModel
             read: Any = kind.from_pretrained  # its annotation leaves out what it returns with the option
-            model, told = read(self.name, revision=self.revision, use_safetensors=True, output_loading_info=True)
+            model, told = read(
+                self.name, revision=self.revision, use_safetensors=True, output_loading_info=True, trust_remote_code=False
+            )
         except Exception as error:  # transformers and safetensors raise many kinds for a folder that is damaged
             raise UserError(
                 f"encoder: expected a folder or a Hugging Face name of a T5 or BERT-like model with safetensors weights, found "

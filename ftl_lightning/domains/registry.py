@@ -1,11 +1,11 @@
-"""Domains by name: those that installed packages offer, and any that can be imported."""
+"""Domains by name: those that installed packages offer, and any that a person names by its module."""
 
 import functools
 import importlib
-from importlib.metadata import entry_points
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.trust import OPTION, entry_points, is_vouched
 
 GROUP = "ftl_lightning.domains"
 """Entry-point group in which a package offers domains: ``name = package.module:DOMAIN``."""
@@ -13,20 +13,27 @@ GROUP = "ftl_lightning.domains"
 
 def domain_names() -> tuple[str, ...]:
     """Names of the domains that installed packages offer, in alphabetical order."""
-    return tuple(sorted({point.name for point in entry_points(group=GROUP)}))
+    return tuple(sorted(_offered()))
+
+
+def _offered() -> dict[str, str]:
+    """Where the domains are that installed packages offer, ``module:ATTRIBUTE`` by name."""
+    return {point.name: point.value for point in reversed(entry_points(GROUP))}
 
 
 @functools.cache
 def load_domain(name: str) -> Domain:
     """A domain by the name under which a package offers it, or as ``package.module:DOMAIN``.
 
+    The module is imported. For a name that stands in a file, :func:`domain_of_file` is to be asked.
+
     Raises:
         UserError: if there is none of that name, or it is something else.
     """
-    reference = next((point.value for point in entry_points(group=GROUP) if point.name == name), name)
+    reference = _offered().get(name, name)
     module, colon, attribute = reference.partition(":")
     if not colon:
-        raise UserError(f"domain: expected one of {', '.join(domain_names())}, or package.module:DOMAIN, found {name!r}")
+        raise _unknown(name)
     try:
         found = getattr(importlib.import_module(module), attribute)
     except UserError:
@@ -39,6 +46,34 @@ def load_domain(name: str) -> Domain:
     if not isinstance(found, Domain):
         raise UserError(f"domain {name!r}: expected a Domain, found {type(found).__name__}")
     return found
+
+
+def _unknown(name: str) -> UserError:
+    expected = f"one of {', '.join(domain_names())}, or package.module:DOMAIN"
+    return UserError(f"domain: expected {expected}, found {short(name)!r}")
+
+
+def is_known(name: str) -> bool:
+    """Whether an installed package offers a domain, by its name or as ``module:ATTRIBUTE``, or a person vouches for it."""
+    offered = _offered()
+    return name in offered or name in offered.values() or is_vouched(name)
+
+
+def domain_of_file(name: str) -> Domain:
+    """The domain that a file asks for: one that an installed package offers, or that a person names beside the file.
+
+    Raises:
+        UserError: for another one; nothing is imported.
+    """
+    if is_known(name):
+        return load_domain(name)
+    module, colon, _ = name.partition(":")
+    if not colon:
+        raise _unknown(name)
+    raise UserError(
+        f"key 'domain': asks for code, {short(name)!r}, that no installed package offers: it was not imported; if you trust it, "
+        f"give {OPTION} {short(module)} (in Python domain={short(name)!r})"
+    )
 
 
 def recorded_name(name: str) -> str:

@@ -13,7 +13,7 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.from_file import OWN, own_domain
-from ftl_lightning.domains.registry import recorded_name
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -67,7 +67,7 @@ class Adaptation(pl.LightningModule, ABC):
         if not isinstance(data, InversionData):
             raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")
         mine = self.model.config.domain
-        if data.domain_name != (mine if mine == OWN else recorded_name(mine)):
+        if data.domain_name != mine and (OWN in (mine, data.domain_name) or load_domain(data.domain_name) is not self.model.domain):
             raise UserError(f"data.domain: expected {mine!r} (the pretrained model's), found {data.domain_name!r}")
         self.concepts = data.concepts
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):

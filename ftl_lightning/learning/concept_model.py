@@ -20,9 +20,9 @@ from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, own_domain
-from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.learning.model_config import CONFIG, VERSION, ModelConfig, expect_domain, find_view, read_config
+from ftl_lightning.domains.registry import domain_of_file
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.learning.model_config import CONFIG, VERSION, ModelConfig, expect_domain, find_view, read_config, upgrade
 from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weights
 from ftl_lightning.schema import built
 from ftl_lightning.tensor_file import (
@@ -86,6 +86,8 @@ class ConceptModel(nn.Module, ABC):
         self.view = find_view(domain, config.view)
         if config.perturb and (self.view is None or self.view.perturb is None):
             raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
+        if config.image_encoder and not config.image_dim:
+            raise UserError(f"image_encoder: expected none, as no image is observed, found {shown(dict(config.image_encoder))}")
         self.images = ImageEncoders(config.observed, config.image_encoder) if config.image_dim else None
         if self.images is not None and self.images.size != config.image_dim:
             raise UserError(f"image_dim: expected {self.images.size} (what is read of the images), found {config.image_dim}")
@@ -300,18 +302,28 @@ class ConceptModel(nn.Module, ABC):
         write_text(folder / CONFIG, json.dumps(header | asdict(self.config), indent=2) + "\n")
 
     @classmethod
-    def load(cls, folder: str | Path) -> Self:
+    def load(cls, folder: str | Path, domain: Domain | None = None) -> Self:
         """Read a folder written by :meth:`save`; the model is frozen and in evaluation mode.
+
+        Args:
+            folder: to read.
+            domain: in place of the one that the folder names; ``None`` for that, if an installed package offers it or a person
+                names it beside the folder.
 
         Raises:
             UserError: naming the file, if it is missing, damaged, or the two files do not belong together.
         """
         path = Path(folder) / CONFIG
         content = read_config(folder)
-        expected_hash = content.pop("hash")
         with about(path):
             if (found := content.pop("kind")) != cls.kind:
                 raise UserError(f"key 'kind': expected {cls.kind!r}, found {found!r}, the model of another method")
+            if domain is None and content["domain"] != OWN:
+                domain = domain_of_file(content["domain"])
+            if domain is not None:
+                upgrade(content, domain)
+            del content["format"]
+            expected_hash = content.pop("hash")
             config = built(cls.Config, content, "")
         weights = Path(folder) / WEIGHTS
         tensors, _ = load_tensors(weights, KIND)
@@ -321,11 +333,9 @@ class ConceptModel(nn.Module, ABC):
             )
         examples = Demonstrations.load(Path(folder) / EXAMPLES) if config.domain == OWN else None
         with about(path):
-            domain = (
-                load_domain(config.domain)
-                if examples is None
-                else own_domain(examples, config.training_concepts, config.horizon, config.metrics)
-            )
+            if examples is not None:
+                domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
+            assert domain is not None
             expect_domain(config, domain)
             # First on paper: a file of a few bytes can name sizes that no memory holds.
             with torch.device("meta"), at_most(sum(value.numel() for value in tensors.values())):

@@ -5,11 +5,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.domains.domain import Domain, View
-from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST, expect_range
 from ftl_lightning.schema import expect_type, read_json
 from ftl_lightning.tensor_file import FORMAT
@@ -74,7 +73,7 @@ def find_view(domain: Domain, name: str) -> View | None:
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:
-    """What the configuration of a pretrained model says, with its ``hash`` and ``kind``.
+    """What the configuration of a pretrained model says, with its ``format``, ``hash`` and ``kind``: data; nothing is made of it.
 
     Raises:
         UserError: naming the file, if it is missing or something else.
@@ -85,7 +84,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit") from error
     with about(path):
-        version = found.pop("format", None) if isinstance(found, dict) else None
+        version = found.get("format") if isinstance(found, dict) else None
         if type(version) is not int or version not in (FORMAT, VERSION):
             raise UserError(
                 f"expected the configuration of a pretrained model, found something else (its format is not {FORMAT} or {VERSION})"
@@ -93,25 +92,25 @@ def read_config(folder: str | Path) -> dict[str, Any]:
         content: dict[str, Any] = {"kind": DIFFUSION} | found
         for key in ("kind", "hash", "domain"):
             expect_type(content.get(key), str, key)
-        if version == FORMAT:
-            _upgrade(content)
         return content
 
 
-def _upgrade(content: dict[str, Any]) -> None:
-    """Bring a configuration of form 1 to form 2, in place: features are those of its domain and view."""
+def upgrade(content: dict[str, Any], domain: Domain) -> None:
+    """Bring a configuration of form 1 to form 2, in place: features are those of its domain and view.
+
+    Args:
+        content: of :func:`read_config`, of either form.
+        domain: that it names.
+    """
+    if content["format"] == VERSION:
+        return
     size = content.pop("initial_state_dim", 0)
     for key in ("entities", "looks", "state_columns"):
         content.pop(key, None)
-    features = _features(content["domain"], expect_type(content.get("view", ""), str, "view")) if size else {}
-    content["observed"] = {name: asdict(feature) for name, feature in features.items()}
-
-
-def _features(domain: str, view: str) -> Mapping[str, Feature]:
-    """What is observed in a domain through one of its views."""
-    found = load_domain(domain)
-    seen = find_view(found, view)
-    return found.observed if seen is None else seen.features
+    view = find_view(domain, expect_type(content.get("view", ""), str, "view"))
+    features = domain.observed if view is None else view.features
+    content["observed"] = {name: asdict(feature) for name, feature in features.items()} if size else {}
+    content["format"] = VERSION
 
 
 def expect_domain(config: ModelConfig, domain: Domain) -> None:
@@ -122,6 +121,8 @@ def expect_domain(config: ModelConfig, domain: Domain) -> None:
     """
     if config.state_dim != (columns := len(domain.plans.columns)):
         raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
+    if config.metrics and config.domain != OWN:
+        raise UserError(f"key 'metrics': expected none, as domain {domain.name} has its own, found {shown(dict(config.metrics))}")
     view = find_view(domain, config.view)
     expected = domain.observed if view is None else view.features
     for name, feature in config.observed.items():

@@ -4,6 +4,9 @@ import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.domains.registry import is_known, load_domain
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import CONFIG, read_config
@@ -25,11 +28,13 @@ def model_class(kind: str) -> type[ConceptModel]:
     return found
 
 
-def load_model(folder: str | Path) -> ConceptModel:
+def load_model(folder: str | Path, domain: Domain | str | None = None) -> ConceptModel:
     """Read a model; it is frozen.
 
     Args:
         folder: that :meth:`~ftl_lightning.learning.concept_model.ConceptModel.save` wrote, or the name of one that ships.
+        domain: whose behaviour it is, in place of what the folder says: a name, ``'package.module:DOMAIN'``, or the domain itself.
+            A folder alone gets no domain but those that installed packages offer, see :mod:`ftl_lightning.trust`.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, of an unknown method, or its files do not belong together.
@@ -37,21 +42,26 @@ def load_model(folder: str | Path) -> ConceptModel:
     folder = pretrained_folder(folder)
     if (kind := read_config(folder)["kind"]) not in MODELS:
         raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {short(kind)!r}")
-    return model_class(kind).load(folder)
+    return model_class(kind).load(folder, load_domain(domain) if isinstance(domain, str) else domain)
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:
-    """The folder of the model with this hash below one of some places.
+    """The folder of the model with this hash below one of some places; of several, one whose domain is known.
+
+    The configurations of all folders there are read as data; nothing that they name is imported.
 
     Raises:
         UserError: if there is none.
     """
-    for place in places:
-        for path in sorted(place.rglob(CONFIG)):
-            try:
-                if read_config(path.parent)["hash"] == model_hash:
-                    return path.parent
-            except UserError:  # the configuration of something else
-                continue
-    told = ", ".join(map(str, places))
-    raise UserError(f"pretrained: expected the model with the hash {model_hash} below {told}, found none; name its folder")
+    matches = []
+    for path in (path for place in places for path in sorted(place.rglob(CONFIG))):
+        try:
+            content = read_config(path.parent)
+        except UserError:  # the configuration of something else
+            continue
+        if content["hash"] == model_hash:
+            matches.append((path.parent, content["domain"]))
+    if not matches:
+        told = ", ".join(map(str, places))
+        raise UserError(f"pretrained: expected the model with the hash {model_hash} below {told}, found none; name its folder")
+    return next((folder for folder, domain in matches if domain == OWN or is_known(domain)), matches[0][0])

@@ -1,15 +1,18 @@
 """What reports show of a domain: the only place of the reports that knows what a domain is made of."""
 
+import re
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
 import pandas as pd
 
 from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
+from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.paper import OURS, Published
-from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.judged import LOST, WON
 
 TRAINING, PAPER = "training", "paper"
@@ -17,9 +20,19 @@ TRAINING, PAPER = "training", "paper"
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
-    """The domain that results are about; of one that is not installed, or a user's own data, what the rows tell of it."""
+    """The domain that results are about; of one that is not installed, or a user's own data, what the rows tell of it.
+
+    Raises:
+        UserError: for a name that no folder of a report can have.
+    """
+    if not re.fullmatch(r"\w[\w .+-]{0,99}", name):
+        raise UserError(
+            f"results: column 'domain': expected a name of letters, digits and - . +, found {shown(name)}; mend the row"
+        )
+    if name != OWN and not is_known(name):
+        print(f"domain {name!r} is not installed: its tables are made from the results alone", file=sys.stderr)
     try:
-        return load_domain(name)
+        return domain_of_file(name)
     except UserError:
         own = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
         metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(own) if metric not in (NOVELTY, COVERAGE)}

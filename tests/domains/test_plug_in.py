@@ -88,7 +88,10 @@ def test_a_domain_that_is_not_installed_is_used_by_its_module() -> None:
     folder = learn(run, "--data.domain=ftl_strokes:DOMAIN")
     # By this name, and no other, the domain is found again.
     assert json.loads((folder / "config.json").read_text())["domain"] == "ftl_strokes:DOMAIN"
-    run("sample", "--pretrained", str(folder), "--compose=arc upwards", "--count=2", "--steps=3", "--sampler=dpm_solver")
+    sample = ["sample", "--pretrained", str(folder), "--compose=arc upwards", "--count=2", "--steps=3", "--sampler=dpm_solver"]
+    assert "give --trust ftl_strokes" in run(*sample, code=2)  # a folder names no code: a person does
+    run(*sample, "--trust=ftl_strokes")
+    run(*sample, f"--settings={EXAMPLE / 'strokes_invert.yaml'}", "--trust=ftl_strokes")
     told = run("generate", "strokes", code=2)
     assert (
         "domain: expected one of agent, driving, mocap, object_rearrangement, tabletop, or package.module:DOMAIN, found 'strokes'"
