@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import re
 import sys
 from argparse import ArgumentError
 from collections.abc import Sequence
@@ -12,8 +11,9 @@ from typing import Any
 from omegaconf.errors import OmegaConfBaseException
 
 from ftl_lightning import inputs, trust
-from ftl_lightning.configuration import configurations, expanded, parts
+from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError
+from ftl_lightning.parse_error import one_line
 from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: configuration: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
     except ArgumentError as error:
-        print(f"error: {_one_line(str(error), arguments)}", file=sys.stderr)
+        print(f"error: {one_line(str(error), arguments)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return _interrupted()
@@ -76,24 +76,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _interrupted() -> int:
     print("interrupted: what was written before is whole", file=sys.stderr)
     return 130
-
-
-def _one_line(message: str, arguments: list[str]) -> str:
-    """What jsonargparse tells in many lines, in one, with the configuration file that holds the mistaken key."""
-    noise = ("Does not validate", "Subtypes:", "Errors:", "Expected a <class 'NoneType'>", "Given value")
-    lines = [line.strip(" -") for line in message.splitlines()]
-    told = " ".join(line for line in lines if line and not line.startswith(noise))
-    named = {key.split(".")[-1] for key in re.findall(r"""['"]([\w.]+)['"]""", told)} - _EVERYWHERE
-    options = {argument.lstrip("-").split("=")[0].split(".")[-1] for argument in arguments}
-    if not named & options:
-        for path in (part for given in configurations(arguments) for part in reversed(parts(given))):
-            if named & set(re.findall(r"([\w.]+)\s*:", path.read_text(encoding="utf-8", errors="replace"))):
-                return f"{path}: {told}"
-    return f"{told}; see --help"
-
-
-_EVERYWHERE = {"model", "data", "trainer", "evaluation", "stages", "init_args", "class_path"}
-"""Keys that every configuration file has; they do not tell which file a mistake is in."""
 
 
 def _dispatch(arguments: list[str]) -> None:

@@ -3,6 +3,8 @@
 import itertools
 import logging
 import warnings
+from argparse import ArgumentError
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ from jsonargparse import Namespace, set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from omegaconf import OmegaConf
 
 from ftl_lightning import trust
 from ftl_lightning.configuration import configurations, expanded, parts, read
-from ftl_lightning.errors import UserError, mistake_behind
+from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.inputs import options
 from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
@@ -42,9 +45,23 @@ class CommandLine(LightningCLI):
         """Parse them, and refuse a seed that numpy does not take."""
         super().parse_arguments(parser, args)
         verb = self.config.get("subcommand")
+        self._expect_keys(self.config[verb] if verb else self.config, args)
         seed = (self.config[verb] if verb else self.config).get("seed_everything")
         if isinstance(seed, int) and not isinstance(seed, bool):
             expect_range("seed_everything", seed, 0, 2**32 - 1)
+
+    @staticmethod
+    def _expect_keys(known: Namespace, arguments: Sequence[str]) -> None:
+        """Refuse what jsonargparse overlooks: an unknown key of a configuration without anything below it.
+
+        Raises:
+            ArgumentError: naming the key.
+        """
+        for option, text in options(arguments):
+            keys = OmegaConf.to_container(OmegaConf.create(text)) if option == "config" and ":" in text else {}
+            for key in keys if isinstance(keys, dict) else ():
+                if key not in known.as_dict():
+                    raise ArgumentError(None, f"Group 'configuration' does not accept option '{short(str(key))}'")
 
     def instantiate_classes(self) -> None:
         """Build everything; Lightning logs the seeds of model and data as one."""

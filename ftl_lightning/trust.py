@@ -173,8 +173,8 @@ def expect_module(reference: str, key: str) -> None:
     module = reference.partition(":")[0]
     if not is_installed(module) and not is_vouched(reference):
         raise UserError(
-            f"key {short(key)!r}: expected a module that is installed, found {short(module)!r}, which was not imported; "
-            f"read it and this file, then allow it with {OPTION} {short(module)}"
+            f"key {short(key)!r}: expected an installed module, found {short(module)!r}, which was not imported; install its "
+            f"package, or if it is in the current folder and you trust it, add {OPTION} {short(module)}"
         )
 
 
