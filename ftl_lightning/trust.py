@@ -27,6 +27,7 @@ _CLASS = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)+")
 _INLINE = re.compile(r"\b(class_path|domain)[\"']?\s*:\s*[\"']?([\w.:]+)")
 _CLASSES = ("class_path", "model", "data", "callbacks", "logger", "strategy", "plugins", "profiler", "optimizer", "lr_scheduler")
 """Ends of options that name classes."""
+_SAFE_PATH = "PYTHONSAFEPATH"
 _POSITIONAL = ("generate", "encode", "prepare", "study")
 """Verbs whose first argument is a domain."""
 _vouched: contextvars.ContextVar[frozenset[str]] = contextvars.ContextVar("vouched", default=frozenset())
@@ -103,8 +104,9 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
     """
     names, rest = _trusted(arguments)
     names |= _named(rest)
-    before = list(sys.path)
+    before, safe = list(sys.path), os.environ.get(_SAFE_PATH)
     sys.path[:] = search_path()
+    os.environ[_SAFE_PATH] = "1"  # of worker processes, which are started with the current folder on their path
     if any(not is_installed(name.partition(":")[0]) for name in names):
         sys.path.append(_appended())
     try:
@@ -112,6 +114,10 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
             yield rest
     finally:
         sys.path[:] = before
+        if safe is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = safe
 
 
 def _trusted(arguments: Sequence[str]) -> tuple[set[str], list[str]]:

@@ -284,9 +284,19 @@ def test_a_module_named_as_one_of_a_library_s_does_not_run_in_its_place() -> Non
     assert not ran()
 
 
+def test_worker_processes_do_not_look_in_the_current_folder() -> None:
+    for name in ("multiprocessing", "pickle", "torch", "highway_env"):
+        Path(f"{name}.py").write_text(SHADOW)
+    options = ["--task=merge", "--count=2", "--workers=2", "--out=d.safetensors"]
+    done = program(sys.executable, "-m", "ftl_lightning", "generate", "driving", *options)
+    assert done.returncode == 0, done.stderr
+    assert not ran()
+
+
 # Configurations
 
 
+CALLED = "lightning.pytorch.callbacks.LambdaCallback"
 CONFIGURED = [
     ("trainer: {callbacks: [{class_path: evil.Called}]}", "trainer.callbacks[0].class_path"),
     ("trainer: {callbacks: {class_path: inside.evil.Called}}", "trainer.callbacks.class_path"),
@@ -307,6 +317,8 @@ CONFIGURED = [
     ("x: evil.Called\ntrainer: {callbacks: [{class_path: '${x}'}]}", "x"),
     ("model: {init_args: {denoiser_args: {hidden_dim: {class_path: evil.Called}}}}", "class_path"),
     ("model: {init_args: {denoiser_args: {hidden_dim: {class_path: collections.Counter}}}}", "hidden_dim"),
+    (f"trainer: {{callbacks: [{{class_path: {CALLED}, init_args: {{on_fit_start: evil.make}}}}]}}", "evil"),
+    (f"trainer: {{callbacks: [{{class_path: {CALLED}, init_args: {{on_fit_start: os.system}}}}]}}", "os"),
     ("trainer: {callbacks: [{class_path: os.system}]}", "os"),
     ("trainer: {callbacks: [{class_path: subprocess.Popen, init_args: {args: [touch, ran]}}]}", "subprocess"),
 ]
