@@ -12,8 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ftl_lightning import inputs, trust
 from ftl_lightning.configuration import expanded
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, mistake_of_machine
 from ftl_lightning.parse_error import one_line
+from ftl_lightning.printing import any_terminal
 from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
@@ -49,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0; 2 for a mistake of the user's, or 130 where the user stopped it, told in one line on standard error.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    any_terminal()
     # Nothing is ever unpickled, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
@@ -66,6 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return _interrupted()
+    except (OSError, MemoryError, RuntimeError, ValueError) as error:
+        if (told := mistake_of_machine(error)) is None:
+            raise
+        print(f"error: {told}", file=sys.stderr)
+        return 2
     except SystemExit as stop:  # after --help and --print_config
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning's way
             return _interrupted()
@@ -86,10 +93,9 @@ def _dispatch(arguments: list[str]) -> None:
         print(__version__)
     elif verb in COMMANDS:
         inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
-        from jsonargparse import auto_cli, set_parsing_settings
+        from jsonargparse import auto_cli
 
-        # These verbs take no classes.
-        set_parsing_settings(import_path_denylist=["*"], instantiate_subclass_spec_in_any=False)
+        trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs take no other class
         commands = importlib.import_module("ftl_lightning.commands")
         name = verb.replace("-", "_")
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)

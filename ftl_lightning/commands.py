@@ -344,15 +344,12 @@ class StudyOptions:
 def study(options: StudyOptions) -> None:
     """Make the page and its key as the options say."""
     from ftl_lightning.domains.registry import load_domain
-    from ftl_lightning.errors import UserError
+    from ftl_lightning.limits import read_text
     from ftl_lightning.study.films import read_films
     from ftl_lightning.study.page import make_study
     from ftl_lightning.study.questions import ask
 
-    try:
-        words = Path(options.consent).read_text(encoding="utf-8") if options.consent else ""
-    except (OSError, ValueError) as error:
-        raise UserError(f"consent: expected a text file, found {options.consent} ({error})") from error
+    words = read_text(options.consent, "text") if options.consent else ""
     domain = load_domain(options.domain)
     films = read_films(Path(options.films), domain, options.scenarios, options.seed)
     made = make_study(domain, ask(films, options.repeats, options.still, options.seed), Path(options.out), options.title, words)

@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ftl_lightning.errors import UserError, short
+from ftl_lightning.limits import expect_readable
 from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
@@ -109,9 +110,8 @@ def _relative(path: Path) -> Path:
 
 
 def _read(path: Path) -> DictConfig:
+    expect_readable(path, "configuration", LONGEST)
     try:
-        if (size := path.stat().st_size) > LONGEST:
-            raise ValueError(f"{size} bytes, more than {LONGEST}")
         keys = OmegaConf.load(path)
     except (
         OSError,

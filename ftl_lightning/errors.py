@@ -40,7 +40,8 @@ def about(where: str | Path) -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        raise UserError(f"{where}: {short(str(error), max(LONGEST - len(str(where)) - 20, 150))}") from error.__cause__
+        told = str(error).removeprefix(f"{where}: ")
+        raise UserError(f"{where}: {short(told, max(LONGEST - len(str(where)) - 20, 150))}") from error.__cause__
 
 
 def mistake_behind(error: BaseException | None) -> UserError | None:
@@ -48,3 +49,33 @@ def mistake_behind(error: BaseException | None) -> UserError | None:
     while error is not None and not isinstance(error, UserError):
         error = error.__cause__ or error.__context__
     return error
+
+
+def mistake_of_machine(error: BaseException) -> str | None:
+    """What a user can mend of a machine's refusal, in one line: a file that cannot be read or written, or memory that is not there.
+
+    Returns:
+        ``None`` for any other exception.
+    """
+    if isinstance(error, OSError):
+        where = short(str(error.filename or "a file"), 150)
+        return f"{where}: {error.strerror or short(str(error))}; choose another place"
+    text = str(error)
+    if isinstance(error, MemoryError) or any(words in text for words in _NO_MEMORY):
+        return (
+            f"memory: this takes more than the machine has ({short(text, 100) or 'none is left'}); lower data.batch_size, "
+            "model.samples, evaluation.samples or count"
+        )
+    if isinstance(error, UnicodeEncodeError) or "null byte" in text or "null character" in text:
+        return f"name of a file: expected letters that a file system takes, found others ({short(ascii(text), 100)})"
+    return None
+
+
+_NO_MEMORY = (
+    "can't allocate memory",
+    "not enough memory",
+    "out of memory",
+    "Unable to allocate",
+    "Storage size calculation overflowed",
+)
+"""How torch and numpy say it."""

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from ftl_lightning.configuration import configurations, load
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about
+from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.shipped import pretrained_folder, shipped_models
-from ftl_lightning.targets import expect_file, expect_folder
+from ftl_lightning.targets import expect_writable_file, expect_writable_folder
 
 Check = Callable[[str], None]
 """Raises a :class:`UserError` for a path where nothing is that could be meant."""
@@ -24,8 +25,10 @@ def _model(path: str) -> None:
 
 
 def _checkpoint(path: str) -> None:
-    if path != "last" and not Path(path).is_file():
-        raise UserError(f"ckpt_path: expected a checkpoint file or 'last', found {path!r}, which does not exist")
+    if path == "last":
+        return
+    with about("ckpt_path"):
+        expect_readable(path, "checkpoint")
 
 
 def _demonstrations(path: str) -> None:
@@ -37,15 +40,14 @@ MINARI = re.compile(r"[\w./-]+-v\d+")
 """How Minari names a data set."""
 
 
-def _file(kind: str) -> Check:
+def _file(kind: str, most: int | None = None) -> Check:
     def check(path: str) -> None:
-        if not Path(path).is_file():
-            raise UserError(f"{path}: expected a {kind} file, found {'a folder' if Path(path).is_dir() else 'nothing'}")
+        expect_readable(path, kind, most)
 
     return check
 
 
-def _written(key: str, expect: Callable[[str, str], None] = expect_file) -> Check:
+def _written(key: str, expect: Callable[[str, str], None] = expect_writable_file) -> Check:
     def check(path: str) -> None:
         if not path.startswith("minari:"):
             expect(path, key)
@@ -55,25 +57,36 @@ def _written(key: str, expect: Callable[[str, str], None] = expect_file) -> Chec
     return check
 
 
+def _added(key: str) -> Check:
+    """Of results, which rows are added to."""
+
+    def check(path: str) -> None:
+        _written(key)(path)
+        if Path(path).exists():
+            expect_readable(path, "results", MOST_TEXT)
+
+    return check
+
+
 TRAINER: Mapping[str, Check] = {
     "model.pretrained": _model,
     "data.demonstrations": _demonstrations,
     "ckpt_path": _checkpoint,
-    "model.output": _written("model.output", expect_folder),
-    "evaluation.results": _written("evaluation.results"),
+    "model.output": _written("model.output", expect_writable_folder),
+    "evaluation.results": _added("evaluation.results"),
 }
 """Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
 _COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _file("demonstrations")}
 _OUT: Mapping[str, Check] = {"out": _written("out")}
-_FOLDER: Mapping[str, Check] = {"out": _written("out", expect_folder)}
+_FOLDER: Mapping[str, Check] = {"out": _written("out", expect_writable_folder)}
 _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
     "encode": _OUT,
     "sample": {**_OUT, "figure": _written("figure"), "animation": _written("animation")},
-    "ablate": {"results": _written("results")},
-    "report": {**_FOLDER, "readme": _file("Markdown")},
+    "ablate": {"results": _added("results")},
+    "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT)},
     "prepare": _FOLDER,
-    "study": _FOLDER,
+    "study": {**_FOLDER, "consent": _file("text", MOST_TEXT)},
 }
 
 

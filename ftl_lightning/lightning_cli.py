@@ -1,6 +1,5 @@
 """The verbs that need a trainer: Lightning's command line with ``invert`` added."""
 
-import itertools
 import logging
 import warnings
 from argparse import ArgumentError
@@ -15,7 +14,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from omegaconf import OmegaConf
 
-from ftl_lightning import trust
+from ftl_lightning import log_folder, trust
 from ftl_lightning.configuration import configurations, expanded, parts, read
 from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
@@ -93,12 +92,20 @@ class CommandLine(LightningCLI):
         return super().instantiate_trainer(**kwargs, callbacks=callbacks)
 
     def before_instantiate_classes(self) -> None:
-        """An inversion gets a log folder of its own: ``invert``, then ``invert_1`` and so on."""
-        if self._verb == "invert" and not self._get(self.config, "ckpt_path"):  # else it goes on where it was
-            logger = self._get(self.config, "trainer").get("logger")
-            options = logger.get("init_args") if isinstance(logger, Namespace) else None
-            if options and isinstance(options.get("version"), str) and {"save_dir", "name"} <= set(options.keys()):
-                options["version"] = unused(Path(options["save_dir"]) / options["name"], options["version"])
+        """Whoever learns gets a log folder that no other run has: an inversion a new one, ``invert``, then ``invert_1`` and so on.
+
+        A pretraining takes that of an earlier one, unless it goes on at the same time. Whatever goes on from a checkpoint takes the
+        folder that is named.
+        """
+        logger = self._get(self.config, "trainer").get("logger")
+        options = logger.get("init_args") if isinstance(logger, Namespace) else None
+        if not options or not isinstance(options.get("version"), str) or not {"save_dir", "name"} <= set(options.keys()):
+            return
+        folder, name = Path(options["save_dir"]) / (options["name"] or ""), options["version"]
+        if self._get(self.config, "ckpt_path") and self._verb in ("fit", "invert"):
+            log_folder.hold(folder / name)
+        elif self._verb in ("fit", "invert"):
+            options["version"] = log_folder.claim(folder, name, new=self._verb == "invert")
 
     @property
     def _verb(self) -> str:
@@ -140,8 +147,6 @@ class CommandLine(LightningCLI):
         # Here the configuration rules, and a checkpoint of another class is refused.
         path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
         if path and path != "last":
-            if not Path(path).is_file():
-                raise UserError(f"ckpt_path: expected a checkpoint file or 'last', found {path!r}, which does not exist")
             read_checkpoint(path)
 
 
@@ -151,10 +156,10 @@ class _Inversion(CommandLine):
     _verb = "invert"
 
 
-def unused(folder: Path, name: str) -> str:
-    """The name, or with the smallest number after it, that nothing in a folder has: ``invert``, ``invert_1``, ``invert_2``."""
-    numbered = (f"{name}_{number}" if number else name for number in itertools.count())
-    return next(free for free in numbered if not (folder / free).exists())
+class _Fit(CommandLine):
+    """The same for a pretraining."""
+
+    _verb = "fit"
 
 
 class _Parser(CommandLine):
@@ -169,12 +174,13 @@ class _Parser(CommandLine):
 
 def run(arguments: list[str]) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
-    _command_line(CommandLine, arguments, run=True)
+    with log_folder.run():
+        _command_line(CommandLine, arguments, run=True)
 
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
-    return _command_line(_Inversion if verb == "invert" else CommandLine, options, run=False)
+    return _command_line(_Inversion if verb == "invert" else _Fit, options, run=False)
 
 
 def parse(options: list[str]) -> dict[str, Any]:
@@ -198,13 +204,8 @@ def _expect_trusted(arguments: list[str]) -> None:
     for where, keys in (*asked, ("options", dict(options(arguments)))):
         trust.expect_classes(keys, where)
         packages |= trust.allowed(keys)
-    # Whatever else names a class, such as a value that is put together from others, is refused where it would be imported.
-    set_parsing_settings(
-        omegaconf_absolute_to_relative_paths=True,
-        instantiate_subclass_spec_in_any=False,
-        import_path_denylist=["*", *trust.NO_CODE],
-        import_path_allowlist=sorted(packages),
-    )
+    trust.allow_classes(packages)
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
 
 
 def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> CommandLine:

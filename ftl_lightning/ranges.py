@@ -6,6 +6,12 @@ from ftl_lightning.errors import UserError, shown
 
 LARGEST = 1_000_000
 """Of a whole number that a user gives: a size or a number of things."""
+MOST_TOGETHER = 100_000
+"""Things that a network works on in one batch, or that are learned together."""
+LARGEST_STEP = 10**9
+"""Of the steps of a run."""
+LARGEST_FACTOR = 1e6
+"""Of weights, temperatures and powers: more says no more, and float32 runs out of digits."""
 
 
 def expect_range(key: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
@@ -32,4 +38,10 @@ def expect_range(key: str, value: float, least: float = -math.inf, most: float =
 def expect_count(key: str, value: int, least: int, most: int = LARGEST) -> None:
     """The same of a number of things, whose largest is told to those alone who ask for more."""
     expect_range(key, value, least)
+    expect_range(key, value, least, most)
+
+
+def expect_factor(key: str, value: float, least: float = -LARGEST_FACTOR, most: float = LARGEST_FACTOR) -> None:
+    """The same of a weight, a temperature or another factor."""
+    expect_range(key, value, -math.inf if least == -LARGEST_FACTOR else least)
     expect_range(key, value, least, most)

@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.ranges import LARGEST
 
 FLOAT32 = 3.4e38
 """Of a number with a point."""
 DEEPEST = 40
 """Lists and mappings within one another."""
-LONGEST_TEXT = 32 * 2**20
-"""Bytes of a text file that is read."""
 _WORDS: Mapping[object, str] = {str: "a text", bool: "true or false", float: "a finite number (float32)"}
 _LISTS = (tuple, list, collections.abc.Sequence)
 
@@ -31,12 +30,11 @@ def read_json(path: Path, kind: str = "JSON") -> Any:
     """What a JSON file says.
 
     Raises:
-        UserError: naming it, as :func:`parse_json`; also where it is too long.
+        UserError: naming it, as :func:`parse_json`; also where there is none, or a device, a pipe, or a file that is too long.
         OSError: if it cannot be read.
     """
+    expect_readable(path, kind.removeprefix("a ").removesuffix(" file"), MOST_TEXT)
     with about(path):
-        if (size := path.stat().st_size) > LONGEST_TEXT:
-            raise UserError(f"expected at most {LONGEST_TEXT} bytes of JSON, found {size}")
         return parse_json(path.read_bytes(), kind)
 
 

@@ -1,11 +1,12 @@
 """Files: written whole or not at all, read without unpickling anything."""
 
+import fcntl
 import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.limits import MOST_HEADER, MOST_TENSORS, expect_readable
 from ftl_lightning.schema import parse_json
 from ftl_lightning.targets import expect_file
 
@@ -32,7 +34,8 @@ def cache_folder() -> Path:
 def atomic(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name in the same folder, renamed to ``path`` when the block ends well and removed when it does not.
 
-    A symbolic link stays one: the file that it leads to is replaced. Temporary names are hidden ones (see :func:`visible`).
+    A symbolic link stays one: the file that it leads to is replaced. Temporary names are hidden ones (see :func:`visible`); those
+    of the same file that a killed process left behind are removed first.
 
     Raises:
         UserError: where the folder cannot be written or the disk is full, or ``path`` is there and no file.
@@ -40,14 +43,14 @@ def atomic(path: str | Path) -> Iterator[Path]:
     expect_file(path)
     path = Path(path).resolve() if Path(path).is_symlink() else Path(path)
     temporary: Path | None = None
+    handle = -1
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
+        begin = f".{path.name.encode()[:_LONGEST].decode(errors='ignore')}."
+        _remove_left(path.parent, begin, path.suffix)
+        handle, temporary = _locked(path.parent, begin, path.suffix)
         yield temporary
-        with temporary.open("rb") as written:
-            os.fsync(written.fileno())
+        os.fsync(handle)
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
     except OSError as error:
@@ -55,6 +58,44 @@ def atomic(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+            os.close(handle)
+
+
+_LONGEST = 100
+"""Bytes of a file's name that its temporary name takes over."""
+
+
+def _locked(folder: Path, begin: str, end: str) -> tuple[int, Path]:
+    """A new file, locked as long as its handle is open: so it is known whether who made it is still there."""
+    while True:
+        handle, name = tempfile.mkstemp(prefix=begin, suffix=end, dir=folder)
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        if os.fstat(handle).st_nlink:  # else another process took it for one that was left
+            return handle, Path(name)
+        os.close(handle)
+
+
+def _remove_left(folder: Path, begin: str, end: str) -> None:
+    """Temporary files of this name whose process is gone."""
+    for left in folder.iterdir():
+        if not (left.name.startswith(begin) and left.name.endswith(end) and left.is_file()):
+            continue
+        with suppress(OSError), left.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
+
+
+@contextmanager
+def alone(folder: str | Path) -> Iterator[None]:
+    """Hold a folder's lock, so that processes that change the same files in it wait for one another. It is made if missing."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:
@@ -117,8 +158,7 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
         UserError: for a file that is missing, damaged, or of another kind.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}: expected a {kind} file, found {'a folder' if path.is_dir() else 'nothing'}")
+    expect_header(path, kind, expect_readable(path, kind))
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             text = (file.metadata() or {}).get(_HEADER, "{}")
@@ -136,6 +176,27 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
             expected = " or ".join(map(str, versions))
             raise UserError(f"key 'format': expected {expected}, found {shown(version)}; it is of another version")
         return tensors, header
+
+
+def expect_header(path: Path, kind: str, size: int) -> None:
+    """Refuse a safetensors file whose header is longer, or names more tensors, than an honest one: it takes minutes to read.
+
+    Args:
+        path: the file.
+        kind: what it is expected to be.
+        size: bytes of it.
+
+    Raises:
+        UserError: naming the file.
+    """
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        if length > min(size, MOST_HEADER):
+            told = "a damaged or foreign file" if length > size else f"a header of {length} bytes, more than {MOST_HEADER}"
+            raise UserError(f"{path}: expected a {kind} file, found {told}")
+        # Each tensor is a mapping, however its keys are written; braces in texts are too few to matter.
+        if (tensors := file.read(length).count(b"{")) > MOST_TENSORS:
+            raise UserError(f"{path}: expected a {kind} file of at most {MOST_TENSORS} tensors, found {tensors}")
 
 
 def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:

@@ -194,6 +194,28 @@ def allowed(keys: object) -> set[str]:
     return (packages - sys.stdlib_module_names) | {name.partition(":")[0] for name in _vouched.get()}
 
 
+def allow_classes(packages: Iterable[str]) -> None:
+    """Let configurations name classes and types of these packages alone, until it is called again.
+
+    Whatever else names a class, such as a value that is put together from others, is refused where it would be imported.
+    """
+    from jsonargparse import set_parsing_settings
+
+    now = set(packages)
+    before = _allowed.copy()
+    set_parsing_settings(
+        instantiate_subclass_spec_in_any=False,
+        import_path_denylist=["*", *NO_CODE, *sorted(before - now)],  # jsonargparse adds to what it was told before
+        import_path_allowlist=sorted(now),
+    )
+    _allowed.clear()
+    _allowed.update(now)
+
+
+_allowed: set[str] = set()
+"""What :func:`allow_classes` was told last, for the whole process, as jsonargparse's settings are."""
+
+
 def leaves(keys: object, above: str = "") -> Iterator[tuple[str, str]]:
     """Every text in mappings and lists, with its keys joined by dots."""
     if isinstance(keys, Mapping):

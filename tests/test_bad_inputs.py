@@ -418,7 +418,7 @@ YAML: list[tuple[bytes, str]] = [
     (b"defaults: c.yaml", "key 'defaults'"),
     (b"defaults: [c.yaml]", "builds on"),
     (b"a: ${unclosed", "expected a configuration file"),
-    (b"a: " + b"x" * 2_000_000, "more than"),
+    (b"a: " + b"x" * 2_000_000, "at most 200000 bytes"),
 ]
 
 

@@ -119,7 +119,7 @@ def test_configuration_keys_can_be_read_back(capsys: pytest.CaptureFixture[str])
         (["fit", f"--config={CONF}"], "conf: expected a configuration file, found a folder"),
         (["fit", "--config", PRETRAINING, "--model.depht=3"], "depht"),
         (["fit", "--config", PRETRAINING, "--trainer.max_steps=many"], "max_steps"),
-        (["fit", "--config", PRETRAINING, "--ckpt_path=no.ckpt"], "ckpt_path: expected a checkpoint file"),
+        (["fit", "--config", PRETRAINING, "--ckpt_path=no.ckpt"], "ckpt_path: no.ckpt: expected a checkpoint file, found nothing"),
         (["fit", "--config", PRETRAINING, *TINY, "--model.denoiser=Transformer"], "denoiser: expected one of MLPDenoiser"),
         (
             ["fit", "--config", PRETRAINING, *TINY, "--model.denoiser_args={width: 3}"],
@@ -325,7 +325,7 @@ def test_a_checkpoint_of_another_form_is_refused(tiny: Path, capsys: pytest.Capt
         (["--model.restarts=0"], "model.restarts: expected 1 or more"),
         (["--model.timestep_power=0.5"], "model.timestep_power: expected 1 or more"),
         (["--data.steps=0"], "data.steps, data.demonstrations_per_concept: expected 1 or more"),
-        (["--trainer.logger.init_args.save_dir=/proc/logs"], "choose a place"),
+        (["--trainer.logger.init_args.save_dir=/proc/logs"], "choose a writable place"),
     ],
 )
 def test_mistakes_are_told_before_anything_is_learned(

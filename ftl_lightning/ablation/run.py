@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning import trust
+from ftl_lightning import log_folder, trust
 from ftl_lightning.ablation.check import check
 from ftl_lightning.ablation.plan import Cell, Stage, part
 from ftl_lightning.configuration import load
@@ -125,7 +125,7 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
     from ftl_lightning.lightning_cli import build  # seconds of import that parsing the plan does not need
 
     print(cell, flush=True)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, log_folder.run():
         path = Path(folder) / "results.csv"
         try:
             line = build(cell.verb, [*cell.arguments, *_log(cell), f"--evaluation.results={path}"])

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ftl_lightning.diffusion.schedule import clean_from_epsilon
 from ftl_lightning.errors import UserError
+from ftl_lightning.ranges import expect_count, expect_factor
 
 Epsilon = Callable[[Tensor, Tensor], Tensor]
 Noise = Callable[[], Tensor]
@@ -119,6 +120,8 @@ class Sampling:
             raise UserError(f"steps: expected 1 or more, found {self.steps}")
         if not 0 <= self.temperature < math.inf:
             raise UserError(f"temperature: expected 0 or more, found {self.temperature}")
+        expect_factor("temperature", self.temperature, 0)
+        expect_count("steps", self.steps, 1)
 
     def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
         """Clean plans ``(batch, horizon, state)``, normalised; arguments as of :class:`Sampler`."""

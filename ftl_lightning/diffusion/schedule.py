@@ -6,6 +6,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+LARGEST_POWER = 100.0
+"""Of :func:`timesteps`: with more, all of them would be the noisiest one."""
+MOST_STEPS = 100_000
+"""Of a schedule, T."""
+
 
 def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999) -> Tensor:
     """Cosine schedule (Nichol & Dhariwal, 2021).

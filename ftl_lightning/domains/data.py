@@ -20,7 +20,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.ranges import LARGEST, LARGEST_STEP, MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
 
 
@@ -107,16 +107,16 @@ class PretrainingData(pl.LightningDataModule):
         self.start_exponent = self.domain.plans.exponent(self.horizon) if start_exponent is None else start_exponent
         if self.start_exponent < 1:
             raise UserError(f"data.start_exponent: expected 1 or more, found {start_exponent}")
+        expect_factor("data.start_exponent", self.start_exponent, 1)
         counts = {
-            "batch_size": batch_size,
-            "steps_per_epoch": steps_per_epoch,
-            "horizon": self.horizon,
-            "samples_per_concept": samples_per_concept,
-            "validation_per_concept": validation_per_concept,
+            "batch_size": (batch_size, MOST_TOGETHER),
+            "steps_per_epoch": (steps_per_epoch, LARGEST_STEP),
+            "horizon": (self.horizon, LARGEST),
+            "samples_per_concept": (samples_per_concept, LARGEST),
+            "validation_per_concept": (validation_per_concept, MOST_TOGETHER),
         }
-        for name, value in counts.items():
-            if value < 1:
-                raise UserError(f"data.{name}: expected 1 or more, found {value}")
+        for name, (value, most) in counts.items():
+            expect_count(f"data.{name}", value, 1, most)
         expect_range("data.seed", seed, 0)
         if balance is not None and not 0 <= balance <= 1:
             raise UserError(f"data.balance: expected a number from 0 to 1, found {balance}")
@@ -281,6 +281,8 @@ class InversionData(pl.LightningDataModule):
         if steps < 1 or demonstrations_per_concept < 1:
             found = f"{steps} and {demonstrations_per_concept}"
             raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {found}")
+        expect_count("data.steps", steps, 1, LARGEST_STEP)
+        expect_count("data.demonstrations_per_concept", demonstrations_per_concept, 1, MOST_TOGETHER)
         expect_range("data.seed", seed, 0)
         self.seed = seed
         self.steps = steps
@@ -289,6 +291,8 @@ class InversionData(pl.LightningDataModule):
         self.domain_name = domain if domain == OWN else recorded_name(domain)
         if demonstrations is None and domain == OWN:
             raise UserError("data.demonstrations: expected a file of the new concepts' demonstrations, found none")
+        if domain != OWN and suite not in (suites := load_domain(domain).concepts.suites):
+            raise UserError(f"data.suite: expected one of {', '.join(suites)}, found {suite!r}")
         if domain == OWN:
             self.demonstrations = read_own(str(demonstrations))
         elif demonstrations is None:
@@ -298,10 +302,7 @@ class InversionData(pl.LightningDataModule):
         self.concepts = tuple(dict.fromkeys(self.demonstrations.concepts))
 
     def _drawn(self, domain: Domain, suite: str, count: int) -> Demonstrations:
-        suites = domain.concepts.suites
-        if suite not in suites:
-            raise UserError(f"data.suite: expected one of {', '.join(suites)}, found {suite!r}")
-        if not (learned := suites[suite].learned):
+        if not (learned := domain.concepts.suites[suite].learned):
             raise UserError(f"data.suite: expected a suite that learns concepts, found {suite!r}, which learns none")
         source = domain.source(self.root)
         return concatenate([source.draw(task, count, DEMONSTRATION_SEED + self.seed) for task in learned])

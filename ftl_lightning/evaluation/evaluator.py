@@ -35,7 +35,7 @@ from ftl_lightning.evaluation.summary import OWN, show, summary_table
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.progress import bar
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_range
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 
 _LOG = logging.getLogger(__name__)
@@ -96,8 +96,10 @@ class Evaluator(pl.Callback):
             raise UserError(f"evaluation.samples: expected 1 or more, found {samples}")
         if replan < 1:
             raise UserError(f"evaluation.replan: expected 1 or more, found {replan}")
+        expect_count("evaluation.samples", samples, 1, MOST_TOGETHER)
+        expect_count("evaluation.replan", replan, 1)
         expect_range("evaluation.seed", seed, 0)
-        expect_range("evaluation.figures", figures, 0)
+        expect_count("evaluation.figures", figures, 0, 1000)
         self.suites = None if suites is None else tuple(suites)
         self._settings: dict[str, Any] = {
             "samples": samples,

@@ -1,12 +1,8 @@
 """The results file: one row for every evaluated number."""
 
 import csv
-import fcntl
 import math
-import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,7 +10,8 @@ from typing import Any
 import pandas as pd
 
 from ftl_lightning.errors import UserError, about, short, shown
-from ftl_lightning.tensor_file import atomic, visible
+from ftl_lightning.limits import MOST_TEXT, expect_readable
+from ftl_lightning.tensor_file import alone, atomic, visible
 from ftl_lightning.version import __version__
 
 METHOD, REFERENCE = "method", "reference"
@@ -81,23 +78,11 @@ def append_rows(path: str | Path, rows: list[Row]) -> None:
 def add_rows(path: str | Path, table: pd.DataFrame) -> None:
     """The same of rows that were read from another file; processes that add to the same file wait for one another."""
     path = Path(path)
-    with _alone(path):
+    with alone(path.parent):
         if path.is_file():
             table = pd.concat([read_rows(path), table])
         with atomic(path) as temporary:
             table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Hold the lock of a file: its folder's, since the file is replaced as a whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path.parent, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
 
 
 def upgraded(table: pd.DataFrame) -> pd.DataFrame:
@@ -177,6 +162,7 @@ def _read(file: Path) -> pd.DataFrame:
 
 
 def _table(file: Path, kinds: Any) -> pd.DataFrame:
+    expect_readable(file, "results", MOST_TEXT)
     try:
         return pd.read_csv(file, dtype=kinds, keep_default_na=False)
     except (OSError, ValueError, OverflowError, MemoryError, csv.Error) as error:

@@ -15,9 +15,10 @@ from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
+from ftl_lightning.targets import expect_writable_file
 
 
 class Adaptation(pl.LightningModule, ABC):
@@ -71,7 +72,9 @@ class Adaptation(pl.LightningModule, ABC):
             raise UserError(f"data.domain: expected {mine!r} (the pretrained model's), found {data.domain_name!r}")
         self.concepts = data.concepts
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
-            raise UserError(f"concepts: expected names that differ in their letters, found {', '.join(self.concepts)}")
+            raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(self.concepts), 150)}")
+        for name in self.concepts:
+            expect_writable_file(self._file(name), "concepts")
         self._found = {}
         expected, found = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
         if found != expected:
@@ -106,11 +109,14 @@ class Adaptation(pl.LightningModule, ABC):
         """Where the learned concepts are written."""
         return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
 
+    def _file(self, concept: str) -> Path:
+        return self.folder / f"{file_name(concept)}.safetensors"
+
     def find(self) -> None:
         """Write every concept to a file of its own."""
         self._found = self.learned()
         for name, concept in self._found.items():
-            path = self.folder / f"{file_name(name)}.safetensors"
+            path = self._file(name)
             concept.save(path)
             weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
             print(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")

@@ -11,26 +11,30 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from packaging.version import InvalidVersion, Version
 from torch import Tensor
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
+from ftl_lightning.limits import expect_readable
 from ftl_lightning.tensor_file import atomic, expect_finite, visible
 
 _KEY = "belongs_to"
 _RANDOM = "random"
+_VERSION = "pytorch-lightning_version"
 _FORM: Mapping[str, type] = {
     "state_dict": dict,
     "epoch": int,
     "global_step": int,
     "loops": dict,
+    _VERSION: str,
     "optimizer_states": list,
     "lr_schedulers": list,
     "callbacks": dict,
     _KEY: dict,
     _RANDOM: dict,
 }
-"""Of a checkpoint's keys the kinds; all but the first four may be missing."""
-_NEEDED = ("state_dict", "epoch", "global_step", "loops")
+"""Of a checkpoint's keys the kinds; all but those of :data:`_NEEDED` may be missing."""
+_NEEDED = ("state_dict", "epoch", "global_step", "loops", _VERSION)
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -78,8 +82,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    size = expect_readable(path, "checkpoint")
     try:
         with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > size:
+                raise ValueError("its content is compressed, which that of a checkpoint is not")
             damaged = archive.testzip()  # torch itself does not look at the checksums
         if damaged is not None:
             raise ValueError(f"the checksum of {damaged} is another")
@@ -92,6 +99,10 @@ def _read(path: Path) -> dict[str, Any]:
         found = content.get(key)
         if (key in content or key in _NEEDED) and (not isinstance(found, kind) or isinstance(found, bool)):
             raise UserError(f"{path}: key {key!r}: expected a checkpoint's {kind.__name__}, found {_kind(found)}")
+    try:
+        Version(content[_VERSION])
+    except InvalidVersion as error:
+        raise UserError(f"{path}: key {_VERSION!r}: expected a version such as 2.6.0, found {shown(content[_VERSION])}") from error
     for name, value in content["state_dict"].items():
         if not (isinstance(name, str) and isinstance(value, Tensor)):
             raise UserError(f"{path}: key 'state_dict': expected tensors by name, found {_kind(value)} as {str(name)[:50]!r}")

@@ -9,7 +9,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion import PAPER_SIZE
 from ftl_lightning.diffusion.prediction import loss_weights
-from ftl_lightning.diffusion.schedule import denoising_loss, timesteps
+from ftl_lightning.diffusion.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError
@@ -17,7 +17,7 @@ from ftl_lightning.learning.codes import Codes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.learning.pretraining import Pretraining
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.ranges import expect_count, expect_factor, expect_range
 
 
 class PretrainingModule(Pretraining):
@@ -93,11 +93,11 @@ class PretrainingModule(Pretraining):
         if not 0 <= code_share <= 1:
             raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
         expect_range("model.condition_dropout", condition_dropout, 0, 1)
-        expect_range("model.timestep_power", timestep_power, 1)
+        expect_factor("model.timestep_power", timestep_power, 1, LARGEST_POWER)
         expect_range("model.loss_discount", loss_discount, 0, 1)
         expect_range("model.code_noise", code_noise, 0)
         for name, count in (("diffusion_steps", diffusion_steps), ("code_knots", code_knots), ("code_size", code_size)):
-            expect_range(f"model.{name}", count, 1)
+            expect_count(f"model.{name}", count, 1, MOST_STEPS)
         self.codes = Codes(code_share, code_knots, code_size, code_noise) if code_share else None
 
     def build(

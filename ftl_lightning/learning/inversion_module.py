@@ -16,7 +16,7 @@ from ftl_lightning.learning.checkpoint import check_parameters, check_restored, 
 from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import Inversion, check_settings
 from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.ranges import expect_factor
 from ftl_lightning.tensor_file import expect_finite
 
 OWN = "inversion."
@@ -73,7 +73,7 @@ class InversionModule(Adaptation):
         super().__init__(pretrained, 1.0 if omega == "learned" else omega, output)
         self.save_hyperparameters()
         if training_omega is not None:
-            expect_range("model.training_omega", training_omega)
+            expect_factor("model.training_omega", training_omega)
         self.settings = InversionSettings(**{field.name: self.hparams[field.name] for field in fields(InversionSettings)})
         check_settings(self.model, self.settings)
         self.inversion: Inversion

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ftl_lightning.diffusion.prediction import LOSSES
+from ftl_lightning.diffusion.schedule import LARGEST_POWER
 from ftl_lightning.errors import UserError
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
 
 EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
@@ -81,12 +82,15 @@ class InversionSettings:
         for name in ("components", "restarts", "samples", "mode_samples", "knots"):
             if (value := getattr(self, name)) < 1:
                 raise UserError(f"model.{name}: expected 1 or more, found {value}")
+        for name, most in (("components", 1000), ("restarts", 1000), ("knots", 1000), ("samples", MOST_TOGETHER)):
+            expect_count(f"model.{name}", getattr(self, name), 1, most)
+        expect_count("model.mode_samples", self.mode_samples, 1, MOST_TOGETHER)
         for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate", "initial_spread", "seed"):
             expect_range(f"model.{name}", getattr(self, name), 0)
-        expect_range("model.initial_omega", self.initial_omega)
-        expect_range("model.guidance_scale", self.guidance_scale, 0)
+        expect_factor("model.initial_omega", self.initial_omega)
+        expect_factor("model.guidance_scale", self.guidance_scale, 0)
         if self.omega != "learned":
-            expect_range("model.omega", self.omega)
+            expect_factor("model.omega", self.omega)
         if isinstance(self.modes, int) and self.modes < 1:
             raise UserError(f"model.modes: expected 1 or more, 'each' or 'auto', found {self.modes}")
         if isinstance(self.modes, str) and self.modes not in ("each", "auto"):
@@ -103,5 +107,9 @@ class InversionSettings:
             raise UserError(f"model.off_span: expected 0 (span) to 1 (free), found {self.off_span}")
         if self.timestep_power < 1:
             raise UserError(f"model.timestep_power: expected 1 or more, found {self.timestep_power}")
+        expect_factor("model.timestep_power", self.timestep_power, 1, LARGEST_POWER)
+        expect_count("model.adapter", self.adapter, 0, 1000)
+        if isinstance(self.modes, int):
+            expect_count("model.modes", self.modes, 1, MOST_TOGETHER)
         if self.loss not in LOSSES:
             raise UserError(f"model.loss: expected one of {', '.join(LOSSES)}, found {self.loss!r}")

@@ -79,10 +79,9 @@ def read_config(folder: str | Path) -> dict[str, Any]:
         UserError: naming the file, if it is missing or something else.
     """
     path = Path(folder) / CONFIG
-    try:
-        found = read_json(path)
-    except OSError as error:
-        raise UserError(f"{path}: expected a pretrained model, found {error.strerror}; run: python -m ftl_lightning fit") from error
+    if not path.exists():
+        raise UserError(f"{path}: expected a pretrained model, found nothing; run: python -m ftl_lightning fit")
+    found = read_json(path)
     with about(path):
         version = found.get("format") if isinstance(found, dict) else None
         if type(version) is not int or version not in (FORMAT, VERSION):

@@ -27,7 +27,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.learning.model_config import find_view
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.ranges import expect_factor, expect_range
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import expect_finite
 
@@ -91,7 +91,7 @@ class Pretraining(pl.LightningModule, ABC):
             ("seed", seed, math.inf),
         ):
             expect_range(f"model.{name}", value, 0, most)
-        expect_range("model.guidance", guidance)
+        expect_factor("model.guidance", guidance)
         self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
         for name, share in self.feature_dropout.items():
             expect_range(f"model.feature_dropout.{name}", share, 0, 1)

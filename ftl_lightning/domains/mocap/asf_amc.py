@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftl_lightning.errors import UserError
+from ftl_lightning.limits import most_bytes, read_text
 
 INCH = 0.0254
 """Metres. Lengths of the database are inches once they are divided by the ``length`` of the skeleton's ``units``."""
@@ -235,10 +236,7 @@ class _Lines:
 
     def __init__(self, path: Path) -> None:
         self.path, self.line = path, 0
-        try:
-            self.lines = path.read_text(encoding="latin-1").splitlines()
-        except OSError as error:
-            raise UserError(f"{path}: cannot be read ({error.strerror or error})") from error
+        self.lines = read_text(path, "recording", most_bytes(), encoding="latin-1").splitlines()
 
     def __iter__(self) -> Iterator[list[str]]:
         for number, text in enumerate(self.lines, start=1):

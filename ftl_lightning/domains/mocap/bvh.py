@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
 from ftl_lightning.errors import UserError
+from ftl_lightning.limits import MOST_TEXT, expect_readable
 
 METRES = INCH / 0.45
 """Of a unit of the conversion, which is that of the ASF files."""
@@ -40,6 +41,7 @@ def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64]
         import pybvh
     except ImportError:
         raise UserError(f"{path}: BVH files need the extra 'mocap'; run: pip install 'ftl-lightning[mocap]'") from None
+    expect_readable(path, "BVH", MOST_TEXT)
     try:
         # What it guesses of facing and handedness does not matter here.
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):

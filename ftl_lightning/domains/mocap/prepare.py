@@ -21,7 +21,8 @@ from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments
 from ftl_lightning.domains.mocap.skeleton import HORIZON, JOINTS, RIGID
 from ftl_lightning.domains.mocap.source import glitches, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, TRAINING_CONCEPTS, cleaned
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.progress import bar
 from ftl_lightning.tensor_file import write_text
 
@@ -90,7 +91,7 @@ def prepare(root: Path | None, out: Path | None = None) -> str:
     if root is None:
         raise UserError(f"root: expected a folder with your copy of the database, found none; {WHERE}")
     if not root.is_dir():
-        raise UserError(f"root: expected a folder, found {'a file' if root.exists() else 'nothing'} at {root}; {WHERE}")
+        raise UserError(f"root: expected a folder, found {'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}")
     out = root if out is None else out
     motions = sorted(path for path in root.rglob("*") if path.suffix.lower() in (".amc", ".bvh") and path.is_file())
     ready = next((root / name for name in FILES if (root / name).is_file()), None)
@@ -223,6 +224,7 @@ def _index(root: Path) -> dict[str, str]:
             f"{root}: expected the index of descriptions, {INDEXES[0]} or {INDEXES[1]}, found neither; it comes with B. Hahne's "
             "conversion of the database (cgspeed.com)"
         )
+    expect_readable(path, "text", MOST_TEXT)
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     rows = csv.reader(lines) if path.suffix == ".csv" else (line.split("\t") for line in lines)
     found = {row[0].strip(): cleaned(row[1]) for row in rows if len(row) > 1 and _TRIAL.fullmatch(row[0].strip())}

@@ -14,10 +14,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ftl_lightning.demonstrations.container import expect_arrays
 from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.tasks import cleaned
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.limits import expect_readable
 from ftl_lightning.tensor_file import atomic
 
 FILE = "recordings.npz"
@@ -83,7 +85,9 @@ class Recordings:
         Raises:
             UserError: naming file and key, where it is damaged or of another content.
         """
+        size = expect_readable(path, "recordings")
         try:
+            expect_arrays(path, size)
             with np.load(path, allow_pickle=False) as archive:
                 found = {name: archive[name] for name in archive.files if name in _KEYS}
         except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
@@ -129,7 +133,7 @@ def read_folder(root: Path) -> tuple[Recordings, tuple[Segment, ...]]:
     """
     if not root.is_dir():
         raise UserError(
-            f"data.root: expected a folder of recordings, found {'a file' if root.exists() else 'nothing'} at {root}; {WHERE}"
+            f"data.root: expected a folder of recordings, found {'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}"
         )
     path = next((root / name for name in FILES if (root / name).is_file()), None)
     if path is None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ftl_lightning.errors import UserError
+from ftl_lightning.limits import read_text
 
 SEGMENTS = "segments.csv"
 HEADER = ("trial_id", "label", "start30", "stop30")
@@ -50,8 +51,8 @@ def read_segments(path: Path) -> tuple[Segment, ...]:
         UserError: naming file and line.
     """
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = list(csv.reader(read_text(path, "table of segments").splitlines()))
+    except csv.Error as error:
         raise UserError(f"{path}: expected a table of segments (CSV), found a file that cannot be read ({error})") from error
     if not lines or tuple(lines[0]) != HEADER:
         raise UserError(f"{path}: line 1: expected {','.join(HEADER)}, found {','.join(lines[0]) if lines else 'nothing'}")

@@ -1,0 +1,97 @@
+"""The log folder of a run, which no other run has at the same time, in whatever process or however close they start."""
+
+import contextvars
+import fcntl
+import itertools
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.targets import expect_writable_folder
+
+LOCK = ".running"
+"""File in the folder of a run that goes on, locked by it."""
+_stack: contextvars.ContextVar[ExitStack | None] = contextvars.ContextVar("stack", default=None)
+
+
+@contextmanager
+def run() -> Iterator[None]:
+    """Within the block, folders that are claimed stay the run's own; at its end, those that nothing was written to are removed."""
+    with ExitStack() as stack:
+        token = _stack.set(stack)
+        try:
+            yield
+        finally:
+            _stack.reset(token)
+
+
+def claim(parent: Path, name: str, new: bool) -> str:
+    """Make a folder and hold it until the end of the run.
+
+    Args:
+        parent: folder of the folder.
+        name: of it.
+        new: whether one that is there is taken, even if no run holds it.
+
+    Returns:
+        The name, or with the smallest number after it that is free: ``invert``, ``invert_1``, ``invert_2``.
+
+    Raises:
+        UserError: where no folder can be made.
+    """
+    return next(found for found in _numbered(name) if _claimed(parent / found, new))
+
+
+def hold(folder: Path) -> None:
+    """Hold a folder that a run goes on in.
+
+    Raises:
+        UserError: if another run holds it.
+    """
+    if not _claimed(folder, new=False):
+        raise UserError(
+            f"{folder}: expected the log folder of a run that has ended, found that of one that goes on; wait for its end"
+        )
+
+
+def _numbered(name: str) -> Iterator[str]:
+    return (f"{name}_{number}" if number else name for number in itertools.count())
+
+
+def _claimed(folder: Path, new: bool) -> bool:
+    """Whether the folder is this run's from now on."""
+    stack, lock = _stack.get(), folder / LOCK
+    expect_writable_folder(folder)
+    while True:
+        missing = [one for one in (folder, *folder.parents) if not one.exists()]
+        try:
+            folder.mkdir(parents=True, exist_ok=not new)
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        except FileExistsError:  # a folder: it was looked at above
+            return False
+        except FileNotFoundError:  # a run that ended has just removed a folder above it
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            return False
+        if not os.fstat(handle).st_nlink:  # of a run that has just ended
+            os.close(handle)
+            continue
+        if stack is None:  # nobody says when the run ends
+            _free(lock, handle, [])
+        else:
+            stack.callback(_free, lock, handle, missing)
+        return True
+
+
+def _free(lock: Path, handle: int, made: list[Path]) -> None:
+    """Let go of a folder; of those that were made for it the empty ones are removed, the innermost first."""
+    lock.unlink(missing_ok=True)
+    os.close(handle)
+    for folder in made:
+        with suppress(OSError):
+            folder.rmdir()
