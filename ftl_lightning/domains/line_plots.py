@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.escape import figure_text
 
 if TYPE_CHECKING:  # half a second of import, for what is drawn later
     from matplotlib.figure import Figure
@@ -26,7 +27,7 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
         columns = min(len(states), MAX_COLUMNS)
         rows = -(-len(states) // columns)
         figure = Figure(figsize=(1.6 * columns, 1.6 * rows + 0.5), layout="constrained")
-        figure.suptitle(title, fontsize=9)
+        figure.suptitle(figure_text(title), fontsize=9)
         spatial = states.shape[2] == 3 and states.shape[1] > 1
         grid = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"} if spatial else {}).flat
         colours = [PLAIN] * len(states) if right is None else [RIGHT if good else WRONG for good in right]
@@ -40,7 +41,7 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
             else:
                 axes.set_ylim(_room(min(low), max(high)))  # one scale for all
                 for column, name in enumerate(names):
-                    axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=name)
+                    axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=figure_text(name))
             lines = states.shape[2] not in (2, 3) or states.shape[1] == 1
             axes.set(xticks=[])
             if not lines or axes is not figure.axes[0]:  # the first panel tells the scale

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from ftl_lightning.printing import line
+
 SECONDS = 4.0
 """An animation takes, if its frames allow it."""
 FRAME_SECONDS = (0.05, 0.8)
@@ -57,12 +59,12 @@ def captioned(pictures: Sequence[NDArray[np.uint8]], text: str) -> list[NDArray[
     font = ImageFont.load_default(FONT_SIZE)
     width = pictures[0].shape[1]
     letters = max(1, int((width - 2 * MARGIN) / font.getlength("n")))
-    lines = [part for line in text.splitlines() for part in textwrap.wrap(line, letters) or [""]]
+    lines = [part for one in text.splitlines() for part in textwrap.wrap(line(one), letters) or [""]]
     spacing = round(1.35 * FONT_SIZE)
     strip = Image.new("RGB", (width, spacing * len(lines) + 2 * MARGIN), PAPER)
     draw = ImageDraw.Draw(strip)
-    for number, line in enumerate(lines):
-        draw.text((MARGIN, MARGIN + number * spacing), line, fill=INK, font=font)
+    for number, part in enumerate(lines):
+        draw.text((MARGIN, MARGIN + number * spacing), part, fill=INK, font=font)
     below = np.asarray(strip, dtype=np.uint8)
     return [np.concatenate((picture, below)) for picture in pictures]
 

@@ -1,6 +1,5 @@
 """The end of a run: one table in the terminal in place of a line for every number."""
 
-import copy
 import io
 import sys
 from collections.abc import Sequence
@@ -8,10 +7,13 @@ from collections.abc import Sequence
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY
+from ftl_lightning.escape import markdown
 from ftl_lightning.evaluation.judged import LOST, WON, standard_error
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, Row, label
+from ftl_lightning.printing import line, say
 
 DIVERSITY = (NOVELTY, COVERAGE)
 OWN = "own demonstrations"
@@ -31,10 +33,10 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
     measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
     metrics = list(dict.fromkeys(row.metric for row in measured))
     metrics.sort(key=lambda name: DIVERSITY.index(name) if name in DIVERSITY else -1)  # behind what is right, in their order
-    table = Table(title=_title(measured), box=box.SIMPLE, title_justify="left", padding=0)
+    table = Table(title=literal(_title(measured), "table.title"), box=box.SIMPLE, title_justify="left", padding=0)
     table.add_column("mean ± error over tasks")
     for name in (*metrics, "n"):
-        table.add_column(name, justify="right")
+        table.add_column(literal(name), justify="right")
     # Own concepts first, in their order; they are not part of their setting's mean.
     order = {name: number for number, name in enumerate(own)}
     single = sorted((row for row in measured if row.task in order), key=lambda row: order[row.task])
@@ -42,11 +44,11 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
     for subject in subjects:
         alike = [row for row in rows if _subject(row, own) == subject]
         found = [row for row in measured if _subject(row, own) == subject]
-        table.add_row(_name(found, own), *(_mean(found, name) for name in metrics), _samples(found))
+        table.add_row(literal(_name(found, own)), *(_mean(found, name) for name in metrics), _samples(found))
         references = [row for row in alike if row.role == REFERENCE]
         for name in dict.fromkeys(row.method for row in references):
             beside = [row for row in references if row.method == name]
-            table.add_row(f"- {name}", *(_mean(beside, metric, False) for metric in metrics), "", style="dim")
+            table.add_row(literal(f"- {name}"), *(_mean(beside, metric, False) for metric in metrics), "", style="dim")
     return table
 
 
@@ -87,13 +89,21 @@ def _samples(rows: Sequence[Row]) -> str:
     return f"{tasks}x{each}" if tasks > 1 else each
 
 
+def literal(text: str, style: str = "") -> Text:
+    """A cell that is shown as it reads: rich takes words in brackets for its own marks, and names come from files."""
+    return Text(line(text), style)
+
+
 def plain(table: Table) -> str:
     """The table as Markdown, as wide as it needs to be: for log files, pipes and TensorBoard."""
-    own = copy.copy(table)
-    own.box, own.padding, own.title = box.MARKDOWN, (0, 1, 0, 1), None  # a title would be wrapped to the table's width
+    own = Table(box=box.MARKDOWN, padding=(0, 1, 0, 1))
+    for column in table.columns:
+        own.add_column(Text(markdown(str(column.header))), justify=column.justify)
+    for cells in zip(*(column.cells for column in table.columns), strict=True):
+        own.add_row(*(Text(markdown(str(cell))) for cell in cells))
     file = io.StringIO()
     Console(file=file, width=100_000, color_system=None).print(own)
-    return "\n".join([str(table.title), *(line.rstrip() for line in file.getvalue().rstrip().splitlines())])
+    return "\n".join([markdown(str(table.title)), *(row.rstrip() for row in file.getvalue().rstrip().splitlines())])
 
 
 def show(table: Table) -> None:
@@ -101,4 +111,4 @@ def show(table: Table) -> None:
     if sys.stdout.isatty():
         Console().print(table)
     else:
-        print(plain(table))
+        say(plain(table))

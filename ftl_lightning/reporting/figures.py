@@ -10,6 +10,7 @@ from sklearn.manifold import TSNE
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.escape import figure_text
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import REFERENCE, latest
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -26,6 +27,12 @@ LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "s
 """Of reference policies."""
 REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
 """Of the reference lines of novelty and coverage."""
+WIDEST = 60.0
+"""Inches of a figure, however many settings there are; a picture of thousands would take all memory."""
+
+
+def _width(inches: float) -> float:
+    return min(inches, WIDEST)
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
@@ -41,7 +48,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
     shown, learned = settings(domain, ours), sorted(set(ours["label"]))
-    figure = Figure(figsize=(1.9 * max(len(shown), 2) + 3.5, 3.4), layout="constrained")
+    figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3.5), 3.4), layout="constrained")
     axes = figure.subplots()
     width = 0.8 / (len(learned) + 1)
     references = select(rows, role=REFERENCE)
@@ -49,7 +56,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
     def once(label: str) -> str | None:
         """For the legend, which names everything once, wherever it is seen first."""
-        return None if label in axes.get_legend_handles_labels()[1] else label
+        return None if figure_text(label) in axes.get_legend_handles_labels()[1] else figure_text(label)
 
     for place, setting in enumerate(shown):
         found = lookup(domain, setting, metric)
@@ -66,8 +73,8 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
             if reference:
                 line = LINES[index % len(LINES)]
                 axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=once(policy))  # type: ignore[arg-type]
-    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], shown)
-    axes.set(ylim=(0, 1.05), ylabel=metric, title=f"{domain.name}, {how}")
+    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], [*map(figure_text, shown)])
+    axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(f"{domain.name}, {how}"))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
@@ -88,13 +95,13 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     # The same colour in every domain, whichever methods it has.
     colours = dict(zip(dict.fromkeys((*METHODS, *names)), itertools.cycle(COLOURS), strict=False))
     width = 0.8 / len(names)
-    figure = Figure(figsize=(1.9 * max(len(shown), 2) + 3, 3.4), layout="constrained")
+    figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3), 3.4), layout="constrained")
     axes = figure.subplots()
     for index, method in enumerate(names):
         own, colour = select(rows, method=method), colours[method]
         for place, setting in enumerate(shown):
             where = place + (index - (len(names) - 1) / 2) * width
-            label = None if place else method
+            label = None if place else figure_text(method)
             if number := summarise(own[own["setting"] == setting]):
                 axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
             elif label and not own.empty:
@@ -107,12 +114,12 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     for index, policy in enumerate(sorted(set(references["method"]))):
         own = references[references["method"] == policy]
         for place in (place for place, setting in enumerate(shown) if setting in set(own["setting"])):
-            label = None if policy in axes.get_legend_handles_labels()[1] else policy
+            label = None if figure_text(policy) in axes.get_legend_handles_labels()[1] else figure_text(policy)
             mean = own.loc[own["setting"] == shown[place], "value"].mean()
             span, line = (place - 0.45, place + 0.45), LINES[index % len(LINES)]
             axes.hlines(mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
-    axes.set_xticks(range(len(shown)), shown)
-    axes.set(ylim=(0, 1.05), ylabel=metric, title=domain.name)
+    axes.set_xticks(range(len(shown)), [*map(figure_text, shown)])
+    axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(domain.name))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
@@ -133,13 +140,13 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
             numbers = [summarise(own[own[axis] == count]) for count in counts]
             means = [number.mean for number in numbers if number]
             errors = [number.error or 0.0 for number in numbers if number]
-            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=setting)
+            axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=figure_text(setting))
         axes.set(xlabel=axis, ylim=(0, 1.05))
         axes.set_xticks(sorted(set(rows[axis])))
         if axis == "demonstrations":
-            axes.set_ylabel(" ".join(set(rows["metric"])))
+            axes.set_ylabel(figure_text(" ".join(set(rows["metric"]))))
             axes.legend(fontsize=8, loc="lower right")
-    figure.suptitle(domain.name, fontsize=10)
+    figure.suptitle(figure_text(domain.name), fontsize=10)
     return figure
 
 
@@ -156,7 +163,7 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     rows = rows[rows["domain"] == domain.name].dropna(subset=["accuracy", "coverage"])
     rows = rows.assign(panel=rows["setting"] + (", " + rows["suite"] if len(set(rows["suite"])) > 1 else ""))
     shown = list(dict.fromkeys(rows["panel"]))
-    figure = Figure(figsize=(3.6 * max(len(shown), 1) + 2.2, 3.6), layout="constrained")
+    figure = Figure(figsize=(_width(3.6 * max(len(shown), 1) + 2.2), 3.6), layout="constrained")
     panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     lines = labelled(rows[~rows["method"].isin(list(REFERENCE_MARKS))])
     forms = list(dict.fromkeys(lines["label"]))
@@ -167,19 +174,19 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
             means = each.groupby("temperature", dropna=False)[["coverage", "accuracy"]].mean().sort_index()
             if means.empty:
                 continue
-            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=form)
+            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(form))
             strengths = [1 - 0.75 * place / len(means) for place in range(len(means))]
             axes.scatter(means["coverage"], means["accuracy"], color=colour, alpha=strengths, s=22)
         for method, mark in REFERENCE_MARKS.items():
             mean = own.loc[own["method"] == method, ["coverage", "accuracy"]].mean()
             if mean.notna().all():
                 axes.plot(mean["coverage"], mean["accuracy"], mark, color="black", markersize=8, label=method)
-        axes.set(xlabel="coverage (less is better)", ylim=(-0.05, 1.05), title=panel)
-    panels[0].set_ylabel(domain.main_metric)
+        axes.set(xlabel="coverage (less is better)", ylim=(-0.05, 1.05), title=figure_text(panel))
+    panels[0].set_ylabel(figure_text(domain.main_metric))
     found = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(list(found.values()), list(found), fontsize=8, loc="outside right upper")
     tempered = lines[lines["method"] != NOISY]
-    figure.suptitle(f"{domain.name}: temperature from {_range(tempered)}", fontsize=10)
+    figure.suptitle(figure_text(f"{domain.name}: temperature from {_range(tempered)}"), fontsize=10)
     return figure
 
 
@@ -192,7 +199,9 @@ def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axes = figure.subplots()
     for colour, (name, own) in zip(COLOURS, curves.items(), strict=False):
-        axes.plot([one.seconds for one in own], [one.accuracy for one in own], "o-", color=colour, markersize=4, label=name)
+        axes.plot(
+            [one.seconds for one in own], [one.accuracy for one in own], "o-", color=colour, markersize=4, label=figure_text(name)
+        )
     axes.axhline(reached(curves), color=PAPER_COLOUR, linestyle="dotted")
     axes.set(xscale="log", xlabel="seconds of learning", ylabel="accuracy", ylim=(-0.05, 1.05))
     figure.legend(fontsize=8, loc="outside upper center", ncols=len(curves))
@@ -227,7 +236,7 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
     axes.scatter(*places[len(training) :].T, color=COLOURS[0], marker="^", label="learned components")
     names = [*training, *(name for name, _ in learned)]
     for place, name in zip(places, names, strict=True):
-        axes.annotate(name, place, fontsize=6, xytext=(3, 3), textcoords="offset points")
-    axes.set(xticks=[], yticks=[], title=f"{model.config.domain}: concepts, t-SNE")
+        axes.annotate(figure_text(name), place, fontsize=6, xytext=(3, 3), textcoords="offset points")
+    axes.set(xticks=[], yticks=[], title=figure_text(f"{model.config.domain}: concepts, t-SNE"))
     axes.legend(fontsize=8)
     return figure

@@ -4,7 +4,9 @@ It is JSON, since it holds other columns than results files, which are all ``.cs
 """
 
 import json
+import math
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
-from ftl_lightning.errors import UserError
+from ftl_lightning.reporting.listed import read_listed
 from ftl_lightning.reporting.tables import MISSING, Table, make_table
 from ftl_lightning.tensor_file import write_text
 
@@ -27,23 +29,39 @@ COLUMNS = [*SUBJECT, "accuracy", "novelty", "coverage"]
 """``accuracy`` is the domain's main metric; what was not measured is missing."""
 
 
+_NUMBERS = ["temperature", "accuracy", "novelty", "coverage"]
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the file, for its check."""
+
+    domain: str
+    suite: str
+    setting: str
+    task: str
+    method: str
+    seed: int
+    n: int
+    variant: str = ""
+    temperature: float = math.nan
+    accuracy: float = math.nan
+    novelty: float = math.nan
+    coverage: float = math.nan
+
+
 def read_frontier(path: str | Path) -> pd.DataFrame:
     """The measurements of a file, or of the folder that holds it; none where there is no file.
 
     Raises:
-        UserError: for a file of something else.
+        UserError: naming the file and the row, for one of something else.
     """
     path = Path(path)
     path = path / FRONTIER if path.is_dir() else path
     if not path.is_file() or path.suffix != ".json":
         return pd.DataFrame(columns=COLUMNS)
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
-        table = pd.DataFrame(rows, columns=COLUMNS)
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: expected rows of {', '.join(COLUMNS)}, found something else ({error!r})") from error
-    numbers = ["temperature", "accuracy", "novelty", "coverage"]
-    return table.astype(dict.fromkeys(numbers, float))
+    rows = [asdict(row) for row in read_listed(path, "rows", _Row, f"rows of {', '.join(COLUMNS)}")]
+    return pd.DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(_NUMBERS, float))
 
 
 def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binom
 
 LEVEL = 0.05
 """A difference is shown where p is below this."""
@@ -180,7 +181,7 @@ def episodes(won: int, lost: int, count: int) -> str:
     apart, all_four = won + lost, count + 2
     middle = (won - lost) / all_four
     error = 1.96 * math.sqrt((apart + 1) / all_four - middle**2) / math.sqrt(all_four)
-    p = min(1.0, 2 * sum(math.comb(apart, k) for k in range(min(won, lost) + 1)) / 2**apart)
+    p = min(1.0, 2 * float(binom.cdf(min(won, lost), apart, 0.5)))
     interval = f"[{middle - error:+.2f}, {middle + error:+.2f}]"
     return f"{(won - lost) / count:+.2f} {interval}, {chance(p)}, {same_outcome(won, lost, count)}"
 

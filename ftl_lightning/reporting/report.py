@@ -1,5 +1,7 @@
 """The report: every table and figure of every domain that has results."""
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -7,13 +9,15 @@ from matplotlib.figure import Figure
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
+from ftl_lightning.limits import read_text
+from ftl_lightning.printing import say
 from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.comparison import compared, comparison_table, methods, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time
-from ftl_lightning.reporting.frontier import frontier_table, read_frontier
+from ftl_lightning.reporting.frontier import FRONTIER, frontier_table, read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.tables import Table, select, tables
@@ -21,6 +25,8 @@ from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 """What ``report --readme`` writes stands between these lines."""
+MOST_DOMAINS, MOST_CELLS = 100, 10_000
+"""Of one report, and of the tables of one domain."""
 
 
 def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
@@ -40,9 +46,13 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     """
     rows = read_rows(results)
     ablations, comparison, curves, changes = (read_study(results, name) for name in ("", COMPARISON, CURVES, CHANGES))
-    measured = read_frontier(results).dropna(subset=["accuracy", "coverage"])
+    _expect_few(results, (ablations, comparison, curves, changes))
+    tempered = read_frontier(results)
+    measured = tempered.dropna(subset=["accuracy", "coverage"])
+    if count := len(tempered) - len(measured):
+        say(f"{results}: {count} rows of {FRONTIER} are left out, which have no accuracy or no coverage")
     if count := replaced(ablations):
-        print(f"{results}: {count} rows are left out, since the same was measured again later in another configuration")
+        say(f"{results}: {count} rows are left out, since the same was measured again later in another configuration")
     everything, headline = [], []
     for name in sorted(set(rows["domain"])):
         domain = domain_of(name, rows)
@@ -73,6 +83,25 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     return "\n".join(table.markdown() for table in everything)
 
 
+def _expect_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
+    """Refuse results whose tables nobody could read, and which would take hours to make.
+
+    Raises:
+        UserError: naming what there is too much of.
+    """
+    if (count := len({name for rows in studies for name in rows["domain"]})) > MOST_DOMAINS:
+        raise UserError(f"{results}: expected at most {MOST_DOMAINS} domains, found {count}; report fewer files at a time")
+    for domain, own in (found for rows in studies for found in rows.groupby("domain")):
+        ours = own[own["method"] == OURS]
+        cells = own["setting"].nunique() * len(own.groupby(["method", "variant"]))
+        cells += ours["setting"].nunique() * ours["variant"].nunique() * ours["K"].nunique() * ours["omega"].nunique()
+        if cells > MOST_CELLS:
+            raise UserError(
+                f"{results}: domain {shown(domain)}: expected at most {MOST_CELLS} pairs of a setting and a method, found {cells}; "
+                "report fewer files at a time"
+            )
+
+
 def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
     """Tables and figures of our method in all its forms."""
     found = [_written(table, folder) for table in tables(domain, rows)]
@@ -94,11 +123,12 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def _file(metric: str) -> str:
-    return metric.replace(" ", "_")
+    """A name in the domain's folder, whatever the metric is called; no hidden one."""
+    return re.sub(r"[^\w+-]", "_", metric)[:100]
 
 
 def _splice(path: Path, text: str) -> None:
-    before, begin, rest = path.read_text(encoding="utf-8").partition(BEGIN)
+    before, begin, rest = read_text(path, "Markdown").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise UserError(f"{path}: expected the lines {BEGIN!r} and {END!r}, found none; add them where the table belongs")

@@ -1,7 +1,6 @@
 """What reports show of a domain: the only place of the reports that knows what a domain is made of."""
 
 import re
-import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -14,6 +13,7 @@ from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.judged import LOST, WON
+from ftl_lightning.printing import say
 
 TRAINING, PAPER = "training", "paper"
 """Suites that come first in reports, in domains that have them."""
@@ -30,7 +30,7 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
             f"results: column 'domain': expected a name of letters, digits and - . +, found {shown(name)}; mend the row"
         )
     if name != OWN and not is_known(name):
-        print(f"domain {name!r} is not installed: its tables are made from the results alone", file=sys.stderr)
+        say(f"domain {name!r} is not installed: its tables are made from the results alone", error=True)
     try:
         return domain_of_file(name)
     except UserError:

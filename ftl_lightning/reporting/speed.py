@@ -1,11 +1,10 @@
 """Accuracy over seconds of learning: the file that ``benchmarks/speed.py`` writes."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.reporting.listed import read_listed
 
 SPEED = "speed.json"
 """Name of the file in a folder of results."""
@@ -41,18 +40,13 @@ def read_speed(path: str | Path) -> dict[str, list[Measured]]:
     """The curves of a file, or of the folder that holds it; none where there is no file.
 
     Raises:
-        UserError: for a file of something else.
+        UserError: naming the file and the row, for one of something else.
     """
     path = Path(path)
     path = path / SPEED if path.is_dir() else path
     found: dict[str, list[Measured]] = {}
     if not path.is_file() or path.suffix != ".json":
         return found
-    try:
-        for row in json.loads(path.read_text(encoding="utf-8"))["curves"]:
-            found.setdefault(str(row["curve"]), []).append(
-                Measured(str(row["curve"]), float(row["steps"]), float(row["seconds"]), float(row["accuracy"]))
-            )
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: expected curves of steps, seconds and accuracy, found something else ({error!r})") from error
+    for measured in read_listed(path, "curves", Measured, "curves of steps, seconds and accuracy"):
+        found.setdefault(measured.curve, []).append(measured)
     return found

@@ -9,8 +9,10 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
 from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.errors import UserError
+from ftl_lightning.escape import latex, latex_row, markdown
 from ftl_lightning.evaluation.judged import LOST, WON, standard_error
-from ftl_lightning.evaluation.results import METHOD, REFERENCE, labels, latest
+from ftl_lightning.evaluation.results import LARGEST_WHOLE, METHOD, REFERENCE, labels, latest
 from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.reporting.shown import (
     component_tasks,
@@ -84,24 +86,22 @@ class Table:
 
     def markdown(self) -> str:
         """GitHub's Markdown, caption first."""
-        lines = [list(self.cells.columns), ["---"] * len(self.cells.columns), *self.cells.to_numpy().tolist()]
-        return f"**{self.caption}**\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        head, *rows = (list(map(markdown, row)) for row in self._rows())
+        lines = [head, ["---"] * len(head), *rows]
+        return f"**{markdown(self.caption)}**\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def latex(self) -> str:
         """A booktabs table."""
-        lines = [" & ".join(map(_escape, row)) + r" \\" for row in [list(self.cells.columns), *self.cells.to_numpy().tolist()]]
+        head, *rows = map(latex_row, self._rows())
         columns = "l" + "c" * (len(self.cells.columns) - 1)
-        body = "\n".join((lines[0], r"\midrule", *lines[1:]))
+        body = "\n".join((head, r"\midrule", *rows))
         return (
-            f"\\begin{{table}}\n\\caption{{{_escape(self.caption)}}}\n\\begin{{tabular}}{{{columns}}}\n\\toprule\n{body}\n"
+            f"\\begin{{table}}\n\\caption{{{latex(self.caption)}}}\n\\begin{{tabular}}{{{columns}}}\n\\toprule\n{body}\n"
             "\\bottomrule\n\\end{tabular}\n\\end{table}\n"
         )
 
-
-def _escape(text: str) -> str:
-    for plain, escaped in (("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$"), ("<", "$<$")):
-        text = text.replace(plain, escaped)
-    return text
+    def _rows(self) -> list[list[str]]:
+        return [list(map(str, self.cells.columns)), *self.cells.to_numpy().tolist()]
 
 
 def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
@@ -261,12 +261,22 @@ def _outcomes(domain: Domain, every: pd.DataFrame) -> Table:
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
-    """In how many episodes only ours succeeds, in how many only the policy from the same start, and of how many; maybe ``None``."""
+    """In how many episodes only ours succeeds, in how many only the policy from the same start, and of how many; maybe ``None``.
+
+    Raises:
+        UserError: for rows that no episodes can have.
+    """
     won, lost = (select(ours, metric=f"{what}{policy}") for what in (WON, LOST))
     if won.empty:
         return None
-    gains, losses = (round(float((rows["value"] * rows["n"]).sum())) for rows in (won, lost))
-    return gains, losses, int(won["n"].sum())
+    gains, losses = (round(float((rows["value"] * rows["n"]).clip(-1, LARGEST_WHOLE).sum())) for rows in (won, lost))
+    count = int(won["n"].sum())
+    if not 0 <= gains + losses <= count or min(gains, losses, count - 1) < 0:
+        raise UserError(
+            f"results: metrics {f'{WON}{policy}'!r} and {f'{LOST}{policy}'!r}: expected shares of the same episodes, found "
+            f"{gains} and {losses} of {count} episodes; mend the rows"
+        )
+    return gains, losses, count
 
 
 def _paired(domain: Domain, every: pd.DataFrame) -> Table:

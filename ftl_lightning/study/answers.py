@@ -51,12 +51,7 @@ class Rater:
 
 
 def _json(path: Path, kind: str) -> dict[str, Any]:
-    try:
-        content = read_json(path, f"a {kind} file")
-    except FileNotFoundError:
-        raise UserError(f"{path}: expected a {kind} file, found nothing") from None
-    except OSError as error:
-        raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign one ({error})") from error
+    content = read_json(path, f"a {kind} file")
     found = content.get("kind") if isinstance(content, dict) else None
     if found != kind:
         told = f"a {short(str(found))} file" if found else "a file of other software"
@@ -75,17 +70,32 @@ def read_key(path: Path) -> Key:
     content = _json(path, KEY_KIND)
     try:
         key = Key(str(content["study"]), str(content["page"]), dict(content["questions"]), dict(content["films"]))
-        for question in key.questions.values():
-            needed = {CHECK: ("expected",), BEST: ("scenario", "setting")}.get(question["kind"], ())
-            if any(part not in question for part in needed) or not {*question["films"]} <= key.films.keys():
-                raise KeyError("questions")
         for film in key.films.values():
-            _ = film["setting"], film["scenario"], film["method"]
+            _expect_texts(film, ("setting", "scenario", "method"))
+        for question in key.questions.values():
+            _expect_texts(question, {CHECK: ("expected",), BEST: ("scenario", "setting")}.get(question["kind"], ()))
+            _expect_texts(question, ("text", "kind"))
+            if not question["films"] or not {*question["films"]} <= key.films.keys():
+                raise KeyError("films")
+        asked = {_asked(question) for question in key.of_kind(DEPICTS).values()}
+        if not {_asked(question) for question in key.of_kind(REPEAT).values()} <= asked:
+            raise KeyError("a question that is repeated")
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
-            f"{path}: expected a study's key with study, page, questions and films, found a damaged one ({error})"
+            f"{path}: expected a study's key with study, page, questions and films, found a damaged one ({short(str(error))})"
         ) from error
     return key
+
+
+def _expect_texts(entry: Mapping[str, Any], names: Sequence[str]) -> None:
+    for name in names:
+        if not isinstance(entry[name], str):
+            raise ValueError(f"{name}: {shown(entry[name])}")
+
+
+def _asked(question: Mapping[str, Any]) -> tuple[str, ...]:
+    """What makes a question the same as another."""
+    return (question["text"], *question["films"])
 
 
 def read_rater(path: Path, key: Key) -> Rater:
@@ -110,7 +120,7 @@ def read_rater(path: Path, key: Key) -> Rater:
         asked = entry.get("id") if isinstance(entry, dict) else None
         question = key.questions.get(asked) if isinstance(asked, str) else None
         if question is None or entry["id"] in answers:
-            raise UserError(f"{path}: key 'answers': expected one answer to each question, found {str(entry)[:60]}")
+            raise UserError(f"{path}: key 'answers': expected one answer to each question, found {shown(entry)}")
         allowed = (YES, NO) if question["kind"] != BEST else question["films"]
         if entry.get("answer") not in allowed:
             told = " or ".join(allowed)
@@ -166,8 +176,8 @@ def inattention(rater: Rater, key: Key) -> str:
     wrong = sum(rater.answers[name] != question["expected"] for name, question in checks.items())
     if wrong:
         return f"{wrong} of {len(checks)} attention checks answered wrongly"
-    first = {(question["text"], *question["films"]): name for name, question in key.of_kind(DEPICTS).items()}
-    pairs = [(name, first[(question["text"], *question["films"])]) for name, question in key.of_kind(REPEAT).items()]
+    first = {_asked(question): name for name, question in key.of_kind(DEPICTS).items()}
+    pairs = [(name, first[_asked(question)]) for name, question in key.of_kind(REPEAT).items()]
     differ = sum(rater.answers[one] != rater.answers[other] for one, other in pairs)
     if differ > REPEATS_THAT_MAY_DIFFER * len(pairs):
         return f"{differ} of {len(pairs)} questions that were asked twice answered in two ways"

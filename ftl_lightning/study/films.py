@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.errors import UserError, shown
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.schema import read_json
 from ftl_lightning.tensor_file import file_hash, visible
 
@@ -19,7 +19,8 @@ TRAINING, NEW = "training", "new"
 """Settings: concepts of pretraining and new ones."""
 CHECKS = {"check-yes": "yes", "check-no": "no"}
 """Methods that are none: films whose answer is obvious, by the answer."""
-_NEEDED, _OPTIONAL = ("concept", "method", "file"), ("scenario", "setting", "row")
+_NEEDED, _TEXTS = ("concept", "method", "file"), ("scenario", "setting")
+_OPTIONAL = (*_TEXTS, "row")
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ def read_films(folder: Path, domain: Domain, scenarios: int, seed: int) -> list[
         else:
             rows = _drawn(common[concept], scenarios, seed, f"{folder / name}: of {concept!r}")
         for row in rows:
-            if not isinstance(row, int) or not 0 <= row < len(source):
-                raise UserError(f"{listing}: key 'row' of {name}: expected 0 to {len(source) - 1}, found {row!r}")
+            if type(row) is not int or not 0 <= row < len(source):
+                raise UserError(f"{listing}: key 'row' of {name}: expected 0 to {len(source) - 1}, found {shown(row)}")
             films.append(
                 Film(
                     setting=str(entry.get("setting", TRAINING if concept in domain.concepts.training else NEW)),
@@ -138,8 +139,8 @@ def _listed(path: Path) -> list[dict[str, Any]]:
         if not isinstance(entry, dict):
             raise UserError(f"{where}: expected {{{', '.join(_NEEDED)}}}, found {type(entry).__name__}")
         if unknown := sorted(set(entry) - {*_NEEDED, *_OPTIONAL}):
-            raise UserError(f"{where}: expected the keys {', '.join((*_NEEDED, *_OPTIONAL))}, found {', '.join(unknown)}")
-        for key in _NEEDED:
+            raise UserError(f"{where}: expected the keys {', '.join((*_NEEDED, *_OPTIONAL))}, found {short(', '.join(unknown))}")
+        for key in (*_NEEDED, *(key for key in _TEXTS if key in entry)):
             if not isinstance(entry.get(key), str) or not entry[key]:
                 raise UserError(f"{where}: key {key!r}: expected a text, found {shown(entry.get(key))}")
     return entries
@@ -159,10 +160,12 @@ def _compare(folder: Path, films: Sequence[Film]) -> None:
     methods = sorted({film.method for film in films})
     for scenario in sorted({film.scenario for film in films}):
         own = [film for film in films if film.scenario == scenario]
-        if found := {film.setting for film in own} if len({(f.setting, f.concept) for f in own}) > 1 else set():
-            raise UserError(f"{folder}: scenario {scenario!r}: expected one concept and setting, found {', '.join(sorted(found))}")
-        shown = sorted(film.method for film in own)
-        if shown != methods:
+        if len({(film.setting, film.concept) for film in own}) > 1:
+            told = short(", ".join(sorted({film.setting for film in own})))
+            raise UserError(f"{folder}: scenario {shown(scenario)}: expected one concept and setting, found {told}")
+        found = sorted(film.method for film in own)
+        if found != methods:
             raise UserError(
-                f"{folder}: scenario {scenario!r}: expected a film of each of {', '.join(methods)}, found {', '.join(shown)}"
+                f"{folder}: scenario {shown(scenario)}: expected a film of each of {short(', '.join(methods))}, "
+                f"found {short(', '.join(found))}"
             )

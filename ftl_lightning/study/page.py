@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,11 @@ import numpy as np
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.wireframe import ABOVE, Wireframe, seen, window
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.escape import script_json
 from ftl_lightning.evaluation.animation import frame_milliseconds, gif
+from ftl_lightning.printing import line, plain
+from ftl_lightning.schema import read_json
 from ftl_lightning.study.questions import Questions, film_id
 from ftl_lightning.tensor_file import bytes_hash, content_hash, write_text
 
@@ -65,8 +69,8 @@ def make_study(domain: Domain, questions: Questions, out: Path, title: str = "",
     """
     minutes = max(1, round(len(questions.page) * SECONDS_A_QUESTION / 60))
     content: dict[str, Any] = {
-        "title": title or "Which films depict what they should?",
-        "consent": (consent.strip() or CONSENT).replace("{minutes}", str(minutes)),
+        "title": line(title) or "Which films depict what they should?",
+        "consent": (plain(consent).strip() or CONSENT).replace("{minutes}", str(minutes)),
         "agree": AGREE,
         "questions": questions.page,
         **_drawings(domain, questions),
@@ -94,11 +98,12 @@ def _keep_other_keys(path: Path, study: str) -> None:
     """Without its key nobody can read a study's answers any more."""
     if path.is_file():
         try:
-            found = json.loads(path.read_text(encoding="utf-8")).get("study")
-        except (OSError, ValueError, AttributeError):
+            found = read_json(path).get("study")
+        except (UserError, OSError, AttributeError):
             found = "something else"
         if found != study:
-            raise UserError(f"{path}: expected no key of another study, found that of {found}; name another folder with --out")
+            told = short(str(found))
+            raise UserError(f"{path}: expected no key of another study, found that of {told}; name another folder with --out")
 
 
 def _drawings(domain: Domain, questions: Questions) -> dict[str, Any]:
@@ -146,15 +151,12 @@ def _animations(pictures: Sequence[Sequence[np.ndarray[Any, Any]]], questions: Q
 
 
 def _html(content: Mapping[str, Any]) -> str:
-    # What opens a tag is written another way, so that no concept's words can end the script element.
-    data = json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
     parts = {
-        "%TITLE%": html.escape(str(content["title"])),
-        "%STYLE%": (HERE / "page.css").read_text(encoding="utf-8"),
-        "%SCRIPT%": (HERE / "page.js").read_text(encoding="utf-8"),
-        "%DATA%": data,
+        "TITLE": html.escape(str(content["title"])),
+        "STYLE": (HERE / "page.css").read_text(encoding="utf-8"),
+        "SCRIPT": (HERE / "page.js").read_text(encoding="utf-8"),
+        "DATA": script_json(content),
     }
-    text = (HERE / "page.html").read_text(encoding="utf-8")
-    for mark, part in parts.items():
-        text = text.replace(mark, part, 1)
-    return text
+    template = (HERE / "page.html").read_text(encoding="utf-8")
+    # In one go: what is put in is not looked at again, so that a title '%DATA%' stays one.
+    return re.sub(f"%({'|'.join(parts)})%", lambda found: parts[found[1]], template)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ftl_lightning.printing import line
 from ftl_lightning.study.films import CHECKS, Film
 
 YES, NO = "yes", "no"
@@ -86,7 +87,7 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
         own = [film for film in real if film.scenario == scenario]
         if len(own) > 1:
             shown = sorted(number_of[id(film)] for film in own)
-            add(f"Which film depicts “{own[0].concept}” best?", shown, kind=BEST, scenario=scenario, setting=own[0].setting)
+            add(f"Which film depicts “{line(own[0].concept)}” best?", shown, kind=BEST, scenario=scenario, setting=own[0].setting)
     page, key = [], {}
     for number, index in enumerate(rng.permutation(len(questions)).tolist()):
         shown, kind = questions[index]
@@ -105,7 +106,7 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
 
 def whether(concept: str) -> str:
     """The first question."""
-    return f"Does this film depict “{concept}”?"
+    return f"Does this film depict “{line(concept)}”?"
 
 
 def _told(film: Film, still: bool) -> dict[str, Any]:

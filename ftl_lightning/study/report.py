@@ -11,6 +11,8 @@ from rich.table import Table
 from scipy.stats import binomtest
 
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.summary import literal
+from ftl_lightning.printing import line
 from ftl_lightning.study.agreement import krippendorff_alpha
 from ftl_lightning.study.answers import Key, Rater, inattention, read_key, read_raters
 from ftl_lightning.study.films import NEW, TRAINING
@@ -67,16 +69,18 @@ class Report:
         """One line for each setting and question, one column for each method."""
         scenarios = ", ".join(f"{count} {setting}" for setting, count in self.scenarios.items())
         raters = "1 rater" if self.raters == 1 else f"{self.raters} raters"
-        table = Table(title=f"{raters}; scenarios: {scenarios}", box=box.SIMPLE, title_justify="left", padding=0)
+        table = Table(
+            title=literal(f"{raters}; scenarios: {scenarios}", "table.title"), box=box.SIMPLE, title_justify="left", padding=0
+        )
         for name in ("setting", "per cent", *self.methods, "alpha"):
-            table.add_column(name, justify="left" if name in ("setting", "per cent") else "right")
+            table.add_column(literal(name), justify="left" if name in ("setting", "per cent") else "right")
         for setting in self.scenarios:
             for kind, label in LABELS.items():
                 found = [self.shares.get((setting, kind, method)) for method in self.methods]
                 if any(found):
                     cells = ["" if share is None else _cell(share) for share in found]
                     alpha = self.agreement.get((setting, kind), math.nan)
-                    table.add_row(setting, label, *cells, "-" if math.isnan(alpha) else f"{alpha:.2f}")
+                    table.add_row(literal(setting), label, *cells, "-" if math.isnan(alpha) else f"{alpha:.2f}")
         return table
 
 
@@ -135,8 +139,8 @@ def _counted(key: Key, raters: Sequence[Rater], dropped: tuple[str, ...], refuse
         agreement={where: krippendorff_alpha(found) for where, found in units.items()},
         scenarios={setting: len(scenarios[setting]) for setting in order},
         raters=len(raters),
-        dropped=dropped,
-        refused=refused,
+        dropped=tuple(map(line, dropped)),
+        refused=tuple(map(line, refused)),
     )
 
 

@@ -1,0 +1,37 @@
+"""Files of measurements that are no results files: JSON with a list of rows."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from ftl_lightning.errors import UserError, shown
+from ftl_lightning.schema import built, read_json
+
+T = TypeVar("T")
+
+
+def read_listed(path: Path, key: str, kind: Callable[..., T], expected: str) -> list[T]:
+    """The rows of a file.
+
+    Args:
+        path: of it.
+        key: that has them.
+        kind: a dataclass that says what a row has; ``null`` is the same as nothing.
+        expected: what the file is expected to hold, for messages.
+
+    Raises:
+        UserError: naming the file and the row, for one of something else.
+    """
+    try:
+        content = read_json(path)
+        rows = content.get(key) if isinstance(content, dict) else None
+        if not isinstance(rows, list):
+            raise UserError(f"key {key!r}: expected a list, found {shown(rows)}")
+        return [built(kind, _told(row), f"{key}[{number}]") for number, row in enumerate(rows)]
+    except UserError as error:
+        told = str(error).removeprefix(f"{path}: ")
+        raise UserError(f"{path}: expected {expected}, found something else ({told})") from error
+
+
+def _told(row: object) -> object:
+    return {name: value for name, value in row.items() if value is not None} if isinstance(row, dict) else row
