@@ -14,7 +14,7 @@ from ftl_lightning import inputs, trust
 from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_of_machine
 from ftl_lightning.parse_error import one_line
-from ftl_lightning.printing import any_terminal
+from ftl_lightning.printing import any_terminal, line, say
 from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
@@ -57,21 +57,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with trust.person(arguments) as rest:
             _dispatch(rest)
     except UserError as error:
-        line = " ".join(str(error).split())
-        print(f"error: {''.join(one if one.isprintable() else '?' for one in line)}", file=sys.stderr)
+        say("error:", line(str(error)), error=True)
         return 2
     except OmegaConfBaseException as error:
-        print(f"error: configuration: {str(error).splitlines()[0]}", file=sys.stderr)
+        say("error: configuration:", line(str(error).splitlines()[0]), error=True)
         return 2
     except ArgumentError as error:
-        print(f"error: {one_line(str(error), arguments)}", file=sys.stderr)
+        say("error:", line(one_line(str(error), arguments)), error=True)
         return 2
     except KeyboardInterrupt:
         return _interrupted()
     except (OSError, MemoryError, RuntimeError, ValueError) as error:
         if (told := mistake_of_machine(error)) is None:
             raise
-        print(f"error: {told}", file=sys.stderr)
+        say("error:", line(told), error=True)
         return 2
     except SystemExit as stop:  # after --help and --print_config
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning's way
@@ -81,16 +80,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _interrupted() -> int:
-    print("interrupted: what was written before is whole", file=sys.stderr)
+    say("interrupted: what was written before is whole", error=True)
     return 130
 
 
 def _dispatch(arguments: list[str]) -> None:
     verb = arguments[0] if arguments else "--help"
     if verb in ("-h", "--help"):
-        print(_overview())
+        say(_overview())
     elif verb == "--version":
-        print(__version__)
+        say(__version__)
     elif verb in COMMANDS:
         inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftl_lightning.ablation import Stage
+from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_count, expect_range
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def generate(
         write_minari(demonstrations, name)
     else:
         demonstrations.save(out)
-    print(f"{name}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
+    say(f"{name}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
 
 
 def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: str = "") -> None:
@@ -81,7 +82,7 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
         raise UserError(f"out: expected a file to write, found none: domain {domain} names no table of its own")
     path = Path(out) if out else Path(str(concepts.table))
     write_table(path, load_encoder(encoder, concepts.table, revision), concepts.descriptions)
-    print(path)
+    say(path)
 
 
 def prepare(domain: str, root: str = "", out: str = "") -> None:
@@ -98,7 +99,7 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
     found = load_domain(domain)
     if found.prepare is None:
         raise UserError(f"domain: expected one whose recordings are prepared, found {domain!r}, which needs nothing of the kind")
-    print(found.prepare(Path(root) if root else None, Path(out) if out else None))
+    say(found.prepare(Path(root) if root else None, Path(out) if out else None))
 
 
 @dataclass(frozen=True)
@@ -175,24 +176,24 @@ def sample(options: SampleOptions) -> None:
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)
     plans.save(options.out)
     # Where a domain has no configuration of its own, what invert was told must be told again.
-    print(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
+    say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
     for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
-        print(f"{name} on '{goal}': {value:.2f}")
+        say(f"{name} on '{goal}': {value:.2f}")
     if options.figure:
         with atomic(options.figure) as temporary:
             model.render(plans, goal).savefig(temporary, dpi=110)
-        print(options.figure)
+        say(options.figure)
     if options.execute and starts is not None:
         done = model.execute(composition, starts, goal, replan=options.replan or None, seed=options.seed, **_sampling(options))
         for name, value in done.outcomes.items():
-            print(f"closed loop, {name}: {value:.2f}, mean of {len(starts)} episodes")
+            say(f"closed loop, {name}: {value:.2f}, mean of {len(starts)} episodes")
         if options.animation:
             done.save(options.animation)
     elif options.animation and film:
         with atomic(options.animation) as temporary:
             temporary.write_bytes(gif(captioned(film(plans.states[0]), goal or Path(options.concept).stem)))
     if options.animation:
-        print(options.animation)
+        say(options.animation)
 
 
 def _sampling(options: SampleOptions) -> dict[str, Any]:
@@ -258,17 +259,17 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), MODELS)))
     model.check(learned, concept)
     names = model.config.training_concepts
-    print(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
+    say(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
     if learned.modes is not None:
         how = "a random mixture of them" if learned.modes.mixed else "one of them"
         composed = "composed too" if learned.knots > 1 else "composed, from the components that have no mode"
-        print(f"alone it generates from {how}: {len(learned.modes)} modes; {composed}")
+        say(f"alone it generates from {how}: {len(learned.modes)} modes; {composed}")
     parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
     if len(learned.weights) > 1:
         whole = learned.at_knots(learned.weights @ learned.embeddings)
         parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]
     for name, embedding in parts:
-        print(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
+        say(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
 
 
 def ablate(
@@ -304,8 +305,8 @@ def report(results: str = "results", out: str = "results/report", readme: str = 
     """
     from ftl_lightning.reporting.report import write_report
 
-    print(write_report(Path(results), Path(out), Path(readme) if readme else None))
-    print(f"written to {out}")
+    say(write_report(Path(results), Path(out), Path(readme) if readme else None))
+    say(f"written to {out}")
 
 
 @dataclass(frozen=True)
@@ -353,8 +354,8 @@ def study(options: StudyOptions) -> None:
     domain = load_domain(options.domain)
     films = read_films(Path(options.films), domain, options.scenarios, options.seed)
     made = make_study(domain, ask(films, options.repeats, options.still, options.seed), Path(options.out), options.title, words)
-    print(f"{made.page}: {made.films} films, {made.questions} questions, {made.size / 1000:.0f} kB; it goes to the raters")
-    print(f"{made.key}: says which film is whose; it stays with you")
+    say(f"{made.page}: {made.films} films, {made.questions} questions, {made.size / 1000:.0f} kB; it goes to the raters")
+    say(f"{made.key}: says which film is whose; it stays with you")
 
 
 def study_report(answers: list[str] = [], key: str = "", all_raters: bool = False) -> None:  # noqa: B006 (never changed)
@@ -365,8 +366,6 @@ def study_report(answers: list[str] = [], key: str = "", all_raters: bool = Fals
         key: the study's key; empty for key.json beside the first file.
         all_raters: also count raters who failed attention checks.
     """
-    import sys
-
     from ftl_lightning.errors import UserError
     from ftl_lightning.evaluation.summary import show
     from ftl_lightning.study.report import NOTES, study_table
@@ -377,6 +376,6 @@ def study_report(answers: list[str] = [], key: str = "", all_raters: bool = Fals
     beside = (first if first.is_dir() else first.parent) / "key.json"
     found = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)
     for line in (*(f"refused: {line}" for line in found.refused), *found.dropped):
-        print(line, file=sys.stderr)
+        say(line, error=True)
     show(found.table())
-    print("\n".join(NOTES))
+    say("\n".join(NOTES))

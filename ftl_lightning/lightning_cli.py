@@ -20,6 +20,7 @@ from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.inputs import options
 from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
+from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.trainer import Trainer
 from ftl_lightning.training_bar import TrainingBar, accuracies
@@ -114,11 +115,11 @@ class CommandLine(LightningCLI):
     def after_fit(self) -> None:
         """Say where the model is."""
         folder = self.model.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
-        print(", ".join((f"pretrained model: {folder}", *accuracies(self.trainer))))
+        say(", ".join((f"pretrained model: {folder}", *accuracies(self.trainer))))
 
     def after_invert(self) -> None:
         """Say where the run was logged."""
-        print(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
+        say(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
     def before_fit(self) -> None:
         """Find the last checkpoint, if it is asked for."""
@@ -140,7 +141,7 @@ class CommandLine(LightningCLI):
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)
             if options["ckpt_path"] is None and self._verb in ("fit", "invert"):
-                print(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
+                say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
 
     def _parse_ckpt_path(self) -> None:
         # Lightning would let the checkpoint's hyper-parameters, class included, override configuration and command line.

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
+from ftl_lightning.printing import plain, say
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -48,7 +50,7 @@ def bar(title: str, total: int | None, done: int = 0, lines: bool = True) -> Ite
     Yields:
         What to call after each step.
     """
-    own = _Bar(title, total, done, lines and _SCREEN.depth == 0)
+    own = _Bar(plain(title), total, done, lines and _SCREEN.depth == 0)
     opened = _SCREEN.display is None and sys.stderr.isatty()
     if opened:
         _SCREEN.display = _display()
@@ -74,12 +76,12 @@ def _display() -> "Progress":
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.fields[steps]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[told]}"),
+        TextColumn("{task.fields[told]}", markup=False),
         console=Console(stderr=True, soft_wrap=True),  # paths that are printed stay in one line
         transient=True,
         # Standard output may be a file, where what is printed has to go, not to the terminal.
@@ -109,7 +111,7 @@ class _Bar:
 
     def advance(self, steps: int = 1, told: str = "") -> None:
         before, self.done = self.done, self.done + steps
-        self.told = told or self.told
+        self.told = plain(told) or self.told
         if _SCREEN.display is not None and self.task is not None:
             _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), told=self.told)  # type: ignore[arg-type]
         elif self.lines and self.total and LINES * before // self.total < LINES * self.done // self.total < LINES:
@@ -136,4 +138,4 @@ class _Bar:
 
     @staticmethod
     def _write(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
+        say(line, error=True)

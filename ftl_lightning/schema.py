@@ -127,7 +127,9 @@ def expect_type(value: Any, kind: Any, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return built(kind, value, key)
     if origin in (Union, types.UnionType):
-        for one in arguments:
+        if value is None and type(None) in arguments:
+            return None
+        for one in (one for one in arguments if one is not type(None)):
             try:
                 return expect_type(value, one, key)
             except UserError as error:

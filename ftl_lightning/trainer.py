@@ -1,6 +1,7 @@
 """Lightning's trainer with one more verb."""
 
 import inspect
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
 from ftl_lightning.ranges import expect_range
@@ -43,6 +44,30 @@ USUAL = {"max_epochs": 1, "deterministic": True}
 """Of a configuration that ships with ``invert``, where Lightning's default is another one."""
 
 
+RANGES = {
+    "num_nodes": (1, 1000),
+    "max_steps": (-1, math.inf),
+    "max_epochs": (-1, math.inf),
+    "min_steps": (0, math.inf),
+    "min_epochs": (0, math.inf),
+    "check_val_every_n_epoch": (1, math.inf),
+    "log_every_n_steps": (0, math.inf),
+    "accumulate_grad_batches": (1, math.inf),
+    "num_sanity_val_steps": (-1, math.inf),
+    "reload_dataloaders_every_n_epochs": (0, math.inf),
+    "gradient_clip_val": (0, math.inf),
+}
+"""Of options that Lightning takes as they are, and fails with in the middle of a run or never uses."""
+LIMITS = {
+    "limit_train_batches": "batches",
+    "limit_val_batches": "batches",
+    "limit_test_batches": "batches",
+    "overfit_batches": "batches",
+    "val_check_interval": "steps",
+}
+"""The same of shares or numbers, with what they count."""
+
+
 class Trainer(pl.Trainer):
     """A trainer that can also ``invert``.
 
@@ -54,7 +79,23 @@ class Trainer(pl.Trainer):
     verb = "fit"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+        for name, (least, most) in RANGES.items():
+            if isinstance(value := options.get(name), int | float) and not isinstance(value, bool):
+                expect_range(f"trainer.{name}", value, least, most)
+        for name, words in LIMITS.items():
+            value = options.get(name)
+            if isinstance(value, int | float) and not (0 <= value <= 1 or (value > 1 and value == int(value))):
+                raise UserError(f"trainer.{name}: expected a share from 0 to 1 or a whole number of {words}, found {value}")
+        if options.get("val_check_interval") == 0:
+            raise UserError(
+                "trainer.val_check_interval: expected more than 0, found 0; trainer.limit_val_batches 0 validates never"
+            )
+        try:
+            super().__init__(*arguments, **options)
+        except UserError:
+            raise
+        except Exception as error:  # of many kinds, by accelerators, strategies and plugins
+            raise UserError(f"trainer: {short(str(error), 200)}") from error
         known = inspect.signature(pl.Trainer.__init__).parameters
         usual = {name: one.default for name, one in known.items()} | USUAL
         self.unusual = {
@@ -74,7 +115,6 @@ class Trainer(pl.Trainer):
                 raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
         if self.limit_train_batches == 0:
             raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
-        expect_range("trainer.gradient_clip_val", self.gradient_clip_val or 0, 0)
         with self._restoring():
             super().fit(model, *arguments, **options)
 

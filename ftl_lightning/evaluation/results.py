@@ -57,6 +57,8 @@ class Row:
     version: str = __version__
 
 
+FOLDER = r"\w[\w .+-]{0,99}"
+"""What a domain may be called: each has a folder in a report."""
 LARGEST_WHOLE = 2**53
 """Of whole numbers, seeds among them."""
 COLUMNS = [field.name for field in fields(Row)]
@@ -164,7 +166,7 @@ def _read(file: Path) -> pd.DataFrame:
 def _table(file: Path, kinds: Any) -> pd.DataFrame:
     expect_readable(file, "results", MOST_TEXT)
     try:
-        return pd.read_csv(file, dtype=kinds, keep_default_na=False)
+        return pd.read_csv(file.absolute(), dtype=kinds, keep_default_na=False, compression=None)
     except (OSError, ValueError, OverflowError, MemoryError, csv.Error) as error:
         raise UserError(f"expected a results file, found something else ({short(str(error), 100)})") from error
 
@@ -175,6 +177,8 @@ def _bad_cell(table: pd.DataFrame) -> tuple[int, str, str] | None:
         numbers = pd.to_numeric(values.astype(str), errors="coerce") if name not in _TEXT else pd.Series(dtype=float)
         if name == "role":
             good, expected = values.isin((METHOD, REFERENCE)), f"{METHOD} or {REFERENCE}"
+        elif name == "domain":
+            good, expected = values.str.fullmatch(FOLDER), "a name of letters, digits and - . +"
         elif name in _TEXT:
             good = values.notna() & ((values != "") | (name in _MAYBE_EMPTY))
             expected = "a text"

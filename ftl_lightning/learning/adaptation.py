@@ -18,6 +18,7 @@ from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
+from ftl_lightning.printing import say
 from ftl_lightning.targets import expect_writable_file
 
 
@@ -119,7 +120,7 @@ class Adaptation(pl.LightningModule, ABC):
             path = self._file(name)
             concept.save(path)
             weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
-            print(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
+            say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
 
     def on_train_end(self) -> None:
         self.find()

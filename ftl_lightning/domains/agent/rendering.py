@@ -12,6 +12,7 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
 from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.escape import figure_text
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """A bowl is an open triangle that points down."""
@@ -33,7 +34,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(2.6 * columns, 1.3 * rows + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=9)
+    figure.suptitle(figure_text(title), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     grid = figure.subplots(rows, columns, squeeze=False).flat
     for axes, plan, initial, frame in zip(grid, states, starts.observed[OBSERVED], frames, strict=False):

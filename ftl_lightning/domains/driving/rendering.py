@@ -16,6 +16,7 @@ from ftl_lightning.demonstrations.features import InitialStates, Observed, take
 from ftl_lightning.domains.driving.environment import NAMES, SCENARIO, TRAFFIC
 from ftl_lightning.domains.driving.scenarios import VEHICLES, decision_seconds, make
 from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
 EGO, OTHER, ROAD, PLAN = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a"
@@ -99,7 +100,8 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     columns = min(len(shown), MAX_COLUMNS, max(1, int(PAGE / width)))
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(max(width * columns, 5.0), AREA / width * rows + 0.8), layout="constrained")
-    figure.suptitle(title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)", fontsize=11)
+    told = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
+    figure.suptitle(figure_text(told), fontsize=11)
     for number, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
         if number >= len(shown):
             axes.set_axis_off()

@@ -132,9 +132,8 @@ def read_folder(root: Path) -> tuple[Recordings, tuple[Segment, ...]]:
         UserError: where there is no folder, no recordings in it, or damaged ones.
     """
     if not root.is_dir():
-        raise UserError(
-            f"data.root: expected a folder of recordings, found {'a file' if root.exists() else 'nothing'} at {short(str(root))}; {WHERE}"
-        )
+        found = f"{'a file' if root.exists() else 'nothing'} at {short(str(root))}"
+        raise UserError(f"data.root: expected a folder of recordings, found {found}; {WHERE}")
     path = next((root / name for name in FILES if (root / name).is_file()), None)
     if path is None:
         raise UserError(f"{root}: expected {FILE}, found {'other files' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")

@@ -13,6 +13,7 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.skeleton import BONES, FPS, HIPS, SHOULDERS, as_joints
 from ftl_lightning.domains.wireframe import Points, Wireframe, drawn, seen
+from ftl_lightning.escape import figure_text
 from ftl_lightning.evaluation.animation import side_by_side as side_by_side
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
@@ -70,7 +71,7 @@ def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: In
     shown = states[:MAX_SAMPLES]
     figure = Figure(figsize=(8.2, 1.65 * len(shown) + 0.5), layout="constrained")
     told = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
-    figure.suptitle(told, fontsize=9)
+    figure.suptitle(figure_text(told), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     for axes, plan, frame in zip(figure.subplots(len(shown), 1, squeeze=False).flat, shown, frames, strict=False):
         _strip(axes, wireframe(plan), frame)

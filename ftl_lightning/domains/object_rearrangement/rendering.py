@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
+from ftl_lightning.escape import figure_text
 
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
 CORNERS = {"triangle": 3, "square": 4}
@@ -27,7 +28,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(1.5 * columns, 1.5 * rows + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=9)
+    figure.suptitle(figure_text(title), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     for axes, state, frame in zip(figure.subplots(rows, columns, squeeze=False).flat, states[:, 0], frames, strict=False):
         _scene(axes, state, frame)

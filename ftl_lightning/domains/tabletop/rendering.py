@@ -14,6 +14,7 @@ from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tabletop.environment import THRESHOLD, TableTopEnvironment
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, SIGHT, WHITE, outlines
 from ftl_lightning.domains.tabletop.world import COLOUR, FRONT
+from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS = 4
 FRAMES = 60
@@ -34,7 +35,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(2.2 * columns, 1.8 * rows + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=9)
+    figure.suptitle(figure_text(title), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     grid = list(figure.subplots(rows, columns, squeeze=False).flat)
     for number, (axes, plan) in enumerate(zip(grid, states, strict=False)):
