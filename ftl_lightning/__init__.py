@@ -4,20 +4,34 @@
 # current folder off Python's path before any module could be found in it.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from ftl_lightning.concepts.composition import Composition
+    from ftl_lightning.concepts.concept import Concept
+    from ftl_lightning.demonstrations.container import Demonstrations
     from ftl_lightning.few_shot import FewShot
+    from ftl_lightning.shipped import list_models
     from ftl_lightning.version import __version__
 
-__all__ = ["FewShot", "__version__"]
+__all__ = ["Composition", "Concept", "Demonstrations", "FewShot", "__version__", "list_models"]
+_MODULES = {
+    "Composition": "concepts.composition",
+    "Concept": "concepts.concept",
+    "Demonstrations": "demonstrations.container",
+    "FewShot": "few_shot",
+    "__version__": "version",
+    "list_models": "shipped",
+}
+"""Where each of them is."""
 
 
 def __getattr__(name: str) -> object:
     """What is offered, imported when it is asked for."""
-    if name == "FewShot":
-        from ftl_lightning.few_shot import FewShot
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it offers {', '.join(__all__)}")
+    import importlib
 
-        return FewShot
-    if name == "__version__":
-        from ftl_lightning.version import __version__
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
-        return __version__
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    """What can be imported, before it is."""
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

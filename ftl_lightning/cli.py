@@ -26,6 +26,7 @@ TRAINER_VERBS = {
 COMMANDS = {
     "generate": "draw demonstrations of a task into a file",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
+    "concepts": "list the training concepts of a model",
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
@@ -34,7 +35,7 @@ COMMANDS = {
     "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"generate", "encode", "prepare", "study"}
+POSITIONAL = {"concepts", "generate", "encode", "prepare", "study"}
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""

@@ -1,12 +1,13 @@
 """The verbs that need no trainer: plain typed functions. Their imports are inside, so that each starts at once."""
 
 import importlib.util
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftl_lightning.ablation import Stage
-from ftl_lightning.printing import say
+from ftl_lightning.printing import line, say
 from ftl_lightning.ranges import expect_count, expect_range
 
 if TYPE_CHECKING:
@@ -241,6 +242,25 @@ def _start_task(options: SampleOptions, domain: "Domain") -> str:
     return next((text for text in named if text and domain.concepts.reads(text)), "")
 
 
+def concepts(pretrained: str) -> None:
+    """List the training concepts of a model, one in a line.
+
+    Args:
+        pretrained: folder of the pretrained model, or the name of one that ships.
+    """
+    from ftl_lightning.errors import about
+    from ftl_lightning.learning.model_config import CONFIG, read_config
+    from ftl_lightning.schema import expect_type
+    from ftl_lightning.shipped import pretrained_folder
+
+    folder = pretrained_folder(pretrained)
+    found = read_config(folder).get("training_concepts")
+    with about(folder / CONFIG):
+        texts = expect_type(found, Sequence[str], "training_concepts")
+    for text in texts:
+        say(line(text))
+
+
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     """Say in words what a learned concept is made of: its nearest training concepts and their best non-negative combination.
 
@@ -375,7 +395,7 @@ def study_report(answers: list[str] = [], key: str = "", all_raters: bool = Fals
     first = Path(answers[0])
     beside = (first if first.is_dir() else first.parent) / "key.json"
     found = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)
-    for line in (*(f"refused: {line}" for line in found.refused), *found.dropped):
-        say(line, error=True)
+    for told in (*(f"refused: {told}" for told in found.refused), *found.dropped):
+        say(told, error=True)
     show(found.table())
     say("\n".join(NOTES))

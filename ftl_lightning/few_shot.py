@@ -1,45 +1,47 @@
 """The few-shot learner in Python: load a pretrained model, learn a concept, sample, compose, judge, draw, execute."""
 
+import functools
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition, Part, parse_composition
+from ftl_lightning.arguments import changed, device_named, expect_path, expect_text, expect_whole
+from ftl_lightning.arrays import Start, demonstrations_of, expect_of_domain, scenes_of, starts_of
+from ftl_lightning.batches import sampled
+from ftl_lightning.concepts.composition import Composition, Part, parse_composition, space_of
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import Explanation, explain
-from ftl_lightning.demonstrations.container import Demonstrations, padded
-from ftl_lightning.demonstrations.features import Feature, InitialStates
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.evaluation.execution import Execution, closed_loop_of
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.hub import card as model_card
 from ftl_lightning.learning.hub import download, upload
 from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.model_config import DIFFUSION
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
-from ftl_lightning.ranges import expect_count
+from ftl_lightning.ranges import LARGEST_STEP
+from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED, generator
-from ftl_lightning.shipped import pretrained_folder, shipped
+from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped, shipped_models
 from ftl_lightning.tensor_file import atomic
 from ftl_lightning.trust import vouching
 from ftl_lightning.tuned import Tuned
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Start = InitialStates | Mapping[str, ArrayLike] | ArrayLike
-"""Where behaviour starts: initial states, observed features by name, or the only feature's values ``(sample, *shape)``."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,15 +56,12 @@ class LearnedConcept(Composition):
     concept: Concept
     model: ConceptModel
 
-    def __repr__(self) -> str:
-        modes = "" if self.modes is None else f", {len(self.modes)} modes{', mixed' if self.modes.mixed else ''}"
-        knots = "" if self.knots == 1 else f", {self.knots} knots"
-        adapter = "" if self.concept.adapter is None else ", an adapter"
-        kind = f"K = {len(self.weights)}{knots}{modes}{adapter}"
-        return f"LearnedConcept({self.concept.origin.name!r}, {kind}, loss {self.concept.origin.loss:.3f})"
+    def _words(self) -> Iterator[str]:
+        return self.concept._words()
 
     def explain(self, nearest: int = 3) -> Explanation:
         """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""
+        expect_whole("nearest", nearest, 1)
         embedding = (self.concept.weights @ self.concept.embeddings).unflatten(0, (self.knots, -1)).mean(dim=0)
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
 
@@ -71,7 +70,14 @@ class LearnedConcept(Composition):
         self.concept.save(path)
 
 
-class FewShot:
+GIVEN = {
+    "sample": ("count", "observed", "seed", "batch_size", "progress"),
+    "execute": ("scenes", "goal", "replan", "environment", "seed"),
+}
+"""Arguments beside the settings of a sampler."""
+
+
+class FewShot(Shown):
     """A pretrained model with everything that is needed to learn a concept from a few demonstrations and to use it.
 
     Args:
@@ -104,18 +110,47 @@ class FewShot:
         Raises:
             UserError: naming the place, if there is no model, or one that asks for code.
         """
-        folder = pretrained_folder(name)
-        if not folder.is_dir() and str(name).count("/") == 1 and not str(name).startswith((".", "~")):
+        expect_path("name", name, f"the name of a model, such as {', '.join(shipped_models())}, or its folder")
+        if settings is not None:
+            expect_path("settings", settings, "a configuration file of invert")
+        folder, place = pretrained_folder(name), device_named(device)
+        owner, slash, own = str(name).partition("/")
+        if not folder.is_dir() and slash and "/" not in own and owner not in FOLDERS and not owner.startswith((".", "~")):
             folder = download(str(name))
         with vouching([] if settings is None else Tuned.domains(settings)):
-            model = load_model(folder, domain).to(device)
+            model = load_model(folder, domain).to(place)
         if settings is None:
             group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
-            own = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
-            settings = own if own.is_file() else "conf/invert/own.yaml"
+            tuned = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
+            settings = tuned if tuned.is_file() else "conf/invert/own.yaml"
         found = cls(model, Tuned.read(settings))
         found.settings = str(settings)
         return found
+
+    def _words(self) -> Iterator[str]:
+        return self.model._words()
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return self.model.device
+
+    def to(self, device: str | torch.device) -> Self:
+        """Compute on another device from now on; concepts that are there already go with it when they are used.
+
+        Returns:
+            This same object.
+
+        Raises:
+            UserError: for a device that this machine does not have.
+        """
+        self.model.to(device_named(device))
+        return self
+
+    @functools.cached_property
+    def _space(self) -> str:
+        """Which model's concepts those of this model are; a hash takes a while."""
+        return space_of(self.model.config.domain, self.model.hash)
 
     @property
     def domain(self) -> Domain:
@@ -133,7 +168,7 @@ class FewShot:
         Raises:
             UserError: for a text that is none.
         """
-        return Composition(self.model.concept(text)[None], torch.ones(1, device=self.model.device))
+        return Composition(self.model.concept(text)[None], torch.ones(1, device=self.device), space=self._space)
 
     def load(self, path: str | Path) -> LearnedConcept:
         """A learned concept from its file.
@@ -141,6 +176,7 @@ class FewShot:
         Raises:
             UserError: naming the file, if it is none or belongs to another model.
         """
+        expect_path("path", path, "the file of a learned concept")
         concept = Concept.load(path)
         self.model.check(concept, path)
         return self._learned(concept)
@@ -153,6 +189,7 @@ class FewShot:
         Raises:
             UserError: for a part that is neither, or nothing at all.
         """
+        expect_text("compose", text, f"{self.training_concepts[0]}:1.2 + learned.safetensors")
         parts = [self._part(part) for part in parse_composition(text)]
         if not parts:
             raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
@@ -163,10 +200,33 @@ class FewShot:
         return found.on(self.domain.plans.grouped(part.groups), self.model.config.state_dim) if part.groups else found
 
     def _learned(self, concept: Concept) -> LearnedConcept:
-        device = self.model.device
-        own = concept.composition.to(device)
+        own = concept.composition.to(self.device)
         parts = {field.name: getattr(own, field.name) for field in fields(Composition)}
-        return LearnedConcept(**parts, concept=concept, model=self.model)
+        return LearnedConcept(**parts | {"space": self._space}, concept=concept, model=self.model)
+
+    def _own(self, call: str, concept: object) -> Composition:
+        """A concept of this model, on its device.
+
+        Raises:
+            UserError: for one of another model, or what is no concept.
+        """
+        if not isinstance(concept, Composition):
+            text = short(self.training_concepts[0], 40)
+            raise UserError(
+                f"{call}: expected a concept, such as model[{text!r}], model.compose(text), model.load(path) or what model.learn "
+                f"returns, found {shown(concept)}"
+            )
+        if concept.space not in ("", self._space):
+            raise UserError(
+                f"{call}: expected a concept of this model, {self._space}, found one of {concept.space}; learn it with this model"
+            )
+        width = self.model.config.concept_dim * concept.knots
+        if concept.embeddings.dim() != 2 or concept.embeddings.shape[1] != width:
+            raise UserError(
+                f"{call}: expected a concept of this model, {self._space}, with embeddings (K, {width}), "
+                f"found {tuple(concept.embeddings.shape)}"
+            )
+        return concept if concept.weights.device == self.device else concept.to(self.device)
 
     def demonstrations(
         self,
@@ -185,29 +245,8 @@ class FewShot:
         Raises:
             UserError: where they do not fit the model.
         """
-        if isinstance(states, Demonstrations):
-            return states.fitted(self.domain.observed).named(name)
-        padded, lengths = _padded(states)
-        if padded.dim() != 3 or padded.shape[2] != len(self.domain.plans.columns):
-            expected = f"(demo, time, {len(self.domain.plans.columns)})"
-            raise UserError(f"states: expected shape {expected}, found {tuple(padded.shape)}")
-        features, per_step = {}, []
-        for key, values in _by_name(observed, self.domain.observed).items():
-            feature = self.domain.observed[key]
-            found = _padded(values)[0]
-            if found.dim() == len(feature.shape) + 2:
-                per_step.append(key)
-            features[key] = found.float() if feature.kind == "vector" else found
-        return Demonstrations(
-            states=padded,
-            lengths=lengths,
-            domain=self.domain.name,
-            state_names=self.domain.plans.columns,
-            state_units=self.domain.plans.units,
-            concepts=(name,) * len(padded),
-            observed=features,
-            per_step=tuple(per_step),
-        ).fitted(self.domain.observed)
+        expect_text("name", name, "go to red bowl")
+        return demonstrations_of(self.domain, states, observed, name)
 
     def learn(
         self,
@@ -229,17 +268,21 @@ class FewShot:
             progress: show a bar.
             changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``components=1``.
 
+        Warns:
+            UserWarning: where demonstrations are longer than the model's plans, and says what is learned from then.
+
         Raises:
             UserError: where demonstrations or settings do not fit the model.
         """
         own = self.demonstrations(states, observed, name)
         if len(found := set(own.concepts)) > 1:
-            raise UserError(f"states: expected demonstrations of one concept, found those of {', '.join(sorted(found))}")
-        try:
-            settings = replace(self.tuned.inversion, **changes, seed=seed)
-        except TypeError as error:
-            raise UserError(f"learn: expected settings of an inversion, found others ({error})") from None
-        total = steps or self.tuned.learning_steps
+            told = short(", ".join(sorted(found)), 150)
+            raise UserError(f"states: expected demonstrations of one concept, found those of {told}; choose with select(name)")
+        expect_whole("seed", seed, 0, None)
+        settings = replace(changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress")), seed=int(seed))
+        total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
+        if told := longer_than_plans(own, self.model):
+            warnings.warn(told, stacklevel=2)
         with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
             learned = invert(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
         self._examples.append(own)
@@ -251,13 +294,27 @@ class FewShot:
         Raises:
             UserError: in domains without initial states.
         """
-        found = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
+        expect_text("goal", goal, self.training_concepts[0])
+        count, seed = expect_whole("count", count, 1), expect_whole("seed", seed, 0, None)
+        try:
+            found = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
+        except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
+            self._judging.expect_goal(goal)
+            raise
         if found is None:
             raise UserError(f"starts: expected a domain with initial states, found {self.domain.name}")
         return found
 
     def sample(
-        self, concept: Composition, count: int = 10, observed: Start | None = None, *, seed: int = 0, **changes: Any
+        self,
+        concept: Composition,
+        count: int = 10,
+        observed: Start | None = None,
+        *,
+        seed: int = 0,
+        batch_size: int | None = None,
+        progress: bool = False,
+        **changes: Any,
     ) -> Demonstrations:
         """Generate behaviour.
 
@@ -266,23 +323,27 @@ class FewShot:
             count: of plans; where they start from initial states, one for each.
             observed: where they start, in domains with observed features.
             seed: of the noise.
+            batch_size: plans that are made at once, where memory is short; ``None`` for all. They are the same but for rounding.
+            progress: show a bar.
             changes: of :class:`~ftl_lightning.diffusion.samplers.Sampling`: ``sampler``, ``steps``, ``temperature``.
 
         Returns:
             Plans ``(sample, horizon, state)`` as demonstrations, with where they start.
 
         Raises:
-            UserError: for a start that does not fit the model.
+            UserError: for a concept of another model, or a start that does not fit the model.
         """
-        sampling, starts = self._sampling(changes), self._starts(observed)
+        concept, sampling = self._own("sample", concept), self._sampling("sample", changes)
+        starts = starts_of(self.domain, observed)
         if starts is None and self.domain.observed:
             told = ", ".join(f"{name} {feature.shape}" for name, feature in self.domain.observed.items())
             raise UserError(f"observed: expected where plans start ({told}), found nothing; model.starts(goal) draws some")
         if starts is not None:
             count = len(starts)
-        expect_count("count", count, 1)
-        seen = {} if starts is None else {key: values.to(self.model.device) for key, values in starts.observed.items()}
-        states = self.model.sample([concept], count, sampling, [generator("cpu", seed)], seen)[0].cpu()
+        count, seed = expect_whole("count", count, 1), expect_whole("seed", seed, 0, None)
+        size = None if batch_size is None else expect_whole("batch_size", batch_size, 1)
+        seen = {} if starts is None else moved(starts.observed, self.device)
+        states = sampled(self.model, concept, count, sampling, seed, seen, size, progress).cpu()
         return Demonstrations(
             states=states,
             lengths=torch.full((count,), states.shape[1]),
@@ -295,28 +356,19 @@ class FewShot:
             provenance={"pretrained": self.model.hash, "seed": seed, "temperature": sampling.temperature},
         )
 
-    def _sampling(self, changes: Mapping[str, Any]) -> Sampling:
-        try:
-            found = replace(self.tuned.sampling, **changes)
-        except TypeError as error:
-            raise UserError(f"sample: expected sampler, steps or temperature, found others ({error})") from None
+    def _sampling(self, call: str, changes: Mapping[str, Any]) -> Sampling:
+        found = changed(call, self.tuned.sampling, changes, GIVEN[call])
         if self.model.max_steps is not None and found.steps > self.model.max_steps:
             raise UserError(f"steps: expected 1 to {self.model.max_steps} (the model's T), found {found.steps}")
         return found
-
-    def _starts(self, given: Start | None) -> InitialStates | None:
-        if given is None or isinstance(given, InitialStates):
-            return given
-        features = self.domain.observed
-        found = {name: _tensor(values) for name, values in _by_name(given, features).items()}
-        return InitialStates({name: own.float() if features[name].kind == "vector" else own for name, own in found.items()})
 
     def evaluate(self, plans: Demonstrations, goal: str) -> dict[str, float]:
         """What the domain's metrics say of plans: shares of right ones, or means, by name.
 
         Raises:
-            UserError: for a goal that the domain cannot judge by, or a domain that judges no plans.
+            UserError: for plans of another domain, a goal that the domain cannot judge by, or a domain that judges no plans.
         """
+        expect_of_domain("evaluate", plans, self.domain)
         if not self._judging.metrics:
             raise UserError(f"evaluate: expected a domain that judges plans, found {self.domain.name}; execute them")
         self._judging.expect_goal(goal)
@@ -336,6 +388,7 @@ class FewShot:
 
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """A picture of plans; with a goal, right ones are framed green and wrong ones red."""
+        expect_of_domain("render", plans, self.domain)
         starts, right = plans.initial_states, None
         if goal:
             self._judging.expect_goal(goal)
@@ -366,22 +419,26 @@ class FewShot:
             changes: as in :meth:`sample`.
 
         Raises:
-            UserError: in a domain without an environment, or without one of this name.
+            UserError: for a concept of another model; in a domain without an environment, or without one of this name.
         """
         from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, reset, roll_out, sampled_plans
 
         loop = closed_loop_of(self.domain)
         if environment and environment not in loop.others:
-            raise UserError(f"environment: expected {' or '.join(loop.others) or 'none'}, found {environment!r}")
+            raise UserError(f"environment: expected {' or '.join(loop.others) or 'none'}, found {shown(environment)}")
         loop = loop.inside(environment)
         if goal:
             self._judging.expect_goal(goal)
-        if replan is not None and replan < 1:
-            raise UserError(f"replan: expected 1 or more, found {replan}")
-        starts = scenes if isinstance(scenes, InitialStates) else reset(loop, _tensor(scenes))
+        every = self.tuned.replan if replan is None else expect_whole("replan", replan, 1)
+        concept, sampling, seed = (
+            self._own("execute", concept),
+            self._sampling("execute", changes),
+            expect_whole("seed", seed, 0, None),
+        )
+        starts = scenes if isinstance(scenes, InitialStates) else reset(loop, scenes_of(scenes))
         draws = [generator("cpu", seed, 1, episode) for episode in range(len(starts))]
-        make = sampled_plans(self.model, [concept] * len(starts), self._sampling(changes), draws)
-        policy = PlanFollower(make, planner(self.model, loop), replan or self.tuned.replan)
+        make = sampled_plans(self.model, [concept] * len(starts), sampling, draws)
+        policy = PlanFollower(make, planner(self.model, loop), every)
         rollout = roll_out(loop, starts, policy)
         return Execution(self.domain, goal, rollout, policy.followed)
 
@@ -409,36 +466,3 @@ def _sum(parts: Iterable[Composition]) -> Composition:
     for part in rest:
         first = first + part
     return first
-
-
-def _tensor(values: ArrayLike) -> Tensor:
-    found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
-    return found if found.dtype == torch.uint8 else found.float()
-
-
-def _padded(values: Any) -> tuple[Tensor, Tensor]:
-    """Arrays of maybe different lengths as one, each padded with its last time, and the lengths."""
-    if not isinstance(values, Tensor | np.ndarray):
-        each = [_tensor(one) for one in values]
-        if each and each[0].dim() and len({len(one) for one in each}) > 1:
-            return padded(each)
-        values = torch.stack(each)
-    found = _tensor(values)
-    return found, torch.full((len(found),), found.shape[1] if found.dim() > 1 else 1)
-
-
-def _by_name(observed: Any, features: Mapping[str, Feature]) -> dict[str, Any]:
-    """Observed features by name; a single value is the only one's.
-
-    Raises:
-        UserError: for a name that is none, or a value without one where there are several.
-    """
-    if observed is None:
-        return {}
-    if isinstance(observed, Mapping):
-        if unknown := set(observed) - set(features):
-            raise UserError(f"observed: expected {', '.join(features) or 'nothing'}, found {', '.join(sorted(unknown))}")
-        return dict(observed)
-    if len(features) != 1:
-        raise UserError(f"observed: expected features by name ({', '.join(features) or 'none'}), found values without one")
-    return {next(iter(features)): observed}

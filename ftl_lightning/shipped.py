@@ -4,6 +4,7 @@ In the repository both folders stand at the root; the package holds links to the
 the documentation are true in a checkout and, after ``pip install``, in any folder.
 """
 
+import difflib
 from pathlib import Path
 
 FOLDERS = ("conf", "pretrained")
@@ -33,6 +34,27 @@ def shipped(path: str | Path) -> Path:
 def shipped_models() -> list[str]:
     """Names of the models that ship, such as ``agent``; baselines apart."""
     return sorted(path.parent.name for path in MODELS.glob("*/config.json"))
+
+
+def list_models(baselines: bool = False) -> list[str]:
+    """Names of the models that ship, which ``FewShot.from_pretrained`` takes.
+
+    Args:
+        baselines: name those of the baselines too, such as ``baseline/cvae/agent``.
+    """
+    others = sorted(str(path.parent.relative_to(MODELS)) for path in MODELS.glob("baseline/*/*/config.json"))
+    return shipped_models() + (others if baselines else [])
+
+
+def missing_model(place: str | Path) -> str:
+    """What is told of a place where no model is, with the nearest names of those that ship."""
+    told = str(place).lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
+    near = difflib.get_close_matches(told, list_models(baselines=True), n=2)
+    ship = f"did you mean {' or '.join(near)}? all that ship:" if near else f"{', '.join(shipped_models())} ship, see"
+    return (
+        f"{Path(place) / 'config.json'}: expected a pretrained model, found nothing; {ship} ftl_lightning.list_models(); "
+        "to make one, run: python -m ftl_lightning fit"
+    )
 
 
 def pretrained_folder(name: str | Path) -> Path:

@@ -2,11 +2,13 @@
 
 import inspect
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import lightning.pytorch as pl
+from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from ftl_lightning.errors import UserError, short
@@ -96,6 +98,8 @@ class Trainer(pl.Trainer):
             raise
         except Exception as error:  # of many kinds, by accelerators, strategies and plugins
             raise UserError(f"trainer: {short(str(error), 200)}") from error
+        if isinstance(self.accelerator, CPUAccelerator):
+            expect_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
         known = inspect.signature(pl.Trainer.__init__).parameters
         usual = {name: one.default for name, one in known.items()} | USUAL
         self.unusual = {

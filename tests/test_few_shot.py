@@ -84,7 +84,7 @@ def test_settings_can_come_from_a_file_of_ones_own(scenes: FewShot) -> None:
 
 @pytest.mark.parametrize("name", ["chess", "/nowhere/at/all", "./mine/model"])
 def test_a_place_without_a_model_is_told(name: str) -> None:
-    with pytest.raises(UserError, match=r"config\.json: expected a pretrained model, found No such file or directory"):
+    with pytest.raises(UserError, match=r"config\.json: expected a pretrained model, found nothing"):
         FewShot.from_pretrained(name)
 
 
@@ -135,7 +135,7 @@ def test_a_setting_can_be_another(scenes: FewShot, shown: Demonstrations, capsys
     assert found.concept.origin.weights == "learned"
     assert scenes.learn(shown.states, name="mine", steps=1).concept.origin.name == "mine"
     for changes, message in (
-        ({"pace": 1}, "learn: expected settings of an inversion, found others"),
+        ({"pace": 1}, r"learn: expected components, omega, .* \(or steps, seed, progress\), found .pace."),
         ({"components": 0}, r"model\.components: expected 1 or more, found 0"),
     ):
         with pytest.raises(UserError, match=message):
@@ -204,7 +204,8 @@ def test_concepts_that_are_none_or_anothers_are_told(scenes: FewShot, drives: Fe
     scenes.learn(shown, steps=1).save("mine.safetensors")
     with pytest.raises(UserError, match=r"mine\.safetensors: key 'domain': expected 'agent' \(the pretrained model's\)"):
         drives.load("mine.safetensors")
-    with pytest.raises(UserError, match="concept 'circle': expected a training concept of the model: circle"):
+    near = "concept 'circle': expected a training concept of the model: .*circle above square; .* nearest of 12; list all: python"
+    with pytest.raises(UserError, match=near):
         scenes["circle"]
     with pytest.raises(UserError, match="concept, compose: expected a learned concept, training concepts or both, found neither"):
         scenes.compose("")
@@ -234,7 +235,7 @@ def test_samples_are_the_models_and_a_seed_repeats_them(scenes: FewShot) -> None
         ({"steps": 101}, r"steps: expected 1 to 100 \(the model's T\), found 101"),
         ({"sampler": "euler"}, "sampler: expected one of"),
         ({"temperature": -1.0}, "temperature: expected 0 or more"),
-        ({"guidance": 2}, "sample: expected sampler, steps or temperature, found others"),
+        ({"guidance": 2}, "sample: expected sampler, steps, temperature .*, found .guidance."),
         ({"count": 0}, "count: expected 1 or more, found 0"),
         ({"observed": np.zeros((2, 3))}, "observed: expected features by name"),
     ],

@@ -2,14 +2,17 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from numbers import Real
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.ranges import LARGEST_FACTOR, expect_range
+from ftl_lightning.representation import Shown, counted, numbers
 
 Context = tuple[Tensor, ...]
 """What a condition encoder read from the observed features, each ``(batch, ...)``; empty where nothing is observed."""
@@ -33,8 +36,8 @@ STRETCH = 1.5
 """Mixtures of modes lie so much farther from the modes' mean than convex combinations: these alone vary less than the modes do."""
 
 
-@dataclass(frozen=True)
-class Modes:
+@dataclass(frozen=True, repr=False)
+class Modes(Shown):
     """Several sets of embeddings of one concept: behaviours that are right in different ways.
 
     Attributes:
@@ -50,6 +53,12 @@ class Modes:
 
     def __len__(self) -> int:
         return len(self.weights)
+
+    def _words(self) -> Iterator[str]:
+        yield counted(len(self), "mode")
+        yield f"K = {self.weights.shape[-1]}"
+        if self.mixed:
+            yield "mixed"
 
     def __mul__(self, factor: float) -> "Modes":
         return replace(self, weights=factor * self.weights)
@@ -74,8 +83,13 @@ class Modes:
         return embeddings, shares @ self.weights, torch.arange(count, device=self.weights.device)
 
 
-@dataclass(frozen=True)
-class Composition:
+def space_of(domain: str, model_hash: str) -> str:
+    """The concept space of a model, in words."""
+    return f"{domain} (hash {model_hash})"
+
+
+@dataclass(frozen=True, repr=False)
+class Composition(Shown):
     """Concepts and the guidance weights with which they are composed; sums, differences and multiples are
     compositions too.
 
@@ -91,6 +105,7 @@ class Composition:
             all of it on every column.
         adapters: changes of the denoiser, each for the concepts that ``adapter`` says.
         adapter: ``(..., K)`` int64, the number from 1 of each concept's adapter, 0 for the denoiser as it is; ``None`` for zeros.
+        space: of which model's concepts it is made, see :func:`space_of`; empty where nobody said.
     """
 
     embeddings: Tensor
@@ -100,13 +115,37 @@ class Composition:
     columns: Tensor | None = field(default=None, kw_only=True)
     adapters: tuple[Adapter, ...] = field(default=(), kw_only=True)
     adapter: Tensor | None = field(default=None, kw_only=True)
+    space: str = field(default="", kw_only=True)
+
+    def _words(self) -> Iterator[str]:
+        yield f"K = {self.weights.shape[-1]}"
+        if self.knots > 1:
+            yield counted(self.knots, "knot")
+        if self.modes is not None:
+            yield counted(len(self.modes), "mode")
+        if self.weights.dim() == 1:
+            yield f"weights {numbers(self.weights.tolist())}"
+        if self.columns is not None:
+            yield "on some columns"
+        if self.adapters:
+            yield counted(len(self.adapters), "adapter")
+        yield f"of {self.space or 'any model'}"
 
     def __add__(self, other: "Composition") -> "Composition":
         """Both; concepts that do not vary over the plan are said at every knot of those that do.
 
         Raises:
-            UserError: for concepts of different numbers of knots, neither of which is 1; for two adapters that change all.
+            UserError: for concepts of different numbers of knots, neither of which is 1; for two adapters that change all; for
+                concepts of two models, or what is no concept.
         """
+        if not isinstance(other, Composition):
+            raise UserError(f"compose: expected a concept on each side of '+' and '-', found {shown(other)}; model[text] is one")
+        if self.space and other.space and self.space != other.space:
+            raise UserError(
+                f"compose: expected concepts of one model, found one of {self.space} and one of {other.space}; "
+                "learn them with the same model"
+            )
+        other = other if other.weights.device == self.weights.device else other.to(self.weights.device)
         if all(any(adapter.everywhere for adapter in part.adapters) for part in (self, other)):
             raise UserError("compose: expected at most one concept whose adapter changes the whole network, found two")
         knots, state = _common([self.knots, other.knots]), _columns_of((self, other))
@@ -119,9 +158,18 @@ class Composition:
             columns=None if state is None else torch.cat([_given(part.columns) for part in parts], dim=-2),
             adapters=(*self.adapters, *other.adapters),
             adapter=torch.cat([_given(part.adapter) for part in parts], dim=-1) if self.adapters or other.adapters else None,
+            space=self.space or other.space,
         )
 
     def __mul__(self, factor: float) -> "Composition":
+        """The same with its guidance weights multiplied.
+
+        Raises:
+            UserError: for what is no finite number.
+        """
+        if not isinstance(factor, Real | Tensor) or isinstance(factor, bool):
+            raise UserError(f"compose: expected a number to multiply a concept with, found {shown(factor)}")
+        expect_range("compose: weight", float(factor))
         return self._with(weights=factor * self.weights, modes=self.modes and self.modes * factor)
 
     __rmul__ = __mul__
@@ -130,7 +178,7 @@ class Composition:
         return -1.0 * self
 
     def __sub__(self, other: "Composition") -> "Composition":
-        return self + -other
+        return self + (-other if isinstance(other, Composition) else other)
 
     def on(self, columns: Sequence[int], state: int) -> "Composition":
         """The same with weight on some columns of a state alone, of ``state`` columns."""
@@ -182,12 +230,21 @@ class Composition:
         adapter = None if self.adapter is None else self.adapter.expand(rows, *self.adapter.shape)
         return self._with(embeddings=embeddings, weights=weights, modes=None, columns=columns, adapter=adapter), own
 
+    def row(self, number: int) -> "Composition":
+        """One ``(K, ...)`` of several compositions ``(row, K, ...)`` without modes."""
+        return self._with(
+            embeddings=self.embeddings[number],
+            weights=self.weights[number],
+            columns=None if self.columns is None else self.columns[number],
+            adapter=None if self.adapter is None else self.adapter[number],
+        )
+
     def drawn(self, generator: torch.Generator) -> "Composition":
         """The composition ``(K, ...)`` of a single sample, without modes."""
         if self.modes is None:
             return self
         rows, row = self.draw(1, generator)
-        return self._with(embeddings=rows.embeddings[row[0]], weights=rows.weights[row[0]], modes=None)
+        return rows.row(int(row[0]))
 
 
 def _together(one: Composition, other: Composition) -> Modes | None:
@@ -368,7 +425,7 @@ def parse_composition(text: str) -> list[Part]:
     """Concepts, weights and groups of columns from ``'circle right of square:1.2 + walk@legs,trunk:0.8'``; a missing weight is 1.
 
     Raises:
-        UserError: for a weight that is no finite number, or an empty concept or group.
+        UserError: for a weight that is no number up to :data:`~ftl_lightning.ranges.LARGEST_FACTOR`, or an empty concept or group.
     """
     parts = []
     for part in text.split(" + ") if text.strip() else ():
@@ -379,9 +436,10 @@ def parse_composition(text: str) -> list[Part]:
         except ValueError:
             omega = math.nan
         found = Part(concept.strip(), omega, tuple(group.strip() for group in groups.split(",")) if at else ())
-        if not (found.concept and math.isfinite(omega) and all(found.groups)):
+        if not (found.concept and abs(omega) <= LARGEST_FACTOR and all(found.groups)):
             raise UserError(
-                f"compose: expected 'concept:weight + concept@group:weight' with finite numbers as weights, found {part!r}"
+                "compose: expected 'concept:weight + concept@group:weight', "
+                f"weights up to {LARGEST_FACTOR:g}, found {short(part)!r}"
             )
         parts.append(found)
     return parts

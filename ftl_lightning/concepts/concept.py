@@ -1,6 +1,6 @@
 """A learned concept and its file."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Self
@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.concepts.adapter import LowRank
-from ftl_lightning.concepts.composition import Composition, Modes
+from ftl_lightning.concepts.composition import Composition, Modes, space_of
 from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.ranges import LARGEST_FACTOR
+from ftl_lightning.representation import Shown, counted, numbers
 from ftl_lightning.schema import built, expect_type
 from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
 
@@ -49,8 +51,8 @@ class Origin:
     loss: float
 
 
-@dataclass(frozen=True)
-class Concept:
+@dataclass(frozen=True, repr=False)
+class Concept(Shown):
     """K embeddings and their guidance weights.
 
     Attributes:
@@ -90,10 +92,25 @@ class Concept:
                 told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
                 raise UserError(f"key {name!r}: expected float32 of shape {shape}, found {told}")
 
+    def _words(self) -> Iterator[str]:
+        yield repr(self.origin.name)
+        yield f"K = {len(self.weights)}"
+        if self.knots > 1:
+            yield counted(self.knots, "knot")
+        if self.modes is not None:
+            yield f"{counted(len(self.modes), 'mode')}{', mixed' if self.modes.mixed else ''}"
+        if self.adapter is not None:
+            yield "an adapter"
+        yield f"loss {self.origin.loss:.3f}"
+        yield f"weights {numbers(self.weights.tolist())}"
+        yield f"from {counted(self.origin.count, 'demonstration')}"
+        yield f"of {space_of(self.origin.domain, self.origin.pretrained)}"
+
     @property
     def composition(self) -> Composition:
         """What it is generated from, alone or composed with others."""
-        whole = Composition(self.embeddings, self.weights, modes=self.modes, knots=self.knots)
+        space = space_of(self.origin.domain, self.origin.pretrained)
+        whole = Composition(self.embeddings, self.weights, modes=self.modes, knots=self.knots, space=space)
         if self.adapter is None:
             return whole
         return replace(whole, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
@@ -124,12 +141,15 @@ class Concept:
         return {"" if self.knots == 1 else f", knot {knot}": own for knot, own in enumerate(each, start=1)}
 
     def expect_finite(self, where: str) -> None:
-        """Refuse a concept of numbers that are none, or of such a loss.
+        """Refuse a concept of numbers that are none or too large, or of such a loss.
 
         Raises:
             UserError: naming ``where`` and the first of them.
         """
         expect_finite(self.numbers, where, "lower model.learning_rate")
+        for name, value in self.numbers.items():
+            if name != "loss" and value.numel() and not value.abs().max() <= LARGEST_FACTOR:
+                raise UserError(f"{where}: expected numbers up to {LARGEST_FACTOR:g}, found larger ones in {short(name)!r}")
 
     @property
     def numbers(self) -> dict[str, Tensor]:
@@ -199,7 +219,7 @@ class Concept:
             learned = cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)
             if header.get("components", len(learned.weights)) != len(learned.weights):
                 raise UserError(f"key 'components': expected {len(learned.weights)}, found {shown(header['components'])}")
-            expect_finite(learned.numbers, "content", "learn it again")
+            learned.expect_finite("content")
             return learned
 
 

@@ -8,6 +8,8 @@ from torch import Tensor
 
 ROUNDING = 1e-4
 """Weights below this share of the largest are rounding and the penalty's doing."""
+MOST_TOLD = 12
+"""Parts of a combination that are told one by one, the largest."""
 RIDGE = 1e-4
 """Penalty of weights, as a share of the training embeddings' largest singular value: well above their rounding (1e-7 of that value
 in float32) and well below the singular values of what tells concepts apart (2e-2 of it and more in the shipped models).
@@ -22,17 +24,28 @@ class Explanation:
         nearest: training concepts with the cosine of their angle to the embedding, the nearest first.
         combination: the non-negative combination of training concepts that is nearest to the embedding, with the smallest weights:
             those with a weight, the largest first.
-        explained: share of the embedding's squared length that the combination holds, from 0 to 1.
+        explained: share of the embedding's squared length that the combination holds, from 0 to 1. The combination is the nearest
+            point of a cone, so what is left is at right angles to it and the two squared lengths add up to the embedding's.
     """
 
     nearest: tuple[tuple[str, float], ...]
     combination: tuple[tuple[str, float], ...]
     explained: float
 
+    @property
+    def unexplained(self) -> float:
+        """Share of the embedding's squared length that no non-negative combination of training concepts holds."""
+        return 1 - self.explained
+
     def __str__(self) -> str:
         near = ", ".join(f"{text} ({cosine:.2f})" for text, cosine in self.nearest)
-        parts = " + ".join(f"{weight:.2f} {text}" for text, weight in self.combination) or "nothing"
-        return f"nearest: {near}; best combination: {parts} (explains {self.explained:.2f})"
+        told = [f"{weight:.2f} {text}" for text, weight in self.combination[:MOST_TOLD]]
+        rest = len(self.combination) - len(told)
+        parts = " + ".join([*told, *([f"{rest} smaller ones"] if rest else [])]) or "nothing"
+        return (
+            f"nearest: {near}; best combination: {parts} (explains {self.explained:.2f}); not explained: "
+            f"{100 * self.unexplained:.0f} % of its squared length, which no non-negative combination of training concepts holds"
+        )
 
 
 def explain(embedding: Tensor, names: Sequence[str], training: Tensor, nearest: int = 3) -> Explanation:

@@ -6,7 +6,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -17,6 +17,8 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed, take
 from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.limits import MOST_TENSORS, expect_readable, expect_unpacked
+from ftl_lightning.representation import Shown, counted
 from ftl_lightning.schema import expect_type
 from ftl_lightning.tensor_file import bytes_hash, load_tensors, save_tensors, serialise
 
@@ -35,8 +37,8 @@ MOST_SHRUNK = 1032
 """zlib makes one byte of so many at most."""
 
 
-@dataclass(frozen=True)
-class Demonstrations:
+@dataclass(frozen=True, repr=False)
+class Demonstrations(Shown):
     """Demonstrations of one or several tasks, in the domain's units.
 
     Attributes:
@@ -110,6 +112,20 @@ class Demonstrations:
 
     def __len__(self) -> int:
         return len(self.states)
+
+    def _words(self) -> Iterator[str]:
+        if self.domain:
+            yield repr(self.domain)
+        yield f"states {tuple(self.states.shape)}"
+        shortest, longest = int(self.lengths.min()), int(self.lengths.max())
+        if shortest < self.states.shape[1]:
+            yield f"lengths {shortest} to {longest}"
+        if any(self.concepts):
+            yield repr(self.concepts[0]) if len(set(self.concepts)) == 1 else counted(len(set(self.concepts)), "concept")
+        for name, values in self.observed.items():
+            yield f"{name} {tuple(values.shape)}"
+        if self.scenes is not None:
+            yield f"scenes {tuple(self.scenes.shape)}"
 
     @property
     def tensors(self) -> dict[str, Tensor]:
@@ -373,6 +389,8 @@ def _unpacked(tensors: Mapping[str, Tensor], shapes: object, per_step: Sequence[
                 f"key {key!r}: expected images of shape ({begin}, ...) that fit into {len(packed)} compressed bytes, "
                 f"found the shape {shown(shape)} in the header; the file is damaged"
             )
+        with about(f"key {short(key)!r}"):
+            expect_unpacked(math.prod(shape), len(packed), "images")
         content = _decompressed(key, packed.numpy().tobytes(), math.prod(shape))
         found[key] = torch.from_numpy(np.frombuffer(content, dtype=np.uint8)).reshape(shape)
     return found
@@ -392,10 +410,9 @@ def _decompressed(key: str, packed: bytes, size: int) -> bytearray:
 
 
 def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    if not path.is_file():
-        raise UserError(f"{path}: expected a demonstrations file, found nothing")
+    size = expect_readable(path, "demonstrations")
     try:
-        _expect_sizes(path)
+        expect_arrays(path, size)
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: np.asarray(archive[name]) for name in archive.files}
             texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
@@ -428,12 +445,9 @@ def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 _DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)
 """What numpy and zipfile raise for files that are damaged or none of theirs."""
-MOST_BYTES = 512 * 2**20
-"""Of the arrays of an ``.npz``, where they are more than :data:`MOST_RATIO` times as large as the file."""
-MOST_RATIO = 100
 
 
-def _expect_sizes(path: Path) -> None:
+def expect_arrays(path: Path, size: int) -> None:
     """Refuse an archive that is much larger than its file, or holds an array whose header names another size than its bytes have.
 
     Raises:
@@ -441,13 +455,15 @@ def _expect_sizes(path: Path) -> None:
     """
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        if (total := sum(member.file_size for member in members)) > max(MOST_BYTES, MOST_RATIO * path.stat().st_size):
-            raise ValueError(f"{total} bytes in a file of {path.stat().st_size}; save it without compression")
+        if len(members) > MOST_TENSORS:
+            raise ValueError(f"{len(members)} arrays")
+        with about(path):
+            expect_unpacked(sum(member.file_size for member in members), size, "arrays")
         for member in members:
             with archive.open(member) as file:
                 version = np.lib.format.read_magic(file)
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
                 shape, _, dtype = read(file)
-                size = math.prod(shape) * dtype.itemsize
-                if not dtype.hasobject and (min(shape, default=0) < 0 or size != member.file_size - file.tell()):
+                stated = math.prod(shape) * dtype.itemsize
+                if not dtype.hasobject and (min(shape, default=0) < 0 or stated != member.file_size - file.tell()):
                     raise ValueError(f"{member.filename} is not of the size that it says")

@@ -5,7 +5,7 @@ Name, plans, concepts and source have to be said; everything else has a default.
 
 import difflib
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
@@ -23,7 +23,8 @@ from ftl_lightning.domains.distances import Distance
 from ftl_lightning.domains.paper import OURS, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
+from ftl_lightning.representation import Shown, counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -260,8 +261,8 @@ def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> Non
         raise UserError(f"{what}: expected a tensor of shape {' or '.join(map(str, shapes))}, found {found}")
 
 
-@dataclass(frozen=True)
-class Domain:
+@dataclass(frozen=True, repr=False)
+class Domain(Shown):
     """A domain.
 
     Attributes:
@@ -307,6 +308,17 @@ class Domain:
     def __post_init__(self) -> None:
         if self.show is _UNSAID:
             object.__setattr__(self, "show", line_drawings(self.plans))
+
+    def _words(self) -> Iterator[str]:
+        yield repr(self.name)
+        yield f"plans of {counted(self.plans.horizon, 'state')} of {counted(len(self.plans.columns), 'column')}"
+        yield counted(len(self.concepts.training), "training concept")
+        for name, feature in self.observed.items():
+            yield f"observes {name} {feature.shape}"
+        if self.metrics:
+            yield f"judged by {', '.join(self.metrics)}"
+        if self.closed_loop is not None:
+            yield f"executed for up to {counted(self.closed_loop.steps, 'step')}"
 
     def measure(self, goal: str, states: Tensor, starts: InitialStates | None) -> dict[str, Tensor]:
         """What each metric says of plans ``(sample, horizon, state)``, by name.
@@ -357,6 +369,8 @@ class Domain:
         Raises:
             UserError: naming the nearest goals that it knows.
         """
+        if not isinstance(goal, str):
+            raise UserError(f"{key}: expected a text, such as {shown(self.concepts.training[0])}, found {shown(goal)}")
         if not self.concepts.reads(goal):
             known = [text for text in self.concepts.descriptions if self.concepts.reads(text)]
             near = difflib.get_close_matches(goal, known, n=5, cutoff=0.4) or known[:5]

@@ -1,6 +1,6 @@
 """Executed plans as a user of the Python API holds them: outcomes, frames, a film."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,13 +11,14 @@ from torch import Tensor
 
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
+from ftl_lightning.representation import Shown, counted
 from ftl_lightning.tensor_file import atomic
 
 
-@dataclass(frozen=True)
-class Execution:
+@dataclass(frozen=True, repr=False)
+class Execution(Shown):
     """Episodes in which plans were executed.
 
     Attributes:
@@ -32,6 +33,14 @@ class Execution:
     rollout: Rollout
     followed: Mapping[int, Sequence[Tensor]]
 
+    def _words(self) -> Iterator[str]:
+        yield repr(self.domain.name)
+        yield counted(len(self.rollout.failed), "episode")
+        if self.goal:
+            yield f"goal {self.goal!r}"
+        for name, value in self.outcomes.items():
+            yield f"{name} {value:.2f}"
+
     @property
     def outcomes(self) -> dict[str, float]:
         """Share of episodes in which something happened, or its mean, by name; empty without a goal."""
@@ -42,9 +51,9 @@ class Execution:
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
         """Pictures ``(height, width, 3)`` of an episode."""
-        plans = self.followed.get(episode)
+        plans = self.followed.get(episode) if isinstance(episode, int) else None
         if not plans:
-            raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {episode}")
+            raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {shown(episode)}")
         if (film := closed_loop_of(self.domain).film) is None:
             raise UserError(f"film: expected a domain that films episodes, found {self.domain.name}")
         return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))

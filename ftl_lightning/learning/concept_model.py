@@ -1,8 +1,9 @@
 """What every method's model has: a concept space, normalisation, a view of behaviour, and the folder it is kept in."""
 
+import difflib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
@@ -24,6 +25,7 @@ from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.learning.model_config import CONFIG, VERSION, ModelConfig, expect_domain, find_view, read_config, upgrade
 from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weights
+from ftl_lightning.representation import Shown, counted
 from ftl_lightning.schema import built
 from ftl_lightning.tensor_file import (
     bytes_hash,
@@ -36,6 +38,8 @@ from ftl_lightning.tensor_file import (
 )
 
 KIND = "generative model"
+NEAREST = 3
+"""Training concepts that are told for a text that is none."""
 EXAMPLES = "demonstrations.safetensors"
 """In the folder of a model of a user's own data."""
 
@@ -47,7 +51,7 @@ class Draws(NamedTuple):
     noise: Tensor
 
 
-class ConceptModel(nn.Module, ABC):
+class ConceptModel(Shown, nn.Module, ABC):
     """A model of behaviour given a concept: what adapting, sampling and evaluation ask of every method.
 
     Args:
@@ -95,6 +99,15 @@ class ConceptModel(nn.Module, ABC):
         self.initial_normalization = initial_normalization
         self.register_buffer("empty", embeddings[0].clone())
         self.register_buffer("training_embeddings", embeddings[1:].clone())
+
+    def _words(self) -> Iterator[str]:
+        yield repr(self.config.domain)
+        yield self.name
+        yield counted(len(self.config.training_concepts), "training concept")
+        yield counted(sum(parameter.numel() for parameter in self.parameters()), "parameter")
+        if self.device.type != "meta":  # on paper it has no weights
+            yield f"hash {self.hash}"
+        yield f"on {self.device}"
 
     @abstractmethod
     def sample(
@@ -169,11 +182,14 @@ class ConceptModel(nn.Module, ABC):
         """The embedding ``(n,)`` of a training concept.
 
         Raises:
-            UserError: for a text that is none.
+            UserError: for a text that is none, with the nearest that are some.
         """
-        if text not in self.config.training_concepts:
+        known = self.config.training_concepts
+        if text not in known:
+            near = difflib.get_close_matches(str(text), known, n=NEAREST, cutoff=0)
             raise UserError(
-                f"concept {text!r}: expected a training concept of the model: {'; '.join(self.config.training_concepts)}"
+                f"concept {shown(text)}: expected a training concept of the model: {'; '.join(short(one, 40) for one in near)} "
+                f"are the nearest of {len(known)}; list all: python -m ftl_lightning concepts MODEL"
             )
         return self.training_embeddings[self.config.training_concepts.index(text)]
 

@@ -1,0 +1,158 @@
+"""What is given to the Python API: whole numbers, texts, devices, and settings by name, refused in the words of the caller."""
+
+import difflib
+import os
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import torch
+
+from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.ranges import LARGEST, expect_count, expect_range
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    T = TypeVar("T", bound=DataclassInstance)
+else:
+    T = TypeVar("T")
+
+ELSEWHERE = {
+    "num_inference_steps": "steps",
+    "n_steps": "steps",
+    "iterations": "steps",
+    "epochs": "steps",
+    "eta": "temperature",
+    "scheduler": "sampler",
+    "num_samples": "count",
+    "n": "count",
+    "starts": "observed",
+    "batch": "batch_size",
+    "generator": "seed",
+    "lr": "learning_rate",
+    "k": "components",
+    "rank": "adapter",
+}
+"""How other libraries call what is given here, with its name here."""
+MOST_NAMES = 8
+"""Settings that are named to someone who gives another."""
+
+
+def expect_whole(key: str, value: object, least: int, most: int | None = LARGEST) -> int:
+    """A whole number of a range.
+
+    Args:
+        key: name of the argument.
+        value: what was given.
+        least: the smallest number of the range.
+        most: the largest; ``None`` for any.
+
+    Raises:
+        UserError: for anything else, ``True`` included.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise UserError(f"{key}: expected a whole number, {least} or more, found {shown(value)}")
+    if most is None:
+        expect_range(key, int(value), least)
+    else:
+        expect_count(key, int(value), least, most)
+    return int(value)
+
+
+def expect_text(key: str, value: object, example: str) -> None:
+    """Refuse what is no text.
+
+    Raises:
+        UserError: with an example of one.
+    """
+    if not isinstance(value, str):
+        raise UserError(f"{key}: expected a text, such as {shown(example, 40)}, found {shown(value)}")
+
+
+def expect_path(key: str, value: object, what: str) -> None:
+    """Refuse what is no path.
+
+    Raises:
+        UserError: saying what it is to be a path of.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise UserError(f"{key}: expected {what}, found {shown(value)}")
+
+
+def changed(call: str, settings: T, changes: Mapping[str, Any], beside: Sequence[str]) -> T:
+    """Settings of which some are changed.
+
+    Args:
+        call: what they are given to, such as ``'sample'``.
+        settings: the others.
+        changes: by name.
+        beside: names of what else can be given to it.
+
+    Raises:
+        UserError: for a name that is none, with all that are, or a value of another type.
+    """
+    names = [field.name for field in fields(settings) if field.name not in beside]
+    if unknown := [name for name in changes if name not in names]:
+        told = names if len(names) <= MOST_NAMES else [*names[:MOST_NAMES], "..."]
+        raise UserError(
+            f"{call}: expected {', '.join(told)} (or {', '.join(beside)}), found {short(str(unknown[0]), 30)!r}"
+            f"; model.tuned shows all settings{_meant(str(unknown[0]), (*names, *beside))}"
+        )
+    # NumPy's numbers are as good as Python's.
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in changes.items()}
+    hints = get_type_hints(type(settings))
+    for name, value in plain.items():
+        kinds = _kinds(hints[name])
+        if not any(_is(value, kind) for kind in kinds):
+            told = [_WORDS[kind] if kind in _WORDS else repr(kind) for kind in kinds]
+            raise UserError(f"{call}: {name}: expected {' or '.join(told)}, found {shown(value)}")
+    return replace(settings, **plain)
+
+
+_WORDS: Mapping[object, str] = {int: "a whole number", float: "a number", str: "a text", bool: "True or False", type(None): "None"}
+
+
+def _kinds(hint: Any) -> list[Any]:
+    """What an annotation allows: types, and texts of a choice."""
+    parts = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return [kind for part in parts for kind in (get_args(part) if get_origin(part) is Literal else (part,))]
+
+
+def _is(value: object, kind: Any) -> bool:
+    """Whether a value is of a type, or a text of a choice; a text is left to the settings where they take texts at all."""
+    if isinstance(kind, str):
+        return isinstance(value, str)
+    if kind in (int, float) and isinstance(value, bool):
+        return False
+    return isinstance(value, int | float if kind is float else kind)
+
+
+def _meant(name: str, known: Sequence[str]) -> str:
+    """What a name was probably meant to be, at the end of a sentence; empty where nothing is near."""
+    own = ELSEWHERE.get(name.lower())
+    near = [own] if own in known else difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def device_named(name: object) -> torch.device:
+    """A device that this machine can compute on.
+
+    Raises:
+        UserError: for another one, with those that there are.
+    """
+    try:
+        if not isinstance(name, str | torch.device):
+            raise TypeError
+        found = torch.device(name)
+        torch.ones(1, device=found).cpu()  # it may be named without being there
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError):
+        raise UserError(f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}") from None
+    return found
+
+
+def _devices() -> list[str]:
+    cuda = [f"cuda:{number}" for number in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+    return ["cpu", *cuda, *(["mps"] if torch.backends.mps.is_available() else [])]

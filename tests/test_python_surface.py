@@ -1,0 +1,489 @@
+"""What people meet in Python: what can be imported, what objects say of themselves, devices, batches, and mistakes in one line."""
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+import ftl_lightning
+from ftl_lightning.concepts.composition import Composition, Modes
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.explanation import explain
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.agent.scenes import OBSERVED
+from ftl_lightning.errors import LONGEST, UserError
+from ftl_lightning.few_shot import FewShot, LearnedConcept
+from ftl_lightning.learning.longer import longer_than_plans
+from ftl_lightning.seeding import generator
+from ftl_lightning.shipped import list_models
+
+GOAL, SCENE = "go to bowl", "circle above square"
+QUICK: dict[str, Any] = {"sampler": "ddim", "steps": 3}
+SPACES = {"agent": "agent (hash d7a9bd82a38b318c)", "scenes": "object_rearrangement (hash ea5aa92a1ef3e100)"}
+
+
+class Things(NamedTuple):
+    """What the tests talk about; nothing changes it."""
+
+    agent: FewShot
+    scenes: FewShot
+    five: Demonstrations
+    learned: LearnedConcept
+    starts: InitialStates
+    plans: Demonstrations
+
+
+@pytest.fixture(scope="module")
+def things() -> Things:
+    agent, scenes = FewShot.from_pretrained("agent"), FewShot.from_pretrained("object_rearrangement")
+    five = scenes.domain.source(None).draw("square diagonal to triangle", 5, 1)
+    learned = scenes.learn(five, steps=2, modes="each")
+    plans = scenes.sample(scenes[SCENE], 4, **QUICK)
+    return Things(agent, scenes, five, learned, agent.starts(GOAL, 3), plans)
+
+
+# What can be imported
+
+
+def test_the_package_shows_what_it_offers_before_anything_is_imported() -> None:
+    offered = ["Composition", "Concept", "Demonstrations", "FewShot", "__version__", "list_models"]
+    program = (
+        "import sys, ftl_lightning; names = dir(ftl_lightning); models = ftl_lightning.list_models()\n"
+        f"assert set({offered}) <= set(names), names\n"
+        "assert 'TYPE_CHECKING' not in names and 'torch' not in sys.modules and 'numpy' not in sys.modules\n"
+        f"assert all(getattr(ftl_lightning, name) is not None for name in {offered})\n"
+        "print(models)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "'agent'" in done.stdout
+    assert ftl_lightning.Composition is Composition
+    assert ftl_lightning.Concept is Concept
+    with pytest.raises(AttributeError, match=r"no attribute 'Fewshot'; it offers .*FewShot"):
+        _ = ftl_lightning.Fewshot  # type: ignore[attr-defined]
+
+
+def test_every_name_that_is_listed_is_a_model_that_loads() -> None:
+    assert {"agent", "driving", "object_rearrangement"} <= set(list_models())
+    assert not any("/" in name for name in list_models())
+    assert {"baseline/bc/agent", *list_models()} <= set(list_models(baselines=True))
+    assert FewShot.from_pretrained("baseline/bc/object_rearrangement").domain.name == "object_rearrangement"
+
+
+# What objects say of themselves
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        (lambda of: of.agent, ["FewShot('agent', ", "4 training concepts", "4,351,253 parameters", "d7a9bd82a38b318c", "on cpu"]),
+        (lambda of: of.agent.model, ["GenerativeModel('agent', ", "hash d7a9bd82a38b318c"]),
+        (lambda of: of.agent.domain, ["Domain('agent', plans of 128 states of 13 columns", "world (52,)", "accuracy", "128 steps"]),
+        (lambda of: of.scenes.domain, ["Domain('object_rearrangement', plans of 1 state of 21 columns, 12 training concepts"]),
+        (
+            lambda of: of.learned,
+            ["LearnedConcept('square diagonal to triangle', K = 2, 5 modes, loss ", "weights ", SPACES["scenes"]],
+        ),
+        (lambda of: of.learned.concept, ["Concept('square diagonal to triangle', K = 2, 5 modes, loss ", "from 5 demonstrations"]),
+        (lambda of: of.learned.modes, ["Modes(5 modes, K = 2)"]),
+        (lambda of: of.agent[GOAL] + 0.8 * of.agent[GOAL], [f"Composition(K = 2, weights 1.00, 0.80, of {SPACES['agent']})"]),
+        (lambda of: Composition(torch.zeros(9, 2), torch.ones(9), knots=2), ["K = 9, 2 knots", "1.00, ..., of any model"]),
+        (lambda of: of.plans, ["Demonstrations('object_rearrangement', states (4, 1, 21))"]),
+        (
+            lambda of: of.agent.domain.source(None).draw(GOAL, 2, 0),
+            ["states (2, 150, 13), lengths ", f"'{GOAL}', world (2, 150, 52)"],
+        ),
+        (
+            lambda of: of.agent.execute(of.agent[GOAL], of.starts, GOAL, replan=64, **QUICK),
+            ["Execution('agent', 3 episodes, ", "success"],
+        ),
+    ],
+)
+def test_objects_say_in_one_line_what_they_are(things: Things, chosen: Callable[[Things], Any], words: list[str]) -> None:
+    found = chosen(things)
+    told, shown = repr(found), found._repr_html_()
+    assert len(told) <= LONGEST
+    assert "\n" not in told
+    assert "tensor(" not in told
+    assert [word for word in words if word not in told] == []
+    assert len(shown) < 1000
+    assert shown.count("<li>") >= 2 == shown.count("<ul>") + shown.count("</ul>")
+
+
+def test_names_from_files_stand_for_themselves_in_a_notebook(things: Things) -> None:
+    origin = replace(things.learned.concept.origin, name="<script>alert('&')</script>" + "x" * 1000 + "\x1b[2J")
+    concept = replace(things.learned.concept, origin=origin)
+    assert "<script" not in concept._repr_html_()
+    assert "&lt;script&gt;alert(&#x27;&amp;" in concept._repr_html_()
+    assert "\x1b" not in concept._repr_html_() + repr(concept)
+    assert len(repr(concept)) <= LONGEST
+
+
+# What is not explained
+
+
+def test_an_explanation_ends_with_what_is_not_explained(things: Things) -> None:
+    training = torch.eye(4, 6)
+    half = explain(torch.tensor([1.0, 0, 0, 0, 3.0, 0]), "abcd", training)
+    assert half.unexplained == pytest.approx(0.9)  # 9 of the squared length 1 + 9
+    assert half.unexplained == pytest.approx(1 - half.explained)
+    sentence = "; not explained: 90 % of its squared length, which no non-negative combination of training concepts holds"
+    assert str(half).endswith(sentence)
+    assert "not explained: 0 % " in str(explain(training[1], "abcd", training))
+    assert "not explained: 100 % " in str(explain(-training[1], "abcd", training))
+    many = explain(torch.ones(40), [f"c{number}" for number in range(40)], torch.eye(40))
+    assert len(many.combination) == 40
+    assert str(many).count("1.00 c") == 12
+    assert " + 28 smaller ones (explains 1.00); not explained: 0 % " in str(many)
+    learned = things.learned.explain()
+    assert f"not explained: {100 * (1 - learned.explained):.0f} % of its squared length" in str(learned)
+
+
+# Devices and batches
+
+
+def test_a_model_is_moved_and_says_where_it_is(things: Things, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert things.agent.to("cpu") is things.agent
+    assert things.agent.device == torch.device("cpu")
+    asked = []
+    monkeypatch.setattr(things.agent.model, "to", asked.append)
+    assert things.agent.to(torch.device("cpu")) is things.agent
+    assert asked == [torch.device("cpu")]
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
+@pytest.mark.parametrize("size", [1, 3, 100])
+def test_plans_do_not_depend_on_the_size_of_a_batch(things: Things, sampler: str, size: int) -> None:
+    scenes, agent, most = things.scenes, things.agent, []
+    sample, model = scenes.model.sample, scenes.model
+
+    def counted(compositions: list[Composition], count: int, *rest: Any) -> torch.Tensor:
+        most.append(len(compositions) * count)
+        return sample(compositions, count, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model, "sample", counted)
+        for concept in (scenes[SCENE], things.learned):  # with modes too, which are drawn
+            most.clear()
+            whole = scenes.sample(concept, 7, seed=3, sampler=sampler, steps=4).states
+            split = scenes.sample(concept, 7, seed=3, sampler=sampler, steps=4, batch_size=size).states
+            assert torch.allclose(split, whole, atol=1e-2)
+            assert most == [7, *([size] * (7 // size) + [7 % size] * (7 % size > 0) if size < 7 else [7])]
+    started = agent.sample(agent[GOAL], observed=things.starts, sampler=sampler, steps=3)
+    again = agent.sample(agent[GOAL], observed=things.starts, sampler=sampler, steps=3, batch_size=size)
+    assert torch.allclose(again.states, started.states, atol=1e-3)
+    assert not torch.allclose(again.states[0], again.states[1], atol=1e-1)
+    assert torch.equal(again.observed[OBSERVED], started.observed[OBSERVED])
+
+
+def test_a_bar_changes_no_plan(things: Things, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = things.scenes.sample(things.learned, 5, sampler="ddpm", steps=4).states
+    shown = things.scenes.sample(things.learned, 5, sampler="ddpm", steps=4, progress=True).states
+    assert torch.equal(plain, shown)
+    assert "5 plans: 4 steps" in capsys.readouterr().err
+    things.scenes.sample(things.learned, 5, sampler="ddpm", steps=4, batch_size=2, progress=True)
+    assert "5 plans: 12 steps" in capsys.readouterr().err
+    other = FewShot.from_pretrained("baseline/cvae/object_rearrangement")  # without a sampler
+    one, two = (other.sample(other[SCENE], 5, batch_size=size, progress=True).states for size in (None, 2))
+    assert torch.equal(one, two)
+    assert "5 plans: 1 steps" in capsys.readouterr().err
+
+
+def test_a_sample_with_modes_and_columns_is_drawn_whole() -> None:
+    modes = Modes(torch.randn(3, 2, 4), torch.rand(3, 2))
+    own = Composition(torch.randn(2, 4), torch.ones(2), modes=modes).on((1,), 5)
+    found = own.drawn(generator("cpu", 0))
+    assert found.columns is not None
+    assert found.columns.shape == (2, 5)
+    assert found.columns.sum(dim=0).tolist() == [0, 2, 0, 0, 0]
+
+
+# Mistakes
+
+
+def test_a_concept_keeps_where_it_comes_from(things: Things) -> None:
+    scenes, learned = things.scenes, things.learned
+    for concept in (
+        scenes[SCENE],
+        learned,
+        learned + scenes[SCENE],
+        2 * learned,
+        -learned,
+        learned - scenes[SCENE],
+        learned.on((0, 1), 21),
+        learned.to(torch.device("cpu")),
+        learned.concept.composition,
+        scenes.compose(f"{SCENE}:1.2 + {SCENE}"),
+        Composition(learned.embeddings, learned.weights) + learned,
+    ):
+        assert concept.space == SPACES["scenes"]
+        with pytest.raises(
+            UserError, match=r"sample: expected a concept of this model, agent \(hash d7a9bd82a38b318c\), found one of"
+        ):
+            things.agent.sample(concept, observed=things.starts)
+    unknown = Composition(learned.embeddings, learned.weights)
+    assert torch.equal(
+        scenes.sample(unknown, 2, **QUICK).states, scenes.sample(replace(unknown, space=SPACES["scenes"]), 2, **QUICK).states
+    )
+    again = FewShot.from_pretrained("object_rearrangement")  # the same model, loaded anew
+    assert torch.equal(again.sample(learned, 2, **QUICK).states, scenes.sample(learned, 2, **QUICK).states)
+
+
+WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
+    "another's concept is sampled": (
+        lambda of: of.agent.sample(of.scenes[SCENE], observed=of.starts),
+        f"sample: expected a concept of this model, {SPACES['agent']}, found one of {SPACES['scenes']}",
+    ),
+    "another's learned concept": (lambda of: of.agent.sample(of.learned), f"found one of {SPACES['scenes']}"),
+    "another's concept is executed": (
+        lambda of: of.agent.execute(of.scenes[SCENE], of.starts),
+        f"execute: expected a concept of this model, {SPACES['agent']}",
+    ),
+    "two models' concepts": (
+        lambda of: of.agent[GOAL] + of.scenes[SCENE],
+        f"compose: expected concepts of one model, found one of {SPACES['agent']} and one of {SPACES['scenes']}",
+    ),
+    "two models' difference": (lambda of: of.learned - of.agent[GOAL], "compose: expected concepts of one model"),
+    "numbers of another size": (
+        lambda of: of.scenes.sample(Composition(torch.ones(1, 5), torch.ones(1))),
+        "with embeddings (K, 384), found (1, 5)",
+    ),
+    "another's plans": (
+        lambda of: of.agent.evaluate(of.plans, GOAL),
+        "evaluate: expected behaviour of agent, the model's domain, found that of object_rearrangement",
+    ),
+    "another's plans are drawn": (lambda of: of.agent.render(of.plans), "render: expected behaviour of agent"),
+    "another's demonstrations": (lambda of: of.agent.learn(of.five), "states: expected behaviour of agent"),
+    "a sum with a text": (
+        lambda of: of.scenes[SCENE] + SCENE,
+        f"expected a concept on each side of '+' and '-', found '{SCENE}'; model[text] is one",
+    ),
+    "a difference with a number": (lambda of: of.scenes[SCENE] - 3, "expected a concept on each side of '+' and '-', found 3"),
+    "a product with a text": (lambda of: of.scenes[SCENE] * "2", "expected a number to multiply a concept with, found '2'"),
+    "a product that is none": (lambda of: float("nan") * of.scenes[SCENE], "weight: expected a finite number, found nan"),
+    "a model's name": (lambda of: FewShot.from_pretrained("objectrearrangement"), "did you mean object_rearrangement"),
+    "a model's name in its folder": (
+        lambda of: FewShot.from_pretrained("pretrained/agnt"),
+        "did you mean agent? all that ship: ftl_lightning.list_models()",
+    ),
+    "a model's name like none": (
+        lambda of: FewShot.from_pretrained("chess"),
+        "agent, driving, mocap, object_rearrangement, tabletop ship",
+    ),
+    "no model's name": (lambda of: FewShot.from_pretrained(3), "name: expected the name of a model, such as agent, driving"),
+    "no settings": (
+        lambda of: FewShot.from_pretrained("agent", settings=3),
+        "settings: expected a configuration file of invert, found 3",
+    ),
+    "a device that is not there": (
+        lambda of: FewShot.from_pretrained("agent", device="meta"),
+        "device: expected one that this machine has, cpu",
+    ),
+    "no device": (lambda of: of.scenes.to("foo"), "device: expected one that this machine has, cpu"),
+    "a training concept": (
+        lambda of: of.agent["go to bowll"],
+        "concept 'go to bowll': expected a training concept of the model: go to bowl; ",
+    ),
+    "a composed training concept": (
+        lambda of: of.agent.compose("go to bowll:1.2"),
+        "list all: python -m ftl_lightning concepts MODEL",
+    ),
+    "no text of a concept": (lambda of: of.agent[3], "concept 3: expected a training concept"),
+    "no text to compose": (lambda of: of.agent.compose(3), "compose: expected a text, such as 'go to red object"),
+    "no file of a concept": (lambda of: of.agent.load(3), "path: expected the file of a learned concept, found 3"),
+    "True for a count": (lambda of: of.scenes.learn(of.five, adapter=True), "learn: adapter: expected a whole number, found True"),
+    "a setting of another name": (
+        lambda of: of.scenes.learn(of.five, lr=3),
+        "learn: expected components, omega, initial_omega, off_span, initial_spread, restarts, learning_rate, "
+        "weight_learning_rate, ... (or steps, seed, progress), found 'lr'; model.tuned shows all settings; "
+        "did you mean learning_rate?",
+    ),
+    "a setting that is no number": (
+        lambda of: of.scenes.learn(of.five, components="two"),
+        "learn: components: expected a whole number, found 'two'",
+    ),
+    "modes between": (
+        lambda of: of.scenes.learn(of.five, modes=2.5),
+        "modes: expected a whole number or 'each' or 'auto', found 2.5",
+    ),
+    "learning for 0 steps": (lambda of: of.scenes.learn(of.five, steps=0), "steps: expected 1 or more, found 0"),
+    "learning for 2.5 steps": (
+        lambda of: of.scenes.learn(of.five, steps=2.5),
+        "steps: expected a whole number, 1 or more, found 2.5",
+    ),
+    "learning with no seed": (lambda of: of.scenes.learn(of.five, seed="x"), "seed: expected a whole number, 0 or more, found 'x'"),
+    "a name that is none": (lambda of: of.scenes.learn(of.five, name=3), "name: expected a text"),
+    "a text is sampled": (
+        lambda of: of.scenes.sample("text"),
+        "sample: expected a concept, such as model['circle right of triangle'], model.compose(text), model.load(path) or what "
+        "model.learn returns, found 'text'",
+    ),
+    "an option of another name": (
+        lambda of: of.scenes.sample(of.scenes[SCENE], num_inference_steps=3),
+        "sample: expected sampler, steps, temperature (or count, observed, seed, batch_size, progress), "
+        "found 'num_inference_steps'; model.tuned shows all settings; did you mean steps?",
+    ),
+    "0 steps": (lambda of: of.scenes.sample(of.scenes[SCENE], steps=0), "steps: expected 1 or more, found 0"),
+    "steps below 0": (lambda of: of.scenes.sample(of.scenes[SCENE], steps=-1), "steps: expected 1 or more, found -1"),
+    "half a step": (lambda of: of.scenes.sample(of.scenes[SCENE], steps=2.5), "steps: expected a whole number, found 2.5"),
+    "a warm temperature": (
+        lambda of: of.scenes.sample(of.scenes[SCENE], temperature="warm"),
+        "temperature: expected a number, found 'warm'",
+    ),
+    "no plans": (lambda of: of.scenes.sample(of.scenes[SCENE], count=0), "count: expected 1 or more, found 0"),
+    "half a plan": (lambda of: of.scenes.sample(of.scenes[SCENE], 0.5), "count: expected a whole number, 1 or more, found 0.5"),
+    "no batch": (lambda of: of.scenes.sample(of.scenes[SCENE], batch_size=0), "batch_size: expected 1 or more, found 0"),
+    "a seed below 0": (lambda of: of.scenes.sample(of.scenes[SCENE], seed=-1), "seed: expected 0 or more, found -1"),
+    "a seed that is a text": (
+        lambda of: of.scenes.sample(of.scenes[SCENE], seed="x"),
+        "seed: expected a whole number, 0 or more, found 'x'",
+    ),
+    "starts of different numbers": (
+        lambda of: of.agent.sample(of.agent[GOAL], observed=InitialStates({OBSERVED: torch.zeros(2, 52)}, torch.zeros(3, 52))),
+        "observed: expected as many samples of every feature, found 2 of 'world', 3 of 'scenes'",
+    ),
+    "starts that are none": (
+        lambda of: of.agent.sample(of.agent[GOAL], observed=np.full((2, 52), np.nan)),
+        "observed: expected finite numbers",
+    ),
+    "starts that are a number": (
+        lambda of: of.agent.sample(of.agent[GOAL], observed=3),
+        "observed: expected (sample, ...) of 'world'",
+    ),
+    "starts that are a text": (
+        lambda of: of.agent.sample(of.agent[GOAL], observed="here"),
+        "expected an array of numbers, found 'here'",
+    ),
+    "observed of other demonstrations": (
+        lambda of: of.agent.learn(np.zeros((5, 9, 13)), np.zeros((3, 9, 52))),
+        "key 'observed/world': expected shape (5, 9, ...), found (3, 9, 52)",
+    ),
+    "two dimensions": (
+        lambda of: of.agent.learn(np.zeros((20, 13)), np.zeros((20, 52))),
+        "states: expected shape (demo, time, 13), found (20, 13); give a single demonstration as states[None]",
+    ),
+    "scenes without time": (
+        lambda of: of.scenes.learn(np.zeros((20, 21))),
+        "found (20, 21); give demonstrations as states[:, None]",
+    ),
+    "two columns": (lambda of: of.agent.learn(np.zeros((20, 2))), "states: expected shape (demo, time, 13), found (20, 2)"),
+    "numbers that are none": (
+        lambda of: of.scenes.learn(np.full((2, 1, 21), np.nan)),
+        "'states': expected finite numbers, found nan",
+    ),
+    "an empty list": (lambda of: of.scenes.learn([]), "states: expected at least one demonstration, found an empty list"),
+    "texts for states": (lambda of: of.scenes.learn(["a"]), "states: expected an array of numbers, found 'a'"),
+    "a number for states": (lambda of: of.scenes.learn(3), "states: expected an array or a list of arrays, found 3"),
+    "different columns": (
+        lambda of: of.scenes.learn([np.zeros((3, 21)), np.zeros((3, 20))]),
+        "states: expected arrays of one shape but for their times, found (3, 20) and (3, 21)",
+    ),
+    "a number of episodes": (
+        lambda of: of.agent.execute(of.agent[GOAL], 3),
+        "scenes: expected where episodes start, what model.starts(goal, count) draws or finite numbers (episode, scene), found 3",
+    ),
+    "half a step of a plan": (
+        lambda of: of.agent.execute(of.agent[GOAL], of.starts, replan=0.5),
+        "replan: expected a whole number, 1 or more",
+    ),
+    "an option of executing": (
+        lambda of: of.agent.execute(of.agent[GOAL], of.starts, guidance=2),
+        "execute: expected sampler, steps, temperature (or scenes, goal, replan, environment, seed), found 'guidance'",
+    ),
+    "no starts": (lambda of: of.agent.starts(GOAL, 0), "count: expected 1 or more, found 0"),
+    "starts of no task": (lambda of: of.agent.starts("fly"), "found 'fly'"),
+    "no text of a goal": (
+        lambda of: of.scenes.evaluate(of.plans, 3),
+        "goal: expected a text, such as 'circle right of triangle', found 3",
+    ),
+    "no plans to judge": (
+        lambda of: of.scenes.evaluate(3, SCENE),
+        "evaluate: expected plans, such as model.sample returns, found 3",
+    ),
+    "nothing that is near": (lambda of: of.learned.explain(nearest=0), "nearest: expected 1 or more, found 0"),
+}
+"""Wrong calls by name, with a part of what is told."""
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_call_is_told_in_one_line(things: Things, case: str) -> None:
+    call, message = WRONG[case]
+    with pytest.raises(UserError) as told:
+        call(things)
+    assert message in str(told.value)
+    assert len(str(told.value)) <= LONGEST
+    assert "\n" not in str(told.value)
+
+
+def test_cuda_is_told_where_there_is_none(things: Things) -> None:
+    if torch.cuda.is_available():
+        told = "cuda:0"
+        with pytest.raises(UserError, match=r"cpu or cuda:0.*, found 'cuda:99'"):
+            things.scenes.to("cuda:99")
+        assert things.scenes.to(told).device.type == "cuda"
+        assert things.scenes.sample(things.learned, 2, **QUICK).states.device.type == "cpu"
+        things.scenes.to("cpu")
+        return
+    for device in ("cuda", "cuda:1"):
+        with pytest.raises(UserError, match=f"device: expected one that this machine has, cpu.*, found '{device}'"):
+            FewShot.from_pretrained("object_rearrangement", device=device)
+
+
+def test_numpys_numbers_are_as_good_as_pythons(things: Things) -> None:
+    scenes = things.scenes
+    plain = scenes.sample(0.5 * scenes[SCENE], 3, seed=2, **QUICK, temperature=0.5).states
+    numpys = {"sampler": "ddim", "steps": np.int64(3), "temperature": np.float32(0.5)}
+    assert torch.equal(plain, scenes.sample(np.float64(0.5) * scenes[SCENE], np.int64(3), seed=np.int64(2), **numpys).states)
+    assert scenes.learn(things.five, steps=np.int64(1), components=np.int64(3)).embeddings.shape == (3, 384)
+
+
+# Longer demonstrations
+
+
+def test_longer_demonstrations_are_told_of(things: Things) -> None:
+    model, goal = things.agent.model, "go to red bowl"
+
+    def shown(lengths: list[int], per_step: bool) -> Demonstrations:
+        states = [np.zeros((length, 13), dtype=np.float32) for length in lengths]
+        world = [np.zeros((length, 52), dtype=np.float32) for length in lengths] if per_step else np.zeros((len(lengths), 52))
+        return things.agent.demonstrations(states, world, goal)
+
+    assert longer_than_plans(shown([128, 100], True), model) == ""
+    assert longer_than_plans(shown([140], False), model) == (
+        "demonstrations of 140 steps are cut to the model's horizon of 128: the first 128 steps are learned from, "
+        "as 'world' is known at the first time alone"
+    )
+    assert longer_than_plans(shown([140, 100], True), model) == (
+        "demonstrations of up to 140 steps are longer than the model's horizon of 128: they are learned from in stretches of "
+        "128 steps, which start anywhere, mostly early; a plan has 128 steps"
+    )
+    # It is true: what comes after the first 128 steps changes no number.
+    long, other = shown([140], False), shown([140], False)
+    other.states[:, 128:] = 1
+    with pytest.warns(
+        UserWarning, match="demonstrations of 140 steps are cut to the model's horizon of 128: the first 128"
+    ) as told:
+        first = things.agent.learn(long, steps=1, samples=2)
+    assert told[0].filename == __file__
+    with pytest.warns(UserWarning, match="are cut"):
+        second = things.agent.learn(other, steps=1, samples=2)
+    assert torch.equal(first.embeddings, second.embeddings)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        things.agent.learn(shown([128], False), steps=1, samples=2)
+
+
+def test_domains_that_plan_anew_learn_from_stretches_of_what_is_longer() -> None:
+    driving = FewShot.from_pretrained("driving")
+    longer = driving.domain.source(None).draw(driving.training_concepts[0], 1, 0)
+    assert longer.states.shape[1] > driving.model.window
+    assert longer_than_plans(longer, driving.model) == ""
+    unseen = replace(longer, observed={}, per_step=())
+    assert "in stretches of 8 steps, which start anywhere; a plan has 8 steps" in longer_than_plans(unseen, driving.model)
