@@ -168,10 +168,10 @@ def sample(options: SampleOptions) -> None:
     from ftl_lightning.tensor_file import atomic
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
+    composition = model.compose(" + ".join(part for part in (options.compose, options.concept) if part))
     _check_sample(options, model.domain)
     goal, film = options.goal, model.domain.show.film
     starts = _sample_starts(options, model.domain)
-    composition = model.compose(" + ".join(part for part in (options.compose, options.concept) if part))
     plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))
     told = {**plans.provenance, "concept": options.concept, "compose": options.compose}
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)

@@ -59,7 +59,8 @@ def mistake_of_machine(error: BaseException) -> str | None:
     """
     if isinstance(error, OSError):
         where = short(str(error.filename or "a file"), 150)
-        return f"{where}: {error.strerror or short(str(error))}; choose another place"
+        told = error.strerror or short(str(error))
+        return f"{where}: expected a place that can be read and written, found another ({told}); choose another one"
     text = str(error)
     if isinstance(error, MemoryError) or any(words in text for words in _NO_MEMORY):
         return (

@@ -8,7 +8,7 @@ from typing import Any
 from ftl_lightning.configuration import configurations, load
 from ftl_lightning.errors import UserError, about
 from ftl_lightning.limits import MOST_TEXT, expect_readable
-from ftl_lightning.shipped import pretrained_folder, shipped_models
+from ftl_lightning.shipped import missing_model, pretrained_folder
 from ftl_lightning.targets import expect_writable_file, expect_writable_folder
 
 Check = Callable[[str], None]
@@ -16,12 +16,8 @@ Check = Callable[[str], None]
 
 
 def _model(path: str) -> None:
-    config = Path(path) / "config.json"
-    if not (pretrained_folder(path) / config.name).is_file():
-        raise UserError(
-            f"{config}: expected a pretrained model, found nothing; run: python -m ftl_lightning fit, or name one that ships: "
-            f"{', '.join(shipped_models())}"
-        )
+    if not (pretrained_folder(path) / "config.json").is_file():
+        raise UserError(missing_model(path))
 
 
 def _checkpoint(path: str) -> None:

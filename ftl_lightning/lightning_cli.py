@@ -1,11 +1,13 @@
 """The verbs that need a trainer: Lightning's command line with ``invert`` added."""
 
 import logging
+import sys
 import warnings
 from argparse import ArgumentError
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import lightning.pytorch as pl
 from jsonargparse import Namespace, set_parsing_settings
@@ -46,6 +48,8 @@ class CommandLine(LightningCLI):
         super().parse_arguments(parser, args)
         verb = self.config.get("subcommand")
         self._expect_keys(self.config[verb] if verb else self.config, args)
+        for key in ("model", "data"):
+            _expect_values(key, (self.config[verb] if verb else self.config).get(key))
         seed = (self.config[verb] if verb else self.config).get("seed_everything")
         if isinstance(seed, int) and not isinstance(seed, bool):
             expect_range("seed_everything", seed, 0, 2**32 - 1)
@@ -66,7 +70,11 @@ class CommandLine(LightningCLI):
     def instantiate_classes(self) -> None:
         """Build everything; Lightning logs the seeds of model and data as one."""
         with trust.vouching(self._domains()):
-            super().instantiate_classes()
+            try:
+                super().instantiate_classes()
+            except (ValueError, MisconfigurationException) as error:
+                told = _behind(error)
+                raise mistake_behind(error) or UserError(f"configuration: {short(told, 230)}; see --help") from error
         model, data = (getattr(one, "hparams", {}).get("seed") for one in (self.model, self.datamodule))
         if model is not None and data is not None and model != data:
             raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
@@ -149,6 +157,32 @@ class CommandLine(LightningCLI):
         path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
         if path and path != "last":
             read_checkpoint(path)
+
+
+def _expect_values(key: str, found: Namespace | None) -> None:
+    """Refuse what jsonargparse takes for a value that was not given: null where the class takes no ``None``.
+
+    Raises:
+        ArgumentError: naming the key.
+    """
+    if found is None or "class_path" not in found:
+        return
+    module, _, name = found["class_path"].rpartition(".")
+    hints: dict[str, Any] = {}
+    for base in reversed(getattr(sys.modules.get(module), name, object).__mro__):
+        with suppress(Exception):  # annotations of others may name what is not there
+            hints |= get_type_hints(vars(base)["__init__"])
+    for name, value in (found.get("init_args") or Namespace()).items(branches=True):
+        hint = hints.get(name)
+        if value is None and hint in (int, float, str, bool):
+            raise ArgumentError(None, f'Key "{key}.{name}": Expected a {hint}. Got value: null')
+
+
+def _behind(error: BaseException) -> str:
+    """What the first of the exceptions says that led to this one."""
+    while behind := error.__cause__ or error.__context__:
+        error = behind
+    return str(error)
 
 
 class _Inversion(CommandLine):
@@ -239,7 +273,7 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
             f"{error.filename or 'output'}: {error.strerror or error}; choose a place that exists, is writable and has room"
         ) from error
     except MisconfigurationException as error:
-        raise UserError(f"trainer: {' '.join(str(error).split())[:200]}") from error
+        raise UserError(f"trainer: {short(str(error), 200)}") from error
     except Exception as error:
         if mistake := mistake_behind(error):
             raise mistake from None

@@ -15,8 +15,8 @@ MOST_BYTES = 2 * 2**30
 """Of a file of tensors: a model, a checkpoint, demonstrations."""
 MOST_TEXT = 32 * 2**20
 """Bytes of a text: JSON, CSV, Markdown."""
-MOST_HEADER = 16 * 2**20
-"""Bytes of the header of a safetensors file, which holds a text for each demonstration."""
+MOST_HEADER = 8 * 2**20
+"""Bytes of the header of a safetensors file, which holds a text for each demonstration; in larger files the more."""
 MOST_TENSORS = 20_000
 """Tensors in a file."""
 MOST_UNPACKED = 128 * 2**20
@@ -75,8 +75,8 @@ def expect_unpacked(size: int, packed: int, what: str) -> None:
     Raises:
         UserError: naming both sizes.
     """
-    if size > min(max(MOST_UNPACKED, MOST_RATIO * packed), most_bytes()):
-        raise UserError(f"{what}: {size} bytes in a file of {packed}, more than honest data have; save it without compression")
+    if size > (most := min(max(MOST_UNPACKED, MOST_RATIO * packed), most_bytes())):
+        raise UserError(f"{what}: expected at most {most} bytes in a file of {packed}, found {size}; save it without compression")
 
 
 def read_text(path: str | Path, kind: str, most: int = MOST_TEXT, encoding: str = "utf-8") -> str:

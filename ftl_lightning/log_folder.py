@@ -4,8 +4,10 @@ import contextvars
 import fcntl
 import itertools
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ftl_lightning.errors import UserError
@@ -13,18 +15,40 @@ from ftl_lightning.targets import expect_writable_folder
 
 LOCK = ".running"
 """File in the folder of a run that goes on, locked by it."""
-_stack: contextvars.ContextVar[ExitStack | None] = contextvars.ContextVar("stack", default=None)
+
+
+@dataclass
+class _Run:
+    """What a run holds, and whether it has begun to learn."""
+
+    held: ExitStack = field(default_factory=ExitStack)
+    learns: bool = False
+
+
+_run: contextvars.ContextVar[_Run | None] = contextvars.ContextVar("run", default=None)
 
 
 @contextmanager
 def run() -> Iterator[None]:
-    """Within the block, folders that are claimed stay the run's own; at its end, those that nothing was written to are removed."""
-    with ExitStack() as stack:
-        token = _stack.set(stack)
+    """Within the block, folders that are claimed stay the run's own.
+
+    At its end those are removed that were made for it and that nothing was written to; all of them, if it was refused before it
+    learned anything.
+    """
+    own = _Run()
+    token = _run.set(own)
+    with own.held:
         try:
             yield
+            own.learns = True
         finally:
-            _stack.reset(token)
+            _run.reset(token)
+
+
+def keep() -> None:
+    """What this run writes is worth keeping, however it ends: it learns."""
+    if (own := _run.get()) is not None:
+        own.learns = True
 
 
 def claim(parent: Path, name: str, new: bool) -> str:
@@ -62,7 +86,7 @@ def _numbered(name: str) -> Iterator[str]:
 
 def _claimed(folder: Path, new: bool) -> bool:
     """Whether the folder is this run's from now on."""
-    stack, lock = _stack.get(), folder / LOCK
+    own, lock = _run.get(), folder / LOCK
     expect_writable_folder(folder)
     while True:
         missing = [one for one in (folder, *folder.parents) if not one.exists()]
@@ -81,15 +105,17 @@ def _claimed(folder: Path, new: bool) -> bool:
         if not os.fstat(handle).st_nlink:  # of a run that has just ended
             os.close(handle)
             continue
-        if stack is None:  # nobody says when the run ends
-            _free(lock, handle, [])
+        if own is None:  # nobody says when the run ends
+            _end(_Run(learns=True), lock, handle, [])
         else:
-            stack.callback(_free, lock, handle, missing)
+            own.held.callback(_end, own, lock, handle, missing)
         return True
 
 
-def _free(lock: Path, handle: int, made: list[Path]) -> None:
-    """Let go of a folder; of those that were made for it the empty ones are removed, the innermost first."""
+def _end(own: _Run, lock: Path, handle: int, made: list[Path]) -> None:
+    """Let go of a folder. Of those that were made for it, the innermost first, the empty ones are removed."""
+    if lock.parent in made and not own.learns:
+        shutil.rmtree(lock.parent, ignore_errors=True)
     lock.unlink(missing_ok=True)
     os.close(handle)
     for folder in made:

@@ -7,6 +7,8 @@ the documentation are true in a checkout and, after ``pip install``, in any fold
 import difflib
 from pathlib import Path
 
+from ftl_lightning.errors import short
+
 FOLDERS = ("conf", "pretrained")
 """What is shipped."""
 _PACKAGE = Path(__file__).parent
@@ -48,7 +50,8 @@ def list_models(baselines: bool = False) -> list[str]:
 
 def missing_model(place: str | Path) -> str:
     """What is told of a place where no model is, with the nearest names of those that ship."""
-    told = str(place).lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
+    place = short(str(place), 80)
+    told = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
     near = difflib.get_close_matches(told, list_models(baselines=True), n=2)
     ship = f"did you mean {' or '.join(near)}? all that ship:" if near else f"{', '.join(shipped_models())} ship, see"
     return (

@@ -11,6 +11,7 @@ import lightning.pytorch as pl
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from ftl_lightning import log_folder
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
@@ -42,11 +43,14 @@ HARMLESS = {
     "val_check_interval",
 }
 """Options that change no number of a run on one device; every other one does."""
+_STARTS = ("`val_check_interval`", "Early stopping conditioned")
+"""How messages of Lightning begin that are about options."""
 USUAL = {"max_epochs": 1, "deterministic": True}
 """Of a configuration that ships with ``invert``, where Lightning's default is another one."""
 
 
 RANGES = {
+    "devices": (-1, 10_000),
     "num_nodes": (1, 1000),
     "max_steps": (-1, math.inf),
     "max_epochs": (-1, math.inf),
@@ -70,6 +74,30 @@ LIMITS = {
 """The same of shares or numbers, with what they count."""
 
 
+class _Begun(pl.Callback):
+    """Notes that learning has begun, and that what callbacks watch is there."""
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        log_folder.keep()
+
+    def on_validation_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        if not trainer.sanity_checking:
+            _expect_monitors(trainer)
+
+
+def _expect_monitors(trainer: pl.Trainer) -> None:
+    """Refuse a callback that watches a number which is not logged: it would do nothing.
+
+    Raises:
+        UserError: naming the callback and what is logged.
+    """
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        watched = getattr(callback, "monitor", None)
+        if isinstance(watched, str) and watched not in trainer.callback_metrics:
+            known, name = short(", ".join(sorted(trainer.callback_metrics)), 150), type(callback).__name__
+            raise UserError(f"trainer.callbacks: {name}: monitor: expected one of {known}, found {short(watched)!r}")
+
+
 class Trainer(pl.Trainer):
     """A trainer that can also ``invert``.
 
@@ -82,7 +110,9 @@ class Trainer(pl.Trainer):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         for name, (least, most) in RANGES.items():
-            if isinstance(value := options.get(name), int | float) and not isinstance(value, bool):
+            value = options.get(name)
+            value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a text
+            if isinstance(value, int | float) and not isinstance(value, bool):
                 expect_range(f"trainer.{name}", value, least, most)
         for name, words in LIMITS.items():
             value = options.get(name)
@@ -107,6 +137,7 @@ class Trainer(pl.Trainer):
             for name, value in options.items()
             if name not in HARMLESS and value != usual.get(name)
         }
+        self.callbacks.append(_Begun())  # type: ignore[attr-defined]
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
             self.strategy.checkpoint_io = WholeCheckpoints()
 
@@ -120,7 +151,13 @@ class Trainer(pl.Trainer):
         if self.limit_train_batches == 0:
             raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
         with self._restoring():
-            super().fit(model, *arguments, **options)
+            try:
+                super().fit(model, *arguments, **options)
+            except (ValueError, RuntimeError) as error:  # what Lightning finds out as it starts
+                if str(error).strip().startswith(_STARTS):
+                    raise UserError(f"trainer: {short(str(error), 250)}") from error
+                raise
+        _expect_monitors(self)
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
         """As Lightning's."""

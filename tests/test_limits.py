@@ -73,6 +73,7 @@ def refused(capsys: Told, arguments: list[str], *expected: str) -> None:
     assert len(told) == 1, told
     assert told[0].startswith("error: ")
     assert len(told[0]) <= LONGEST
+    assert "expected" in told[0] or "cannot be written" in told[0]
     for text in expected:
         assert text in told[0]
     assert {path for path in Path().rglob("*") if "cache" not in path.parts} <= before
@@ -121,7 +122,7 @@ def unreadable() -> None:
 @pytest.mark.parametrize("reader", READ)
 def test_what_is_no_honest_file(reader: str, make: Callable[[], None], capsys: Told) -> None:
     make()
-    refused(capsys, READ[reader], "x", "expected")
+    refused(capsys, READ[reader], "x")
 
 
 @pytest.mark.parametrize("make", [device, pipe, sparse], ids=lambda make: make.__name__)
@@ -148,7 +149,7 @@ def test_what_is_no_honest_file_in_a_folder(place: str, arguments: list[str], ma
     if make is device:
         Path(place).unlink(missing_ok=True)
     Path("x").rename(place)
-    refused(capsys, arguments, "expected")
+    refused(capsys, arguments)
 
 
 def test_the_search_for_a_concept_s_model_passes_by_what_is_no_file(capsys: Told) -> None:
@@ -160,7 +161,7 @@ def test_the_search_for_a_concept_s_model_passes_by_what_is_no_file(capsys: Told
     Path("x").rename("logs/c/config.json")
     shipped = ROOT / "pretrained" / "mocap" / "arm_circle.safetensors"
     with bounded():
-        assert main(["explain", f"--concept={shipped}"]) in (0, 2)
+        assert main(["explain", f"--concept={shipped}"]) == 0
 
 
 # Files that claim more than they hold, or hold more than they say
@@ -193,7 +194,7 @@ HEADERS: dict[str, Callable[[], None]] = {
 @pytest.mark.parametrize("reader", ["concept", "initial", "demonstrations"])
 def test_a_header_that_is_none(reader: str, name: str, capsys: Told) -> None:
     HEADERS[name]()
-    refused(capsys, READ[reader], "x", "expected")
+    refused(capsys, READ[reader], "x")
 
 
 FORM = {"kind": "demonstrations", "format": 3, "domain": "agent", "concepts": ["", ""], "per_step": []}
@@ -204,7 +205,7 @@ STATES = {"states": torch.zeros(2, 3, 13), "lengths": torch.full((2,), 3), "obse
     ("held", "shape", "expected"),
     [
         (2**20, [2, 2**35], "expected images of shape (2, ...)"),
-        (2**30, [2, 2**29], "1073741824 bytes"),
+        (2**30, [2, 2**29], "found 1073741824; save it without compression"),
         (2**30, [2, 3], "expected"),
         (6, [2, 3, 10**12], "expected"),
         (6, [2, -3], "expected"),
@@ -275,7 +276,7 @@ def test_who_has_larger_files_says_so(capsys: Told, monkeypatch: pytest.MonkeyPa
 )
 @pytest.mark.parametrize("value", ["1000000000000", "1000000000000000000000000000000"])
 def test_a_number_that_no_machine_has_room_for(base: list[str], key: str, value: str, capsys: Told) -> None:
-    refused(capsys, [*base, f"--{key}={value}"], key.rpartition(".")[2], "expected")
+    refused(capsys, [*base, f"--{key}={value}"], key.rpartition(".")[2])
 
 
 # Names
@@ -318,7 +319,7 @@ def test_a_number_that_no_machine_has_room_for(base: list[str], key: str, value:
     ids=lambda value: " ".join(value)[:60],
 )
 def test_a_name_of_three_hundred_letters(arguments: list[str], capsys: Told) -> None:
-    refused(capsys, arguments, "expected" if not any("cannot" in one for one in arguments) else "")
+    refused(capsys, arguments)
 
 
 PLACES = ["/proc/x/o", "/sys/o", "/dev/null/o", "/dev/full", "file/o", "a\0b"]

@@ -58,6 +58,8 @@ def run_ablation(
     """
     from ftl_lightning.evaluation.results import add_rows
 
+    if not seeds:
+        raise UserError("seeds: expected one or more, found none")
     shared = {"data.root": root} if root else {}
     every = [replace(stage, options={**shared, **stage.options}) for stage in stages]
     plan = [[cell for seed in seeds for cell in stage.cells(seed)] for stage in every]

@@ -1,7 +1,7 @@
 """What is observed, by name, and where behaviour starts."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Self
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.errors import UserError, shown
+from ftl_lightning.representation import Shown
 
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
@@ -98,8 +99,8 @@ def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None
             raise UserError(f"key 'observed/{name}': expected {feature.words} a sample, found {own.words}")
 
 
-@dataclass(frozen=True)
-class InitialStates:
+@dataclass(frozen=True, repr=False)
+class InitialStates(Shown):
     """Where behaviour starts.
 
     Attributes:
@@ -110,6 +111,12 @@ class InitialStates:
 
     observed: Observed = field(default_factory=dict)
     scenes: Tensor | None = None
+
+    def _words(self) -> Iterator[str]:
+        for name, values in self.observed.items():
+            yield f"{name} {tuple(values.shape)}"
+        if self.scenes is not None:
+            yield f"scenes {tuple(self.scenes.shape)}"
 
     def __len__(self) -> int:
         return len(next(iter([*self.observed.values(), *([] if self.scenes is None else [self.scenes])]), ()))

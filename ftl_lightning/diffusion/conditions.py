@@ -173,12 +173,12 @@ ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {
 }
 
 
-def condition_encoder(name: str, sizes: Sizes, width: int) -> ConditionEncoder:
-    """An encoder by its name in a configuration.
+def condition_encoder(name: str, sizes: Sizes, width: int) -> ConditionEncoder | None:
+    """An encoder by its name in a configuration; ``None`` where no vector is observed.
 
     Raises:
         UserError: for a name that is none, or one that needs entities in a domain without them.
     """
     if name not in ENCODERS:
         raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")
-    return ENCODERS[name](sizes, width)
+    return ENCODERS[name](sizes, width) if sizes.vector_dim else None

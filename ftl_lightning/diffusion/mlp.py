@@ -57,7 +57,7 @@ class MLPDenoiser(nn.Module):
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, condition_dim), nn.SiLU())
         plan = sizes.horizon * sizes.state_dim
-        self.initial = condition_encoder(initial_encoder, sizes, initial_dim) if sizes.vector_dim else None
+        self.initial = condition_encoder(initial_encoder, sizes, initial_dim)
         inputs = [plan + (initial_dim if sizes.vector_dim else 0)] + [hidden_dim] * (depth - 1)
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
         self.time_film = nn.Linear(time_dim, 2 * hidden_dim * depth)

@@ -140,7 +140,7 @@ class TemporalUNet(nn.Module):
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.initial = condition_encoder(initial_encoder, sizes, width) if sizes.vector_dim else None
+        self.initial = condition_encoder(initial_encoder, sizes, width)
         condition = width * (3 if sizes.vector_dim else 2)
         channels = [width * multiplier for multiplier in multipliers]
         self.down = nn.ModuleList(

@@ -17,6 +17,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
 from ftl_lightning.printing import say
 from ftl_lightning.targets import expect_writable_file
@@ -88,6 +89,8 @@ class Adaptation(pl.LightningModule, ABC):
             examples = concatenate([self.model.examples, self.demonstrations])
             config = self.model.config
             self.domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
+        if told := longer_than_plans(self.demonstrations, self.model):
+            say(f"note: {told}", error=True)
 
     # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
     def validation_step(self, step: int) -> None:

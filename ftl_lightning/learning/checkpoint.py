@@ -100,9 +100,11 @@ def _read(path: Path) -> dict[str, Any]:
         if (key in content or key in _NEEDED) and (not isinstance(found, kind) or isinstance(found, bool)):
             raise UserError(f"{path}: key {key!r}: expected a checkpoint's {kind.__name__}, found {_kind(found)}")
     try:
-        Version(content[_VERSION])
-    except InvalidVersion as error:
-        raise UserError(f"{path}: key {_VERSION!r}: expected a version such as 2.6.0, found {shown(content[_VERSION])}") from error
+        old = Version(content[_VERSION]) < Version("2")
+    except InvalidVersion:
+        old = True
+    if old:
+        raise UserError(f"{path}: key {_VERSION!r}: expected 2.0 or newer, found {shown(content[_VERSION])}")
     for name, value in content["state_dict"].items():
         if not (isinstance(name, str) and isinstance(value, Tensor)):
             raise UserError(f"{path}: key 'state_dict': expected tensors by name, found {_kind(value)} as {str(name)[:50]!r}")

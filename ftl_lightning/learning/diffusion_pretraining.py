@@ -8,11 +8,11 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion import PAPER_SIZE
-from ftl_lightning.diffusion.prediction import loss_weights
+from ftl_lightning.diffusion.prediction import LOSSES, loss_weights
 from ftl_lightning.diffusion.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.paper import OURS
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.codes import Codes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
@@ -92,6 +92,8 @@ class PretrainingModule(Pretraining):
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         if not 0 <= code_share <= 1:
             raise UserError(f"model.code_share: expected a share from 0 to 1, found {code_share}")
+        if loss not in LOSSES:
+            raise UserError(f"model.loss: expected one of {', '.join(LOSSES)}, found {short(loss)!r}")
         expect_range("model.condition_dropout", condition_dropout, 0, 1)
         expect_factor("model.timestep_power", timestep_power, 1, LARGEST_POWER)
         expect_range("model.loss_discount", loss_discount, 0, 1)
@@ -110,7 +112,11 @@ class PretrainingModule(Pretraining):
     ) -> GenerativeModel:
         names = ("denoiser", "diffusion_steps", "prediction")
         config = DiffusionConfig(**shared, denoiser_args=self.denoiser_args, **{name: self.hparams[name] for name in names})
-        return GenerativeModel(config, data.domain, normalization, embeddings, initial_normalization)
+        model = GenerativeModel(config, data.domain, normalization, embeddings, initial_normalization)
+        if self.codes is not None and self.codes.knots > 1 and not model.over_time:
+            told = f"whose concepts do not vary over a plan, found {self.codes.knots}"
+            raise UserError(f"model.code_knots: expected 1 for {config.denoiser}, {told}")
+        return model
 
     def configure_model(self) -> None:
         super().configure_model()

@@ -85,8 +85,9 @@ class InversionSettings:
         for name, most in (("components", 1000), ("restarts", 1000), ("knots", 1000), ("samples", MOST_TOGETHER)):
             expect_count(f"model.{name}", getattr(self, name), 1, most)
         expect_count("model.mode_samples", self.mode_samples, 1, MOST_TOGETHER)
-        for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate", "initial_spread", "seed"):
-            expect_range(f"model.{name}", getattr(self, name), 0)
+        for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate", "initial_spread"):
+            expect_factor(f"model.{name}", getattr(self, name), 0)
+        expect_range("model.seed", self.seed, 0)
         expect_factor("model.initial_omega", self.initial_omega)
         expect_factor("model.guidance_scale", self.guidance_scale, 0)
         if self.omega != "learned":
