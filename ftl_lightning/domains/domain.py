@@ -23,7 +23,7 @@ from ftl_lightning.domains.distances import Distance
 from ftl_lightning.domains.paper import OURS, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
-from ftl_lightning.errors import UserError, shown
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.representation import Shown, counted
 
 if TYPE_CHECKING:
@@ -374,7 +374,7 @@ class Domain(Shown):
         if not self.concepts.reads(goal):
             known = [text for text in self.concepts.descriptions if self.concepts.reads(text)]
             near = difflib.get_close_matches(goal, known, n=5, cutoff=0.4) or known[:5]
-            raise UserError(f"{key}: expected a task of {self.name}, such as {', '.join(map(repr, near))}, found {goal!r}")
+            raise UserError(f"{key}: expected a task of {self.name}, such as {', '.join(map(repr, near))}, found {short(goal)!r}")
 
     @property
     def main_metric(self) -> str:
