@@ -36,6 +36,11 @@ def most_bytes() -> int:
     return int(text) if text else MOST_BYTES
 
 
+def raised(most: int) -> int:
+    """A limit, as many times as high as the user has raised that of files."""
+    return int(most * max(1, most_bytes() / MOST_BYTES))
+
+
 def expect_readable(path: str | Path, kind: str, most: int | None = None) -> int:
     """Refuse what is no regular file, or too large a one. Nothing is opened: a pipe would wait for ever.
 
@@ -75,7 +80,7 @@ def expect_unpacked(size: int, packed: int, what: str) -> None:
     Raises:
         UserError: naming both sizes.
     """
-    if size > (most := min(max(MOST_UNPACKED, MOST_RATIO * packed), most_bytes())):
+    if size > (most := min(raised(max(MOST_UNPACKED, MOST_RATIO * packed)), most_bytes())):
         raise UserError(f"{what}: expected at most {most} bytes in a file of {packed}, found {size}; save it without compression")
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.errors import UserError, about, short, shown
-from ftl_lightning.limits import MOST_BYTES, MOST_HEADER, MOST_TENSORS, expect_readable, most_bytes
+from ftl_lightning.limits import MOST_HEADER, MOST_TENSORS, expect_readable, raised
 from ftl_lightning.schema import parse_json
 from ftl_lightning.targets import expect_file
 
@@ -191,7 +191,7 @@ def expect_header(path: Path, kind: str, size: int) -> None:
     """
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
-        most = MOST_HEADER * max(1, most_bytes() // MOST_BYTES)
+        most = raised(MOST_HEADER)
         if length > min(size, most):
             told = "a damaged or foreign file" if length > size else f"a header of {length} bytes, more than {most}"
             raise UserError(f"{path}: expected a {kind} file, found {told}")

@@ -202,18 +202,19 @@ def allow_classes(packages: Iterable[str]) -> None:
     from jsonargparse import set_parsing_settings
 
     now = set(packages)
-    before = _allowed.copy()
+    # jsonargparse adds to what it was told before, so what is allowed no more has to be denied, unless it is inside of what is.
+    inside = {name for name in _told if any(name.startswith(f"{package}.") for package in now)}
     set_parsing_settings(
         instantiate_subclass_spec_in_any=False,
-        import_path_denylist=["*", *NO_CODE, *sorted(before - now)],  # jsonargparse adds to what it was told before
-        import_path_allowlist=sorted(now),
+        import_path_denylist=["*", *sorted(_told - now - inside)],
+        import_path_allowlist=sorted(now | inside),
     )
-    _allowed.clear()
-    _allowed.update(now)
+    set_parsing_settings(import_path_denylist=list(NO_CODE))
+    _told.update(now)
 
 
-_allowed: set[str] = set()
-"""What :func:`allow_classes` was told last, for the whole process, as jsonargparse's settings are."""
+_told: set[str] = set()
+"""What :func:`allow_classes` was ever told, for the whole process, as jsonargparse's settings are."""
 
 
 def leaves(keys: object, above: str = "") -> Iterator[tuple[str, str]]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from ftl_lightning.cli import main
+from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.line_plots import picture
 from ftl_lightning.escape import figure_text, latex, latex_row, markdown
 from ftl_lightning.evaluation.animation import captioned
@@ -635,3 +637,13 @@ def test_what_is_said_is_printable_in_as_many_lines(name: str, capsys: pytest.Ca
     assert out == err == plain(name) + "\n"
     assert out.count("\n") == name.count("\n") + 1
     assert not UNPRINTABLE.search(out)
+
+
+@pytest.mark.parametrize("name", ["cleared\x1b[2J\x07", "turned \u202egnp.exe"], ids=ascii)
+def test_what_a_concept_is_called_moves_no_cursor(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    concept = Concept.load(ROOT / "pretrained" / "mocap" / "arm_circle.safetensors")
+    replace(concept, origin=replace(concept.origin, name=name)).save("c.safetensors")
+    assert main(["explain", "--concept=c.safetensors", f"--pretrained={ROOT / 'pretrained' / 'mocap'}"]) == 0
+    out, err = capfd.readouterr()
+    assert out.startswith(f"{line(name)}: learned from ")
+    assert not UNPRINTABLE.search(out + err)

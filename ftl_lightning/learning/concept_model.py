@@ -28,6 +28,7 @@ from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weight
 from ftl_lightning.representation import Shown, counted
 from ftl_lightning.schema import built
 from ftl_lightning.tensor_file import (
+    alone,
     bytes_hash,
     expect_finite,
     file_hash,
@@ -311,11 +312,12 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         folder, stored = Path(folder), self._stored()
         expect_finite(stored, str(folder), "nothing was written; train it anew")
-        save_tensors(folder / WEIGHTS, KIND, stored, {"domain": self.config.domain})
-        if self.examples is not None:
-            self.examples.save(folder / EXAMPLES)
         header = {"format": VERSION, "hash": self.hash, "kind": self.kind}
-        write_text(folder / CONFIG, json.dumps(header | asdict(self.config), indent=2) + "\n")
+        with alone(folder):  # of two that are written to the same folder, the files of one
+            save_tensors(folder / WEIGHTS, KIND, stored, {"domain": self.config.domain})
+            if self.examples is not None:
+                self.examples.save(folder / EXAMPLES)
+            write_text(folder / CONFIG, json.dumps(header | asdict(self.config), indent=2) + "\n")
 
     @classmethod
     def load(cls, folder: str | Path, domain: Domain | None = None) -> Self:

@@ -11,6 +11,7 @@ from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST, expect_range
 from ftl_lightning.schema import expect_type, read_json
+from ftl_lightning.shipped import missing_model
 from ftl_lightning.tensor_file import FORMAT
 
 CONFIG = "config.json"
@@ -80,7 +81,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / CONFIG
     if not path.exists():
-        raise UserError(f"{path}: expected a pretrained model, found nothing; run: python -m ftl_lightning fit")
+        raise UserError(missing_model(folder))
     found = read_json(path)
     with about(path):
         version = found.get("format") if isinstance(found, dict) else None

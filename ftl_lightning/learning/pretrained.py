@@ -10,7 +10,7 @@ from ftl_lightning.domains.registry import is_known, load_domain
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import CONFIG, read_config
-from ftl_lightning.shipped import missing_model, pretrained_folder
+from ftl_lightning.shipped import pretrained_folder
 
 MODELS = {
     "diffusion": "generative_model:GenerativeModel",
@@ -40,8 +40,6 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
         UserError: naming the file, if it is missing, damaged, of an unknown method, or its files do not belong together.
     """
     folder = pretrained_folder(folder)
-    if not (folder / CONFIG).exists():
-        raise UserError(missing_model(folder))
     if (kind := read_config(folder)["kind"]) not in MODELS:
         raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {short(kind)!r}")
     return model_class(kind).load(folder, load_domain(domain) if isinstance(domain, str) else domain)
