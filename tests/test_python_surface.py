@@ -95,6 +95,7 @@ def test_every_name_that_is_listed_is_a_model_that_loads() -> None:
         (lambda of: of.learned.modes, ["Modes(5 modes, K = 2)"]),
         (lambda of: of.agent[GOAL] + 0.8 * of.agent[GOAL], [f"Composition(K = 2, weights 1.00, 0.80, of {SPACES['agent']})"]),
         (lambda of: Composition(torch.zeros(9, 2), torch.ones(9), knots=2), ["K = 9, 2 knots", "1.00, ..., of any model"]),
+        (lambda of: of.starts, ["InitialStates(world (3, 52), scenes (3, 52))"]),
         (lambda of: of.plans, ["Demonstrations('object_rearrangement', states (4, 1, 21))"]),
         (
             lambda of: of.agent.domain.source(None).draw(GOAL, 2, 0),
