@@ -168,8 +168,10 @@ def sample(options: SampleOptions) -> None:
     from ftl_lightning.tensor_file import atomic
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
-    composition = model.compose(" + ".join(part for part in (options.compose, options.concept) if part))
+    text = " + ".join(part for part in (options.compose, options.concept) if part)
+    known = model.compose(text) if text else None  # what is unknown is told before what is missing
     _check_sample(options, model.domain)
+    composition = model.compose(text) if known is None else known
     goal, film = options.goal, model.domain.show.film
     starts = _sample_starts(options, model.domain)
     plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))

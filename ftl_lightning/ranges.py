@@ -10,6 +10,8 @@ MOST_TOGETHER = 100_000
 """Things that a network works on in one batch, or that are learned together."""
 LARGEST_STEP = 10**9
 """Of the steps of a run."""
+LARGEST_RATE = 1e30
+"""Of a rate of learning: float32 ends soon after."""
 LARGEST_FACTOR = 1e6
 """Of weights, temperatures and powers: more says no more, and float32 runs out of digits."""
 

@@ -34,7 +34,7 @@ _FORM: Mapping[str, type] = {
     _RANDOM: dict,
 }
 """Of a checkpoint's keys the kinds; all but those of :data:`_NEEDED` may be missing."""
-_NEEDED = ("state_dict", "epoch", "global_step", "loops", _VERSION)
+_NEEDED = ("state_dict", "epoch", "global_step", "loops")
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -63,7 +63,14 @@ class WholeCheckpoints(TorchCheckpointIO):
         """Read it on the CPU, as :func:`read_checkpoint`; nothing is unpickled whatever the caller says."""
         if "://" in str(path):
             return super().load_checkpoint(path, map_location, weights_only=True)
-        return read_checkpoint(path)
+        content = read_checkpoint(path)
+        try:
+            old = Version(content.get(_VERSION, "")) < Version("2")
+        except InvalidVersion:
+            old = True
+        if old:  # Lightning would look for what they do not have
+            raise UserError(f"{path}: key {_VERSION!r}: expected 2.0 or newer, found {shown(content.get(_VERSION))}")
+        return content
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -99,12 +106,6 @@ def _read(path: Path) -> dict[str, Any]:
         found = content.get(key)
         if (key in content or key in _NEEDED) and (not isinstance(found, kind) or isinstance(found, bool)):
             raise UserError(f"{path}: key {key!r}: expected a checkpoint's {kind.__name__}, found {_kind(found)}")
-    try:
-        old = Version(content[_VERSION]) < Version("2")
-    except InvalidVersion:
-        old = True
-    if old:
-        raise UserError(f"{path}: key {_VERSION!r}: expected 2.0 or newer, found {shown(content[_VERSION])}")
     for name, value in content["state_dict"].items():
         if not (isinstance(name, str) and isinstance(value, Tensor)):
             raise UserError(f"{path}: key 'state_dict': expected tensors by name, found {_kind(value)} as {str(name)[:50]!r}")

@@ -6,7 +6,7 @@ from typing import Literal
 from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.diffusion.schedule import LARGEST_POWER
 from ftl_lightning.errors import UserError
-from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.ranges import LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
 
 EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
@@ -85,8 +85,9 @@ class InversionSettings:
         for name, most in (("components", 1000), ("restarts", 1000), ("knots", 1000), ("samples", MOST_TOGETHER)):
             expect_count(f"model.{name}", getattr(self, name), 1, most)
         expect_count("model.mode_samples", self.mode_samples, 1, MOST_TOGETHER)
-        for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate", "initial_spread"):
-            expect_factor(f"model.{name}", getattr(self, name), 0)
+        for name in ("learning_rate", "weight_learning_rate", "adapter_learning_rate"):
+            expect_factor(f"model.{name}", getattr(self, name), 0, LARGEST_RATE)
+        expect_factor("model.initial_spread", self.initial_spread, 0)
         expect_range("model.seed", self.seed, 0)
         expect_factor("model.initial_omega", self.initial_omega)
         expect_factor("model.guidance_scale", self.guidance_scale, 0)

@@ -27,7 +27,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
 from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.learning.model_config import find_view
-from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor, expect_range
+from ftl_lightning.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import expect_finite
 
@@ -84,7 +84,7 @@ class Pretraining(pl.LightningModule, ABC):
         super().__init__()
         self.save_hyperparameters()
         for name, value, most in (
-            ("learning_rate", learning_rate, LARGEST_FACTOR),
+            ("learning_rate", learning_rate, LARGEST_RATE),
             ("warmup_steps", warmup_steps, math.inf),
             ("weight_decay", weight_decay, LARGEST_FACTOR),
             ("ema_decay", ema_decay, 1),
