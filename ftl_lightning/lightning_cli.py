@@ -14,6 +14,7 @@ from jsonargparse import Namespace, set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from ftl_lightning import log_folder, trust
@@ -106,6 +107,8 @@ class CommandLine(LightningCLI):
         A pretraining takes that of an earlier one, unless it goes on at the same time. Whatever goes on from a checkpoint takes the
         folder that is named.
         """
+        if getattr(rank_zero_only, "rank", 0):  # of several processes of one run the first has the folder
+            return
         logger = self._get(self.config, "trainer").get("logger")
         options = logger.get("init_args") if isinstance(logger, Namespace) else None
         if not options or not isinstance(options.get("version"), str) or not {"save_dir", "name"} <= set(options.keys()):
