@@ -464,3 +464,17 @@ def test_the_path_is_restored_after_a_command(monkeypatch: pytest.MonkeyPatch) -
     assert main(["--version"]) == 0
     assert sys.path == before
     assert "" not in trust.search_path()
+
+
+def test_stages_of_an_ablation_are_read_in_a_process_of_their_own() -> None:
+    """What a process has been told of trusted classes before would hide that they are not."""
+    done = program(sys.executable, "-m", "ftl_lightning", "ablate", "--config=conf/ablation/smoke.yaml", "--print_config")
+    assert done.returncode == 0, done.stderr
+    assert "verb: invert" in done.stdout
+
+
+def test_a_class_that_a_person_named_once_stays_taken_from_its_package(capsys: pytest.CaptureFixture[str]) -> None:
+    stopping = "--trainer.callbacks+=lightning.pytorch.callbacks.EarlyStopping"
+    for more, expected in (([stopping, "--trainer.callbacks.monitor=val/loss"], "data.batch_size"), ([], "data.batch_size")):
+        assert main([*FIT, *more, "--data.batch_size=0"]) == 2
+        assert expected in capsys.readouterr().err

@@ -8,6 +8,7 @@ from pathlib import Path
 import lightning.pytorch as pl
 from torch import Tensor
 
+from ftl_lightning import log_folder
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
@@ -119,6 +120,7 @@ class Adaptation(pl.LightningModule, ABC):
     def find(self) -> None:
         """Write every concept to a file of its own."""
         self._found = self.learned()
+        log_folder.keep()  # also where nothing is trained
         for name, concept in self._found.items():
             path = self._file(name)
             concept.save(path)
