@@ -143,13 +143,14 @@ def device_named(name: object) -> torch.device:
     Raises:
         UserError: for another one, with those that there are.
     """
+    told = f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}"
+    if not isinstance(name, str | torch.device):
+        raise UserError(told)
     try:
-        if not isinstance(name, str | torch.device):
-            raise TypeError
         found = torch.device(name)
         torch.ones(1, device=found).cpu()  # it may be named without being there
-    except (RuntimeError, AssertionError, TypeError, NotImplementedError):
-        raise UserError(f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}") from None
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch has one for each kind of absence
+        raise UserError(told) from error
     return found
 
 

@@ -91,10 +91,13 @@ def _claimed(folder: Path, new: bool) -> bool:
     while True:
         missing = [one for one in (folder, *folder.parents) if not one.exists()]
         try:
-            folder.mkdir(parents=True, exist_ok=not new)
+            try:
+                folder.mkdir(parents=True)
+            except FileExistsError:  # a folder, which was looked at above; whoever made it, this run did not and never removes it
+                if new:
+                    return False
+                missing = []
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileExistsError:  # a folder: it was looked at above
-            return False
         except FileNotFoundError:  # a run that ended has just removed a folder above it
             continue
         try:

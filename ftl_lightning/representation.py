@@ -1,6 +1,7 @@
 """What an object is, in a few words: one line where it is printed, a short list in a notebook."""
 
 import html
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 
 from ftl_lightning.errors import LONGEST, short
@@ -9,12 +10,12 @@ MOST_NUMBERS = 6
 """Numbers of a list that are told one by one."""
 
 
-class Shown:
+class Shown(ABC):
     """Something that says what it is in a few words of its own."""
 
+    @abstractmethod
     def _words(self) -> Iterable[str]:
         """What one wants to know of it, the most important first."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         return short(f"{type(self).__name__}({', '.join(map(short, self._words()))})", LONGEST)

@@ -158,3 +158,28 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
 def test_a_name_that_a_file_system_just_takes_is_written(name: str) -> None:
     write_text(name, "long")
     assert [path.name for path in Path().iterdir()] == [name]
+
+
+def test_a_folder_that_another_run_made_in_the_meantime_is_never_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is made, filled and let go of between the look at what is missing and the making of the folder."""
+    folder = tmp_path / "fit"
+    exists = Path.exists
+
+    def filled(path: Path) -> bool:
+        found = exists(path)
+        if path == folder and not found:
+            folder.mkdir()
+            (folder / "results.csv").touch()
+        return found
+
+    monkeypatch.setattr(log_folder, "expect_writable_folder", lambda path: None)
+    monkeypatch.setattr(Path, "exists", filled)
+
+    def refused() -> None:
+        with log_folder.run():
+            log_folder.hold(folder)
+            raise UserError("refused")
+
+    with pytest.raises(UserError, match="refused"):
+        refused()
+    assert [path.name for path in folder.iterdir()] == ["results.csv"]
