@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli import main
+from ftl_lightning.errors import LONGEST
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -23,6 +24,22 @@ TINY = [
     "--trainer.accelerator=cpu",
 ]
 """Options that make any fit of object rearrangement a matter of seconds."""
+
+
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *expected: str) -> str:
+    """Run a verb and expect one line that says something, and no new file; returns what went to standard error."""
+    capsys.readouterr()
+    before = {path: path.lstat().st_mtime_ns for path in Path().rglob("*")}
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    lines = [line for line in told.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1
+    assert "Traceback" not in told
+    assert len(lines[0]) <= LONGEST
+    for text in expected:
+        assert text in lines[0]
+    assert {path: path.lstat().st_mtime_ns for path in Path().rglob("*") if "cache" not in path.parts} == before
+    return told
 
 
 @pytest.fixture(autouse=True)

@@ -12,30 +12,14 @@ import pytest
 import safetensors.torch
 import torch
 
-from ftl_lightning.cli import main
-from ftl_lightning.errors import LONGEST
 from ftl_lightning.evaluation.results import COLUMNS
 from ftl_lightning.tensor_file import file_hash
 
-from .conftest import CONF, ROOT
+from .conftest import CONF, ROOT, refused
 
 Told = pytest.CaptureFixture[str]
 PUSH = "go to red object"
 ZERO = "0" * 16
-
-
-def refused(capsys: Told, arguments: list[str], *expected: str) -> None:
-    """Run a verb and expect one line that says something, and no new file."""
-    before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
-    assert main(arguments) == 2
-    told = capsys.readouterr().err
-    lines = [line for line in told.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1
-    assert "Traceback" not in told
-    assert len(lines[0]) <= LONGEST
-    for text in expected:
-        assert text in lines[0]
-    assert {path: path.stat().st_mtime_ns for path in Path().rglob("*") if "cache" not in path.parts} == before
 
 
 def at(tree: dict[str, Any], path: str, value: object) -> dict[str, Any]:

@@ -10,10 +10,9 @@ import safetensors.torch
 import torch
 
 from ftl_lightning.cli import main
-from ftl_lightning.errors import LONGEST
 from ftl_lightning.evaluation.results import COLUMNS
 
-from .conftest import CONF, ROOT, TINY
+from .conftest import CONF, ROOT, TINY, refused
 
 Told = pytest.CaptureFixture[str]
 FIT = ["fit", f"--config={CONF / 'object_rearrangement.yaml'}", *TINY, "--trainer.max_steps=2"]
@@ -22,21 +21,6 @@ PUSH = "go to red object"
 SAMPLE = ["sample", "--pretrained=agent"]
 CHECKPOINT = "trainer.callbacks=[{class_path: lightning.pytorch.callbacks.ModelCheckpoint, init_args: {%s}}]"
 STOPPING = "trainer.callbacks=[{class_path: lightning.pytorch.callbacks.EarlyStopping, init_args: {%s}}]"
-
-
-def refused(capsys: Told, arguments: list[str], *expected: str) -> str:
-    before = set(Path().rglob("*"))
-    capsys.readouterr()
-    assert main(arguments) == 2
-    out, err = capsys.readouterr()
-    assert "Traceback" not in err
-    told = [row for row in err.splitlines() if row.startswith("error: ")]
-    assert len(told) == 1, err
-    assert len(told[0]) <= LONGEST
-    for text in expected:
-        assert text in told[0]
-    assert {path for path in Path().rglob("*") if "cache" not in path.parts} <= before
-    return out
 
 
 @pytest.mark.parametrize(
