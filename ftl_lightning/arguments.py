@@ -4,13 +4,15 @@ import difflib
 import os
 import types
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 
 from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.learning.options import groups_of, replaced
 from ftl_lightning.ranges import LARGEST, expect_count, expect_range
 
 if TYPE_CHECKING:
@@ -82,7 +84,9 @@ def expect_path(key: str, value: object, what: str) -> None:
         raise UserError(f"{key}: expected {what}, found {shown(value)}")
 
 
-def changed(call: str, settings: T, changes: Mapping[str, Any], beside: Sequence[str]) -> T:
+def changed(
+    call: str, settings: T, changes: Mapping[str, Any], beside: Sequence[str], places: Mapping[str, str] = MappingProxyType({})
+) -> T:
     """Settings of which some are changed.
 
     Args:
@@ -90,11 +94,13 @@ def changed(call: str, settings: T, changes: Mapping[str, Any], beside: Sequence
         settings: the others.
         changes: by name.
         beside: names of what else can be given to it.
+        places: of each option in a group of the settings where it is, ``'group.option'``, by its flat name.
 
     Raises:
         UserError: for a name that is none, with all that are, or a value of another type.
     """
-    names = [field.name for field in fields(settings) if field.name not in beside]
+    groups = groups_of(places)
+    names = [*(field.name for field in fields(settings) if field.name not in (*beside, *groups)), *places]
     if unknown := [name for name in changes if name not in names]:
         told = names if len(names) <= MOST_NAMES else [*names[:MOST_NAMES], "..."]
         raise UserError(
@@ -104,12 +110,16 @@ def changed(call: str, settings: T, changes: Mapping[str, Any], beside: Sequence
     # NumPy's numbers are as good as Python's.
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in changes.items()}
     hints = get_type_hints(type(settings))
+    of_groups = {group: get_type_hints(hints[group]) for group in groups}
+    for name, place in places.items():
+        group, _, option = place.partition(".")
+        hints[name] = of_groups[group][option]
     for name, value in plain.items():
         kinds = _kinds(hints[name])
         if not any(_is(value, kind) for kind in kinds):
             told = [_WORDS[kind] if kind in _WORDS else repr(kind) for kind in kinds]
             raise UserError(f"{call}: {name}: expected {' or '.join(told)}, found {shown(value)}")
-    return replace(settings, **plain)
+    return replaced(settings, plain, places)
 
 
 _WORDS: Mapping[object, str] = {int: "a whole number", float: "a number", str: "a text", bool: "True or False", type(None): "None"}

@@ -273,13 +273,14 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     """
     from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.concepts.explanation import explain as explained
+    from ftl_lightning.learning.concept_check import expect_concept
     from ftl_lightning.learning.pretrained import find_model, load_model
     from ftl_lightning.shipped import MODELS
 
     expect_count("nearest", nearest, 1)
     learned = Concept.load(concept)
     model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), MODELS)))
-    model.check(learned, concept)
+    expect_concept(model, learned, concept)
     names = model.config.training_concepts
     say(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
     if learned.modes is not None:

@@ -20,6 +20,7 @@ from yaml import YAMLError
 
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.limits import expect_readable
+from ftl_lightning.regrouped import regrouped
 from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
@@ -57,7 +58,7 @@ def load(path: str | Path) -> dict[str, Any]:
     except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
     assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
+    return regrouped({str(key): value for key, value in found.items()}, str(path))
 
 
 def parts(path: str | Path) -> list[Path]:
@@ -69,7 +70,7 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConf
     """Every file with its own keys. ``above`` are the files that led here."""
     if path.resolve() in (one.resolve() for one in above):
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
-    keys = _read(path)
+    keys = OmegaConf.create(regrouped(read(path), str(path)))
     names = keys.pop(DEFAULTS, None) or []
     if not isinstance(names, ListConfig | list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")

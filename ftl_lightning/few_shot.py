@@ -24,15 +24,17 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.evaluation.execution import Execution, closed_loop_of
+from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.hub import card as model_card
 from ftl_lightning.learning.hub import download, upload
-from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.model_config import DIFFUSION
+from ftl_lightning.learning.model_folder import save_model
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
 from ftl_lightning.ranges import LARGEST_STEP
+from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED, generator
 from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped, shipped_models
@@ -120,7 +122,7 @@ class FewShot(Shown):
         with vouching([] if settings is None else Tuned.domains(settings)):
             model = load_model(folder, domain).to(place)
         if settings is None:
-            group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
+            group = "" if model.method.kind == DIFFUSION else f"baseline/{model.method.kind.replace('-', '_')}/"
             tuned = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
             settings = tuned if tuned.is_file() else "conf/invert/own.yaml"
         found = cls(model, Tuned.read(settings))
@@ -178,7 +180,7 @@ class FewShot(Shown):
         """
         expect_path("path", path, "the file of a learned concept")
         concept = Concept.load(path)
-        self.model.check(concept, path)
+        expect_concept(self.model, concept, path)
         return self._learned(concept)
 
     def compose(self, text: str) -> Composition:
@@ -279,12 +281,14 @@ class FewShot(Shown):
             told = short(", ".join(sorted(found)), 150)
             raise UserError(f"states: expected demonstrations of one concept, found those of {told}; choose with select(name)")
         expect_whole("seed", seed, 0, None)
-        settings = replace(changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress")), seed=int(seed))
+        settings = replace(
+            changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION), seed=int(seed)
+        )
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         if told := longer_than_plans(own, self.model):
             warnings.warn(told, stacklevel=2)
         with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
-            learned = invert(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
+            learned = self.model.method.learn()(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
         self._examples.append(own)
         return self._learned(learned[own.concepts[0]])
 
@@ -445,7 +449,7 @@ class FewShot(Shown):
     def save_pretrained(self, folder: str | Path) -> None:
         """Write ``config.json``, ``model.safetensors`` and, if there is none yet, a ``README.md`` to a folder."""
         folder = Path(folder)
-        self.model.save(folder)
+        save_model(self.model, folder)
         if not (card := folder / "README.md").is_file():
             with atomic(card) as temporary:
                 temporary.write_text(model_card(self.model), encoding="utf-8")

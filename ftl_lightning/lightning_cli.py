@@ -25,6 +25,7 @@ from ftl_lightning.inputs import options
 from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_range
+from ftl_lightning.regrouped import regrouped_arguments
 from ftl_lightning.trainer import Trainer
 from ftl_lightning.training_bar import TrainingBar, accuracies
 
@@ -213,17 +214,17 @@ class _Parser(CommandLine):
 def run(arguments: list[str]) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
     with log_folder.run():
-        _command_line(CommandLine, arguments, run=True)
+        _command_line(CommandLine, arguments[0], arguments, run=True)
 
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
-    return _command_line(_Inversion if verb == "invert" else _Fit, options, run=False)
+    return _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
 
 
-def parse(options: list[str]) -> dict[str, Any]:
+def parse(verb: str, options: list[str]) -> dict[str, Any]:
     """What the options of a verb come to, by key; nothing is built."""
-    found: dict[str, Any] = _command_line(_Parser, options, run=False).config.as_dict()
+    found: dict[str, Any] = _command_line(_Parser, verb, options, run=False).config.as_dict()
     return found
 
 
@@ -246,7 +247,7 @@ def _expect_trusted(arguments: list[str]) -> None:
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
 
 
-def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> CommandLine:
+def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run: bool) -> CommandLine:
     _expect_trusted(arguments)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
@@ -269,7 +270,7 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(arguments),
+            args=expanded(regrouped_arguments(arguments, verb)),
         )
     except OSError as error:
         raise UserError(

@@ -6,7 +6,7 @@ from typing import Self
 
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.inversion_settings import GROUPS, InversionSettings
 from ftl_lightning.trust import is_installed, is_vouched
 
 
@@ -37,11 +37,16 @@ class Tuned:
 
         content = load(path)
         model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
-        learning, seen = model.get("init_args") or {}, {field.name for field in fields(InversionSettings)} - {"seed"}
+        options = model.get("init_args") or {}
+        learning = {
+            field.name: GROUPS[field.name](**options[field.name]) if field.name in GROUPS else options[field.name]
+            for field in fields(InversionSettings)
+            if field.name in options and field.name != "seed"
+        }
         sampling = {field.name: evaluation[field.name] for field in fields(Sampling) if field.name in evaluation}
         try:
             return cls(
-                inversion=InversionSettings(**{key: value for key, value in learning.items() if key in seen}),
+                inversion=InversionSettings(**learning),
                 learning_steps=int((data.get("init_args") or {}).get("steps", 400)),
                 sampling=Sampling(**sampling),
                 replan=int(evaluation.get("replan", 1)),

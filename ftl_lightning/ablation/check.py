@@ -38,11 +38,11 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.concepts.encoder import load_encoder
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.learning.model_config import read_config
-    from ftl_lightning.learning.pretrained import MODELS, model_class
     from ftl_lightning.lightning_cli import parse
+    from ftl_lightning.methods.registry import adapts, kinds_for
 
     find(cell.config)
-    config = parse(cell.arguments)
+    config = parse(cell.verb, cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
     if cell.verb == "fit":
         load_encoder(data["encoder"], Path(), data["revision"])
@@ -59,12 +59,12 @@ def _check(cell: Cell, made: set[str]) -> None:
             expected = ", ".join(domain.concepts.suites)
             raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")
     if model["pretrained"] not in made:
-        adapts = _class(config["model"]["class_path"]).adapts
-        kinds = [kind for kind in MODELS if issubclass(model_class(kind), adapts)]
+        adaptation = _class(config["model"]["class_path"])
         found = read_config(pretrained_folder(model["pretrained"]))
-        if found["domain"] != domain.name or found["kind"] not in kinds:
+        if found["domain"] != domain.name or not adapts(adaptation, found["kind"]):
+            expected = " or ".join(kinds_for(adaptation))
             raise UserError(
-                f"model.pretrained: expected a model of {domain.name} ({' or '.join(kinds)}), found one of {found['domain']} "
+                f"model.pretrained: expected a model of {domain.name} ({expected}), found one of {found['domain']} "
                 f"({found['kind']}) in {model['pretrained']}"
             )
     if "encoder" in model:

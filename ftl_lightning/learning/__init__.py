@@ -7,15 +7,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ftl_lightning.learning.diffusion_pretraining import PretrainingModule
     from ftl_lightning.learning.inversion_module import InversionModule
+    from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 
 __all__ = ["InversionModule", "PretrainingModule"]
 
-_MODULES = {"InversionModule": "inversion_module", "PretrainingModule": "diffusion_pretraining"}
+_MODULES = {
+    "InversionModule": "ftl_lightning.learning.inversion_module",
+    "PretrainingModule": "ftl_lightning.methods.ftl_igm.pretraining",
+}
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)

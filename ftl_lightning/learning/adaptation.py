@@ -19,7 +19,8 @@ from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.longer import longer_than_plans
-from ftl_lightning.learning.pretrained import MODELS, load_model, model_class
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.registry import adapts, kinds_for
 from ftl_lightning.printing import say
 from ftl_lightning.targets import expect_writable_file
 
@@ -35,17 +36,16 @@ class Adaptation(pl.LightningModule, ABC):
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
     """
 
-    adapts: tuple[type[ConceptModel], ...]
-    """Models that can be adapted so."""
     learns = False
     """Whether concepts are learned by gradient descent, for which there are training steps."""
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
-        self.model = load_model(pretrained)
-        if not isinstance(self.model, self.adapts):
-            expected = " or ".join(kind for kind in MODELS if issubclass(model_class(kind), self.adapts))
-            raise UserError(f"model.pretrained: expected a model of kind {expected}, found {self.model.kind} in {pretrained}")
+        self.model: ConceptModel = load_model(pretrained)
+        kind = self.model.method.kind
+        if not adapts(type(self), kind):
+            expected = " or ".join(kinds_for(type(self)))
+            raise UserError(f"model.pretrained: expected a model of kind {expected}, found {kind} in {pretrained}")
         self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ class Adaptation(pl.LightningModule, ABC):
     @property
     def method(self) -> str:
         """The method's name in tables."""
-        return self.model.name
+        return self.model.method.name
 
     @property
     def variant(self) -> str:

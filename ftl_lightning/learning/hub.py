@@ -40,7 +40,7 @@ def card(model: ConceptModel) -> str:
     texts = "\n".join(f"- {text}" for text in model.config.training_concepts)
     return (
         "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning]\n---\n"
-        f"# {model.name} on {model.domain.name}\n\nHash {model.hash}; plans of {model.config.horizon} states of "
+        f"# {model.method.name} on {model.domain.name}\n\nHash {model.hash}; plans of {model.config.horizon} states of "
         f"{model.config.state_dim} numbers. Text encoder: {model.config.encoder}.\n\nTraining concepts:\n\n{texts}\n\n"
         f'    from ftl_lightning import FewShot\n    model = FewShot.from_pretrained("FOLDER OR NAME")\n\n'
         f"Files: `{CONFIG}`, `model.safetensors` (weights in half precision).\n"

@@ -10,16 +10,16 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
-from ftl_lightning.concepts.adapter import LowRank, adaptable
+from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, Modes
 from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
-from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.stopping import Stopping
+from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.seeding import generator
 
 _LOG = logging.getLogger(__name__)
@@ -77,36 +77,38 @@ class Inversion(nn.Module):
         self.runs = self._runs()
         self.register_buffer("_modes", torch.tensor([run.mode > 0 for run in self.runs]), persistent=False)
         # A generator for each concept, so that its start does not depend on what is learned beside it. Its modes start alike.
-        shape = (settings.restarts, settings.components, model.config.concept_dim)
+        shape = (settings.budget.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
         starts = [torch.randn(shape, generator=draw) for draw in draws]
-        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.restarts]]).repeat(1, 1, settings.knots)
-        self.embeddings = nn.Parameter(settings.initial_spread * start)
+        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.budget.restarts]]).repeat(
+            1, 1, settings.embeddings.knots
+        )
+        self.embeddings = nn.Parameter(settings.embeddings.initial_spread * start)
         runs = (len(start), settings.components)
         if settings.omega == "learned":
-            self.weights = nn.Parameter(torch.full(runs, float(settings.initial_omega)))
+            self.weights = nn.Parameter(torch.full(runs, float(settings.weights.initial)))
         else:
             self.register_buffer("weights", torch.full(runs, float(settings.omega)), persistent=False)
         # Factors of an adapter for every run: of each weight ``up (run, outputs, rank)``, which starts at zero, and ``down``.
         self.factors = nn.ParameterList()
-        sizes = adaptable(model.denoiser) if settings.adapter and isinstance(model, GenerativeModel) else {}
+        sizes = model.adaptable() if settings.adapter.rank else {}
         self._names = list(sizes)
         for outputs, inputs in sizes.values():
-            down = torch.stack([torch.randn(settings.adapter, inputs, generator=draws[run.concept]) for run in self.runs])
-            self.factors.append(torch.zeros(len(self.runs), outputs, settings.adapter))
+            down = torch.stack([torch.randn(settings.adapter.rank, inputs, generator=draws[run.concept]) for run in self.runs])
+            self.factors.append(torch.zeros(len(self.runs), outputs, settings.adapter.rank))
             self.factors.append(down / inputs**0.5)
         self.stopping: Stopping | None = None
-        if settings.tolerance is not None:
-            self.stopping = Stopping(self.embeddings, self.weights, settings.tolerance)
+        if settings.budget.tolerance is not None:
+            self.stopping = Stopping(self.embeddings, self.weights, settings.budget.tolerance)
 
     def _runs(self) -> list[_Run]:
         """Of each concept the run of all its demonstrations, then those of its modes; restarts of a run stand together."""
-        texts, modes, found = self.demonstrations.concepts, self.settings.modes, []
+        texts, modes, found = self.demonstrations.concepts, self.settings.modes.sets, []
         for concept, name in enumerate(self.concepts):
             rows = tuple(row for row, text in enumerate(texts) if text == name)
             count = min(modes, len(rows)) if isinstance(modes, int) else len(rows)
             parts = [rows, *((rows[mode::count] for mode in range(count)) if count > 1 else ())]
-            found += [_Run(concept, part, mode) for mode, part in enumerate(parts) for _ in range(self.settings.restarts)]
+            found += [_Run(concept, part, mode) for mode, part in enumerate(parts) for _ in range(self.settings.budget.restarts)]
         return found
 
     @property
@@ -116,11 +118,11 @@ class Inversion(nn.Module):
 
     def parametrised(self, embeddings: Tensor) -> Tensor:
         """Embeddings ``(run, K, knots * n)`` after their part off the span is scaled."""
-        if self.settings.off_span == 1:
+        if self.settings.embeddings.off_span == 1:
             return embeddings
-        each = embeddings.unflatten(-1, (self.settings.knots, -1))
+        each = embeddings.unflatten(-1, (self.settings.embeddings.knots, -1))
         inside = each @ self.basis.T @ self.basis
-        return (inside + self.settings.off_span * (each - inside)).flatten(-2)
+        return (inside + self.settings.embeddings.off_span * (each - inside)).flatten(-2)
 
     def adapter(self, run: int) -> LowRank | None:
         """A run's adapter; ``None`` where there are none."""
@@ -128,7 +130,7 @@ class Inversion(nn.Module):
         if not factors:
             return None
         named = dict(zip(self._names, zip(factors[::2], factors[1::2], strict=True), strict=True))
-        return LowRank(named, self.settings.adapter_scope == "all")
+        return LowRank(named, self.settings.adapter.scope == "all")
 
     def _losses(self, samples: int, draw: torch.Generator, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
         """The model's loss (ours is Eq. 2) for every sample ``(run, samples)``. Runs share what is random in it and, as a share of
@@ -147,20 +149,20 @@ class Inversion(nn.Module):
             runs = [run for run, own in zip(runs, chosen.tolist(), strict=True) if own]
         model, device = self.model, self.embeddings.device
         window = model.window
-        draws = model.draws(samples, self.settings.timestep_power, draw)
+        draws = model.draws(samples, self.settings.loss.timestep_power, draw)
         rows = torch.tensor([run.rows[sample % len(run.rows)] for run in runs for sample in range(samples)])
         share = torch.rand(samples, generator=draw, device=device).cpu().repeat(len(runs))
         plans = model.domain.plans
         starts = self.demonstrations.starts(rows, share, plans.exponent(window), window, plans.at_rest)
         states, observed = self.demonstrations.windows(rows, starts, window)
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
-        composition = Composition(self.parametrised(embeddings), weights, knots=self.settings.knots)
+        composition = Composition(self.parametrised(embeddings), weights, knots=self.settings.embeddings.knots)
         if self.factors:
             own = torch.arange(len(self.runs), device=device) if chosen is None else chosen.nonzero()[:, 0]
             adapters = tuple(adapter for run in own.tolist() if (adapter := self.adapter(run)))
             number = torch.arange(1, len(own) + 1, device=device)[:, None].expand_as(weights)
             composition = replace(composition, adapters=adapters, adapter=number)
-        return model.losses(states, seen, composition, draws, self.settings.loss)
+        return model.losses(states, seen, composition, draws, self.settings.loss.kind)
 
     def losses(self, samples: int, draw: torch.Generator, chosen: Tensor | None = None) -> Tensor:
         """:meth:`_losses` of the embeddings and weights that are being learned."""
@@ -175,7 +177,7 @@ class Inversion(nn.Module):
         if self.stopping is not None and step == 0:
             self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
         found = []
-        for samples, own in ((self.settings.samples, ~self._modes), (self.settings.mode_samples, self._modes)):
+        for samples, own in ((self.settings.budget.samples, ~self._modes), (self.settings.modes.samples, self._modes)):
             chosen = own if self.stopping is None else own & self.stopping.going
             if chosen.any():
                 # Anew for the modes, which would otherwise depend on whether any other run goes on.
@@ -184,7 +186,7 @@ class Inversion(nn.Module):
         losses = torch.cat(found)
         mean = losses.detach().mean()
         if not mean.isfinite():
-            raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.learning_rate")
+            raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.budget.learning_rate")
         return losses
 
     def stepped(self, step: int) -> bool:
@@ -205,14 +207,14 @@ class Inversion(nn.Module):
     def rates(self) -> list[tuple[nn.Parameter, float]]:
         """Each parameter with its learning rate."""
         learned = isinstance(self.weights, nn.Parameter)
-        weights = [(self.weights, self.settings.weight_learning_rate)] if learned else []
-        factors = [(factor, self.settings.adapter_learning_rate) for factor in self.factors]
-        return [(self.embeddings, self.settings.learning_rate), *weights, *factors]
+        weights = [(self.weights, self.settings.weights.learning_rate)] if learned else []
+        factors = [(factor, self.settings.adapter.learning_rate) for factor in self.factors]
+        return [(self.embeddings, self.settings.budget.learning_rate), *weights, *factors]
 
     def optimizer(self, steps: int) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Adam, weights with a rate of their own, and its cosine decay over so many steps, or no decay where runs are stopped."""
         optimizer = torch.optim.Adam([{"params": [parameter], "lr": rate} for parameter, rate in self.rates])
-        if self.settings.tolerance is not None:
+        if self.settings.budget.tolerance is not None:
             return optimizer, torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
         return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
@@ -223,18 +225,18 @@ class Inversion(nn.Module):
         Raises:
             UserError: for a concept that is not finite.
         """
-        restarts = self.settings.restarts
+        restarts = self.settings.budget.restarts
         # Where there were fewer steps than a round has, there is no best one yet.
         source = self if self.stopping is None or not self.stopping.rounds else self.stopping
         raw, weights = source.embeddings.detach(), source.weights.detach()
         losses = self._final(raw, weights)
         best = torch.arange(0, len(losses), restarts, device=losses.device) + losses.unflatten(0, (-1, restarts)).argmin(dim=1)
-        auto = self.settings.modes == "auto"
+        auto = self.settings.modes.sets == "auto"
         empty = self._final(raw, torch.zeros_like(weights)) if auto else losses
         embeddings = self.parametrised(raw)
         kind = "learned" if self.settings.omega == "learned" else "fixed"
         if kind == "learned":
-            weights = weights * self.settings.guidance_scale
+            weights = weights * self.settings.weights.scale
         found = {}
         for index, name in enumerate(self.concepts):
             whole, *modes = [run for run in best.tolist() if self.runs[run].concept == index]
@@ -244,7 +246,7 @@ class Inversion(nn.Module):
                 weights[whole].cpu(),
                 origin(self.model, self.demonstrations, name, kind, losses[whole].item()),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
-                self.settings.knots,
+                self.settings.embeddings.knots,
                 adapter.copied() if (adapter := self.adapter(whole)) else None,
             )
             found[name].expect_finite(f"inversion: concept {name!r}")
@@ -267,17 +269,23 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
     Raises:
         UserError: naming the key.
     """
-    if settings.off_span < 1 and not isinstance(model, TextConceptModel):
+    if not model.invertible:
+        raise UserError(f"model.pretrained: expected a model that concepts are learned through, found one of {model.method.name}")
+    if settings.embeddings.off_span < 1 and not isinstance(model, TextConceptModel):
+        found = settings.embeddings.off_span
         raise UserError(
-            f"model.off_span: expected 1 (free) for {model.name}, whose concepts are no texts, found {settings.off_span}"
+            f"model.embeddings.off_span: expected 1 (free) for {model.method.name}, whose concepts are no texts, found {found}"
         )
-    if settings.knots > 1 and not model.over_time:
-        raise UserError(f"model.knots: expected 1 for this model, whose concepts do not vary over a plan, found {settings.knots}")
-    if settings.adapter and not isinstance(model, GenerativeModel):
-        raise UserError(f"model.adapter: expected 0 (none) for {model.name}, found {settings.adapter}")
-    pretrained = model.config.training.get("model", {}).get("loss", settings.loss)
-    if pretrained != settings.loss:
-        _LOG.warning("model.loss: the model was pretrained with %r; with %r concepts are learned worse", pretrained, settings.loss)
+    if (knots := settings.embeddings.knots) > 1 and not model.over_time:
+        told = f"expected 1 for this model, whose concepts do not vary over a plan, found {knots}"
+        raise UserError(f"model.embeddings.knots: {told}")
+    if settings.adapter.rank and not model.adaptable():
+        raise UserError(f"model.adapter.rank: expected 0 (none) for {model.method.name}, found {settings.adapter.rank}")
+    pretrained = model.config.training.get("model", {}).get("loss", settings.loss.kind)
+    if pretrained != settings.loss.kind:
+        _LOG.warning(
+            "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse", pretrained, settings.loss.kind
+        )
 
 
 def origin(model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float) -> Origin:
@@ -327,7 +335,7 @@ def invert(
         # An adapter also has factors of what reads observed features, which happens once a plan, outside of the branches.
         gradients = torch.autograd.grad(losses.sum(), [group.parameter for group in groups], materialize_grads=True)
         for group, gradient in zip(groups, gradients, strict=True):
-            group.step(gradient, None if settings.tolerance is not None else (step, steps))
+            group.step(gradient, None if settings.budget.tolerance is not None else (step, steps))
         tell(losses.detach().mean().item())
         if not inversion.stepped(step):
             break

@@ -1,6 +1,5 @@
 """Inversion as a LightningModule: curves, checkpoints that resume exactly, and evaluation at the end."""
 
-from dataclasses import fields
 from typing import Any, Literal
 
 import torch
@@ -11,19 +10,24 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.paper import FINE_TUNED, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
-from ftl_lightning.learning.baselines.additive import AdditiveModel
-from ftl_lightning.learning.checkpoint import check_parameters, check_restored, check_signature, sign
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import Inversion, check_settings
-from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.ranges import expect_factor
-from ftl_lightning.tensor_file import expect_finite
+from ftl_lightning.learning.inversion_settings import (
+    AdapterOptions,
+    BudgetOptions,
+    EmbeddingOptions,
+    InversionSettings,
+    LossOptions,
+    ModeOptions,
+    WeightOptions,
+)
+from ftl_lightning.learning.options import flat, groups_of
+from ftl_lightning.learning.resume import ExactResume
+from ftl_lightning.regrouped import INVERSION
 
-OWN = "inversion."
-"""Names of all that a checkpoint holds begin so."""
+_USUAL = InversionSettings()
 
 
-class InversionModule(Adaptation):
+class InversionModule(ExactResume, Adaptation):
     """Learns K embeddings and their weights for every concept of an :class:`~ftl_lightning.domains.data.InversionData`.
 
     Its only parameters are those of an :class:`~ftl_lightning.learning.inversion.Inversion`. The pretrained model is frozen and
@@ -31,17 +35,21 @@ class InversionModule(Adaptation):
 
     Args:
         pretrained: folder of the pretrained model.
-        components, omega, initial_omega, off_span: see :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
-        initial_spread, restarts, learning_rate, weight_learning_rate, samples: likewise.
-        mode_samples, modes, tolerance, knots, guidance_scale, adapter, adapter_learning_rate, adapter_scope: likewise.
-        loss, timestep_power, seed: likewise.
-        training_omega: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed
-            omega, or 1 when weights are learned.
+        components: K.
+        omega: fixed guidance weight of every component, or ``'learned'``.
+        embeddings: where they are looked for.
+        weights: how they are learned, and those of training concepts.
+        modes: several sets of embeddings of a concept.
+        adapter: of the denoiser.
+        budget: how much is computed.
+        loss: what is minimised.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
+        seed: decides starts, noise and timesteps.
     """
 
-    adapts = (GenerativeModel, AdditiveModel)
     learns = True
+    prefix = "inversion."
+    doing = "inversion"
     strict_loading = False
 
     def __init__(
@@ -49,54 +57,58 @@ class InversionModule(Adaptation):
         pretrained: str,
         components: int = 2,
         omega: float | Literal["learned"] = 1.2,
-        initial_omega: float = 1.0,
-        off_span: float = 1.0,
-        initial_spread: float = 0.05,
-        restarts: int = 1,
-        learning_rate: float = 0.1,
-        weight_learning_rate: float = 3e-3,
-        samples: int = 32,
-        mode_samples: int = 8,
-        modes: int | Literal["each", "auto"] = 1,
-        tolerance: float | None = None,
-        knots: int = 1,
-        guidance_scale: float = 1.0,
-        adapter: int = 0,
-        adapter_learning_rate: float = 1e-3,
-        adapter_scope: Literal["concept", "all"] = "concept",
-        loss: str = "epsilon",
-        timestep_power: float = 1.0,
-        training_omega: float | None = None,
+        embeddings: EmbeddingOptions = _USUAL.embeddings,
+        weights: WeightOptions = _USUAL.weights,
+        modes: ModeOptions = _USUAL.modes,
+        adapter: AdapterOptions = _USUAL.adapter,
+        budget: BudgetOptions = _USUAL.budget,
+        loss: LossOptions = _USUAL.loss,
         output: str | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(pretrained, 1.0 if omega == "learned" else omega, output)
-        self.save_hyperparameters()
-        if training_omega is not None:
-            expect_factor("model.training_omega", training_omega)
-        self.settings = InversionSettings(**{field.name: self.hparams[field.name] for field in fields(InversionSettings)})
+        groups = {
+            "embeddings": embeddings,
+            "weights": weights,
+            "modes": modes,
+            "adapter": adapter,
+            "budget": budget,
+            "loss": loss,
+        }
+        self.save_hyperparameters(ignore=groups_of(INVERSION))
+        self.save_hyperparameters(flat(groups, INVERSION))
+        self.settings = InversionSettings(
+            components=components,
+            omega=omega,
+            embeddings=embeddings,
+            weights=weights,
+            modes=modes,
+            adapter=adapter,
+            budget=budget,
+            loss=loss,
+            seed=seed,
+        )
         check_settings(self.model, self.settings)
         self.inversion: Inversion
-        self._from = 0
 
     @property
     def method(self) -> str:
         """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
-        if self.settings.adapter and self.settings.adapter_scope == "all":
+        if self.settings.adapter.rank and self.settings.adapter.scope == "all":
             return FINE_TUNED
-        modes, knots, adapter = (self.settings.modes != 1, self.settings.knots > 1, self.settings.adapter > 0)
+        modes, knots, adapter = (self.settings.modes.sets != 1, self.settings.embeddings.knots > 1, self.settings.adapter.rank > 0)
         forms = [name for name, has in ((WITH_MODES, modes), (WITH_KNOTS, knots), (WITH_ADAPTER, adapter)) if has]
         return "".join((super().method, *forms))
 
     @property
     def variant(self) -> str:
-        off_span, weight = self.settings.off_span, self.hparams["training_omega"]
+        off_span, weight = self.settings.embeddings.off_span, self.settings.weights.training
         form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
-        modes = [] if self.settings.modes in (1, "auto") else [f"modes: {self.settings.modes}"]
-        knots = [f"{self.settings.knots} knots"] if self.settings.knots > 1 else []
-        scaled = self.settings.omega == "learned" and self.settings.guidance_scale != 1
-        scale = [f"guidance {self.settings.guidance_scale:g}"] if scaled else []
-        adapter = [f"rank {self.settings.adapter}"] if self.settings.adapter else []
+        modes = [] if self.settings.modes.sets in (1, "auto") else [f"modes: {self.settings.modes.sets}"]
+        knots = [f"{self.settings.embeddings.knots} knots"] if self.settings.embeddings.knots > 1 else []
+        scaled = self.settings.omega == "learned" and self.settings.weights.scale != 1
+        scale = [f"guidance {self.settings.weights.scale:g}"] if scaled else []
+        adapter = [f"rank {self.settings.adapter.rank}"] if self.settings.adapter.rank else []
         training = [] if weight is None else [f"training weight {weight:g}"]
         return ", ".join([*self.model.traits, form, *modes, *knots, *scale, *adapter, *training])
 
@@ -106,10 +118,6 @@ class InversionModule(Adaptation):
             with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
                 super().configure_model()
                 self.inversion = Inversion(self.model, self.demonstrations, self.settings)
-
-    def on_train_start(self) -> None:
-        """Look at what was restored, if anything."""
-        check_restored(self, self._from)
 
     def training_step(self, step: int) -> Tensor:
         losses = self.inversion.step_losses(self.global_step)
@@ -137,31 +145,22 @@ class InversionModule(Adaptation):
         optimizer, decay = self.inversion.optimizer(int(self.trainer.estimated_stepping_batches))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint and leave the frozen model out; its folder is a hyper-parameter."""
-        sign(self, checkpoint, self._signature())
-        own = {key: value for key, value in checkpoint["state_dict"].items() if key.startswith(OWN)}
-        checkpoint["state_dict"] = own
-        parameters = dict(self.inversion.named_parameters())
-        expect_finite(parameters, f"inversion: step {self.global_step}", "nothing was saved of it; lower model.learning_rate")
-
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse the checkpoint of another module, model, concepts or kind of weights."""
-        check_signature(self, checkpoint, self._signature())
-        check_parameters(checkpoint["state_dict"], self, OWN)
-        self._found, self._from = {}, checkpoint["global_step"]
+        """Refuse the checkpoint of another module, model, concepts or kind of weights; the frozen model is in none."""
+        super().on_load_checkpoint(checkpoint)
+        self._found = {}
 
-    def _signature(self) -> dict[str, Any]:
+    def signature(self) -> dict[str, Any]:
         """Settings that must match before a checkpoint is loaded."""
         return {
             "pretrained": self.model.hash,
             "demonstrations": self.demonstrations.hash,
             "components": self.settings.components,
-            "restarts": self.settings.restarts,
-            **({} if self.settings.modes == 1 else {"modes": self.settings.modes}),
-            **({} if self.settings.knots == 1 else {"knots": self.settings.knots}),
-            **({} if self.settings.adapter == 0 else {"adapter": self.settings.adapter}),
-            **({} if self.settings.tolerance is None else {"tolerance": self.settings.tolerance}),
+            "restarts": self.settings.budget.restarts,
+            **({} if self.settings.modes.sets == 1 else {"modes": self.settings.modes.sets}),
+            **({} if self.settings.embeddings.knots == 1 else {"knots": self.settings.embeddings.knots}),
+            **({} if self.settings.adapter.rank == 0 else {"adapter": self.settings.adapter.rank}),
+            **({} if self.settings.budget.tolerance is None else {"tolerance": self.settings.budget.tolerance}),
             "omega": self.settings.omega,
         }
 
@@ -169,5 +168,5 @@ class InversionModule(Adaptation):
         return self.inversion.learned()
 
     def training_weight(self, task: EvaluationTask) -> float:
-        omega = self.hparams["training_omega"] if task.learned else None
+        omega = self.settings.weights.training if task.learned else None
         return super().training_weight(task) if omega is None else omega

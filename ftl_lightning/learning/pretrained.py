@@ -1,6 +1,5 @@
 """Pretrained models by the folder they are kept in, whatever their method."""
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,29 +9,16 @@ from ftl_lightning.domains.registry import is_known, load_domain
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import CONFIG, read_config
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.registry import kinds, method_of
 from ftl_lightning.shipped import pretrained_folder
-
-MODELS = {
-    "diffusion": "generative_model:GenerativeModel",
-    "bc": "baselines.cloning:CloningModel",
-    "cvae": "baselines.vae:VAEModel",
-    "in-context": "baselines.in_context:InContextModel",
-}
-"""Where the class of each kind of model is; the baselines' also need Lightning, which takes seconds to import."""
-
-
-def model_class(kind: str) -> type[ConceptModel]:
-    """The class of a kind of model, one of :data:`MODELS`."""
-    module, _, name = MODELS[kind].partition(":")
-    found: type[ConceptModel] = getattr(importlib.import_module(f"ftl_lightning.learning.{module}"), name)
-    return found
 
 
 def load_model(folder: str | Path, domain: Domain | str | None = None) -> ConceptModel:
     """Read a model; it is frozen.
 
     Args:
-        folder: that :meth:`~ftl_lightning.learning.concept_model.ConceptModel.save` wrote, or the name of one that ships.
+        folder: that :func:`~ftl_lightning.learning.model_folder.save_model` wrote, or the name of one that ships.
         domain: whose behaviour it is, in place of what the folder says: a name, ``'package.module:DOMAIN'``, or the domain itself.
             A folder alone gets no domain but those that installed packages offer, see :mod:`ftl_lightning.trust`.
 
@@ -40,9 +26,10 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
         UserError: naming the file, if it is missing, damaged, of an unknown method, or its files do not belong together.
     """
     folder = pretrained_folder(folder)
-    if (kind := read_config(folder)["kind"]) not in MODELS:
-        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(MODELS)}, found {short(kind)!r}")
-    return model_class(kind).load(folder, load_domain(domain) if isinstance(domain, str) else domain)
+    kind = read_config(folder)["kind"]
+    if (method := method_of(kind)) is None:
+        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(kinds())}, found {short(kind)!r}")
+    return read_model(method.model_class(), folder, load_domain(domain) if isinstance(domain, str) else domain)
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:

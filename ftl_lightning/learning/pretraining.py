@@ -6,9 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
-import lightning.pytorch as pl
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
@@ -18,21 +17,25 @@ from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.checkpoint import Random, check_parameters, check_restored, check_signature, sign
+from ftl_lightning.learning.checkpoint import Random
 from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
-from ftl_lightning.learning.model_config import find_view
+from ftl_lightning.learning.model_config import ModelConfig, find_view
+from ftl_lightning.learning.model_folder import save_model
+from ftl_lightning.learning.options import groups_of
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.learning.resume import ExactResume
 from ftl_lightning.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
 from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import expect_finite
+
+M = TypeVar("M", bound=ConceptModel)
 
 
-class Pretraining(pl.LightningModule, ABC):
+class Pretraining(ExactResume, ABC, Generic[M]):
     """Fits a model to a domain's demonstrations; what the model is and what it minimises, a method says.
 
     ``model`` holds the running average of the weights, which is what is validated, exported and adapted; the published code uses
@@ -58,8 +61,10 @@ class Pretraining(pl.LightningModule, ABC):
         UserError: at construction, for a value out of its range.
     """
 
-    method: str
-    """The method's name in tables."""
+    model: M
+    raw: M
+    flat: ClassVar[Mapping[str, str]] = {}
+    """Of options in groups, where each is by its flat name, ``'group.option'``, see :mod:`ftl_lightning.learning.options`."""
     variant: str = ""
     """What tells it apart from others of the same method in tables."""
     concepts: tuple[str, ...] = ()
@@ -82,7 +87,7 @@ class Pretraining(pl.LightningModule, ABC):
         feature_dropout: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        self.save_hyperparameters(ignore=groups_of(self.flat))
         for name, value, most in (
             ("learning_rate", learning_rate, LARGEST_RATE),
             ("warmup_steps", warmup_steps, math.inf),
@@ -97,33 +102,21 @@ class Pretraining(pl.LightningModule, ABC):
             expect_range(f"model.feature_dropout.{name}", share, 0, 1)
         self.seed = seed
         self.guidance = guidance
-        self.model: ConceptModel
-        self.raw: ConceptModel
         self._validated = False
         self._random: Random | None = None
-        self._from = 0
 
     @abstractmethod
-    def build(
-        self,
-        shared: Mapping[str, Any],
-        data: PretrainingData,
-        normalization: Normalization,
-        embeddings: Tensor,
-        initial_normalization: Normalization | None,
-    ) -> ConceptModel:
+    def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> M:
         """The method's model with fresh weights.
 
         Args:
-            shared: what every model's configuration says.
+            prepared: what every model is built for, with the text encoder's embeddings; a method adds what its network needs by
+                :meth:`~ftl_lightning.learning.prepared.Prepared.configured`.
             data: what it learns from.
-            normalization: of its states.
-            initial_normalization: of the observed vectors; ``None`` where there are none.
-            embeddings: of the encoder ``(1 + training concepts, n)``, the empty text first.
         """
 
     @abstractmethod
-    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
+    def losses(self, model: M, batch: Batch, draw: torch.Generator) -> Tensor:
         """What is minimised, on a batch ``(batch,)``; ``model`` is in training mode while fitting."""
 
     def configure_model(self) -> None:
@@ -150,53 +143,48 @@ class Pretraining(pl.LightningModule, ABC):
             states = view.encode(states, windows.observed)
         with torch.device("meta"):  # for its size alone
             image_dim = ImageEncoders(features, self.image_encoder).size
-        shared = {
-            "domain": data.domain_name,
-            "horizon": data.horizon,
-            "state_dim": len(data.domain.plans.columns),
-            "observed": dict(features),
-            "concept_dim": embeddings.shape[-1],
-            "training_concepts": concepts,
-            "encoder": data.encoder.identity,
-            "view": self.hparams["view"],
-            "perturb": self.hparams["perturb"],
-            "image_dim": image_dim,
-            "image_encoder": self.image_encoder,
-            "feature_dropout": expect_dropout(self.feature_dropout, features),
-            "metrics": dict(data.metrics),
-            "training": {
+        config = ModelConfig(
+            domain=data.domain_name,
+            horizon=data.horizon,
+            state_dim=len(data.domain.plans.columns),
+            observed=dict(features),
+            concept_dim=embeddings.shape[-1],
+            training_concepts=concepts,
+            encoder=data.encoder.identity,
+            view=self.hparams["view"],
+            perturb=self.hparams["perturb"],
+            image_dim=image_dim,
+            image_encoder=self.image_encoder,
+            feature_dropout=expect_dropout(self.feature_dropout, features),
+            metrics=dict(data.metrics),
+            training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
                 # Where somebody's recordings lie says nothing of the model.
                 "data": {key: value for key, value in data.hparams.items() if key != "root" and not key.startswith("_")},
                 "max_steps": self.trainer.max_steps,
             },
-        }
+        )
         # The initial weights are a function of the seed, wherever in a process this is called.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             resolution = data.domain.plans.resolution
             normalization = Normalization.fit(states, view.scales if view else (), resolution)
             beside = None
-            sizes = Sizes(horizon=0, state_dim=0, concept_dim=0, observed=features)
-            if sizes.measured_dim:
-                beside = Normalization.fit(joined_vectors(seen, features), sizes.entities, resolution)
-                if sizes.state_columns and (view is None or view.same_columns):  # else plans have another scale
-                    beside.share(sizes.state_columns, normalization)
-            self.model = self.build(shared, data, normalization, embeddings, beside)
+            if config.measured_dim:
+                beside = Normalization.fit(joined_vectors(seen, features), config.entities, resolution)
+                if config.state_columns and (view is None or view.same_columns):  # else plans have another scale
+                    beside.share(config.state_columns, normalization)
+            self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
             self.model.examples = data.examples
         self.raw = copy.deepcopy(self.model)
         self.model.requires_grad_(False).eval()
 
-    def train(self, mode: bool = True) -> "Pretraining":
+    def train(self, mode: bool = True) -> Self:
         """Switch modes; the average is always in evaluation mode."""
         super().train(mode)
         if "model" in self._modules:
             self.model.eval()
         return self
-
-    def on_train_start(self) -> None:
-        """Look at what was restored, if anything."""
-        check_restored(self, self._from)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Let a resumed run draw what the unbroken one draws: dropout takes from the global generators.
@@ -260,7 +248,13 @@ class Pretraining(pl.LightningModule, ABC):
 
     def on_fit_end(self) -> None:
         """Write the averaged model for ``invert`` and ``sample``."""
-        self.model.save(self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained")
+        folder = self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
+        save_model(self.model, folder)
+
+    @property
+    def method(self) -> str:
+        """The method's name in tables."""
+        return self.model.method.name
 
     @property
     def domain(self) -> Domain:
@@ -284,25 +278,18 @@ class Pretraining(pl.LightningModule, ABC):
         return self.model.named_embeddings()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint, and keep where the global generators stand.
-
-        Raises:
-            UserError: if a parameter is not finite; the checkpoint that is there stays.
-        """
-        found = checkpoint["state_dict"]
-        expect_finite(found, f"training: step {self.global_step}", "nothing was saved of it; lower model.learning_rate")
-        sign(self, checkpoint, self._signature())
+        """Sign the checkpoint, and keep where the global generators stand."""
+        super().on_save_checkpoint(checkpoint)
         loop = self.trainer.fit_loop
         validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
         Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module or of a model of another form."""
-        check_signature(self, checkpoint, self._signature())
-        check_parameters(checkpoint["state_dict"], self)
-        self._random, self._from = Random.read(checkpoint), checkpoint["global_step"]
+        super().on_load_checkpoint(checkpoint)
+        self._random = Random.read(checkpoint)
 
-    def _signature(self) -> dict[str, Any]:
+    def signature(self) -> dict[str, Any]:
         """What decides the form of a checkpoint's parameters, and what they mean."""
         different = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}

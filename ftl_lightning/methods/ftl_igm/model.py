@@ -8,18 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning import diffusion
-from ftl_lightning.concepts.adapter import LowRank
+from ftl_lightning.concepts.adapter import LowRank, adaptable
 from ftl_lightning.concepts.composition import Composition, Context, batched, composed_epsilon
 from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss, timesteps
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.learning.concept_model import Draws, TextConceptModel
-from ftl_lightning.learning.model_config import DIFFUSION, ModelConfig
+from ftl_lightning.learning.concept_model import Draws
+from ftl_lightning.learning.model_config import ModelConfig
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.learning.text_concept_model import TextConceptModel
+from ftl_lightning.methods.ftl_igm import METHOD
 from ftl_lightning.schema import built
 
 
@@ -65,28 +65,20 @@ class GenerativeModel(TextConceptModel):
     """A denoiser with everything that is needed to go from words and states to states.
 
     Args:
-        config, domain, normalization, initial_normalization: see :class:`~ftl_lightning.learning.concept_model.ConceptModel`.
-        embeddings: the encoder's embeddings ``(1 + training concepts, n)``, the empty text first.
+        prepared: with the encoder's embeddings.
     """
 
-    kind = DIFFUSION
-    name = OURS
+    method = METHOD
+    invertible = True
     Config = DiffusionConfig
     config: DiffusionConfig
     denoiser: nn.Module
     alpha_bar: Tensor
 
-    def __init__(
-        self,
-        config: DiffusionConfig,
-        domain: Domain,
-        normalization: Normalization,
-        embeddings: Tensor,
-        initial_normalization: Normalization | None = None,
-    ) -> None:
-        super().__init__(config, domain, normalization, embeddings, initial_normalization)
-        self.denoiser = build_denoiser(config)
-        self.register_buffer("alpha_bar", cosine_alpha_bar(config.diffusion_steps))
+    def __init__(self, prepared: Prepared[DiffusionConfig]) -> None:
+        super().__init__(prepared)
+        self.denoiser = build_denoiser(prepared.config)
+        self.register_buffer("alpha_bar", cosine_alpha_bar(prepared.config.diffusion_steps))
 
     @property
     def traits(self) -> tuple[str, ...]:
@@ -97,6 +89,9 @@ class GenerativeModel(TextConceptModel):
     def over_time(self) -> bool:
         found: bool = getattr(diffusion, self.config.denoiser).over_time
         return found
+
+    def adaptable(self) -> dict[str, tuple[int, int]]:
+        return adaptable(self.denoiser)
 
     def expect_adapter(self, adapter: LowRank) -> None:
         adapter.expect_fits(self.denoiser)

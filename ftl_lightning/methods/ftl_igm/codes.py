@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ftl_lightning.diffusion.schedule import MOST_STEPS
+from ftl_lightning.ranges import expect_count, expect_range
 from ftl_lightning.seeding import generator
 
 
@@ -17,16 +19,23 @@ class Codes:
     is as long as a text's embedding on average, and half of the samples with a code have no text.
 
     Attributes:
-        share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept.
+        share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept. 0 is the
+            paper's form.
         knots: times.
         size: numbers of a code at a knot.
         noise: standard deviation of what is added to the numbers, which have unit variance.
     """
 
-    share: float
-    knots: int
-    size: int
-    noise: float
+    share: float = 0.0
+    knots: int = 8
+    size: int = 16
+    noise: float = 0.3
+
+    def __post_init__(self) -> None:
+        expect_range("model.codes.share", self.share, 0, 1)
+        expect_range("model.codes.noise", self.noise, 0)
+        expect_count("model.codes.knots", self.knots, 1, MOST_STEPS)
+        expect_count("model.codes.size", self.size, 1, MOST_STEPS)
 
     def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
         """Concepts ``(batch, knots * n)``.

@@ -1,22 +1,19 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details'): the next state from state and concept."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ftl_lightning.concepts.composition import Composition, batched
 from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.learning.baselines.additive import AdditiveModel, added
-from ftl_lightning.learning.baselines.transitions import StepConfig, expect_window, unroll
-from ftl_lightning.learning.concept_model import ConceptModel, TextConceptModel
-from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.learning.additive import AdditiveModel, added
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.learning.text_concept_model import TextConceptModel
+from ftl_lightning.learning.transitions import StepConfig, unroll
+from ftl_lightning.methods.bc import METHOD
 from ftl_lightning.ranges import expect_range
 
 
@@ -58,23 +55,16 @@ class CloningModel(AdditiveModel, TextConceptModel):
     """A deterministic policy of the concept and, where there is one, the state; composing adds concepts.
 
     Args:
-        config, domain, normalization, embeddings, initial_normalization: see :class:`TextConceptModel`.
+        prepared: what it is built for.
     """
 
-    kind = "bc"
-    name = "BC"
+    method = METHOD
     Config = CloningConfig
     config: CloningConfig
 
-    def __init__(
-        self,
-        config: CloningConfig,
-        domain: Domain,
-        normalization: Normalization,
-        embeddings: Tensor,
-        initial_normalization: Normalization | None = None,
-    ) -> None:
-        super().__init__(config, domain, normalization, embeddings, initial_normalization)
+    def __init__(self, prepared: Prepared[CloningConfig]) -> None:
+        super().__init__(prepared)
+        config = prepared.config
         expect_range("model.members", config.members, 1, 1000)
         inputs = config.concept_dim + config.vector_dim
         self.network = ParallelMLP(config.members, inputs, config.hidden_dim, config.moments * config.state_dim)
@@ -125,45 +115,3 @@ class CloningModel(AdditiveModel, TextConceptModel):
             return self.predict(None if vector is None else vector[None], condition[None])[member, rows]
 
         return unroll(self, predict, observed or {}).unflatten(0, (len(compositions), count))
-
-
-class CloningPretraining(Pretraining):
-    """Fits the policy to transitions of a domain's pairs of behaviour and concept.
-
-    Args:
-        hidden_dim, members: see :class:`CloningConfig`.
-        plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.learning.baselines.transitions.StepConfig`; ``data.horizon`` is one more, or 1.
-        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
-    """
-
-    method = "BC"
-
-    def __init__(
-        self, hidden_dim: int = 512, members: int = 1, plan_horizon: int | None = None, stride: int = 1, **options: Any
-    ) -> None:
-        super().__init__(**options)
-        self.save_hyperparameters()
-        expect_range("model.hidden_dim", hidden_dim, 1)
-        if plan_horizon is not None:
-            expect_range("model.plan_horizon", plan_horizon, 1)
-        self.stride = stride
-
-    def build(
-        self,
-        shared: Mapping[str, Any],
-        data: PretrainingData,
-        normalization: Normalization,
-        embeddings: Tensor,
-        initial_normalization: Normalization | None,
-    ) -> CloningModel:
-        own = {name: self.hparams[name] for name in ("hidden_dim", "members", "stride")}
-        config = CloningConfig(**dict(shared) | own | {"horizon": self.hparams["plan_horizon"] or data.domain.plans.horizon})
-        expect_window(config, data)
-        return CloningModel(config, data.domain, normalization, embeddings, initial_normalization)
-
-    def losses(self, model: ConceptModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Squared error of what follows."""
-        assert isinstance(model, CloningModel)
-        states, seen = model.perturbed(batch.states, batch.observed, draw)
-        return model.errors(states, seen, model.training_embeddings[batch.concepts])

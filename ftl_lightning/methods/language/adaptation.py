@@ -1,4 +1,4 @@
-"""Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, told in words what the new task is."""
+"""Adapting our model by language: a concept is the embedding of its description."""
 
 import torch
 from torch import Tensor
@@ -9,8 +9,9 @@ from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adaptation import Adaptation
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import origin
+from ftl_lightning.learning.text_concept_model import TextConceptModel
+from ftl_lightning.methods.language import METHOD
 
 
 class LanguageAdaptation(Adaptation):
@@ -30,9 +31,6 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or another encoder.
     """
 
-    adapts = (GenerativeModel,)
-    method = "language"
-
     def __init__(
         self,
         pretrained: str,
@@ -44,14 +42,22 @@ class LanguageAdaptation(Adaptation):
     ) -> None:
         super().__init__(pretrained, omega, output)
         self.save_hyperparameters()
+        if not isinstance(self.model, TextConceptModel):
+            raise UserError(
+                f"model.pretrained: expected a model whose concepts are texts, found {self.model.method.kind} in {pretrained}"
+            )
+        self._standardise = self.model.standardise
         self._encoder = load_encoder(encoder, self.model.domain.concepts.table, revision)
         if (found := self._encoder.identity) != self.model.config.encoder:
             raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {found!r}")
 
+    @property
+    def method(self) -> str:
+        return METHOD.name
+
     def _embedding(self, goal: str) -> Tensor:
         """``(1, n)`` of a task's description."""
-        assert isinstance(self.model, GenerativeModel)
-        return self.model.standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))
+        return self._standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))
 
     def learned(self) -> dict[str, Concept]:
         weights = torch.tensor([self._omega])

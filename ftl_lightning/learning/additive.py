@@ -14,6 +14,8 @@ from ftl_lightning.learning.concept_model import ConceptModel, Draws
 class AdditiveModel(ConceptModel):
     """A model to which a composition is one concept: the weighted sum of its parts."""
 
+    invertible = True
+
     @abstractmethod
     def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
         """Squared error of behaviour ``(batch,)``.

@@ -1,0 +1,23 @@
+"""Adapting a model by its method's learner alone, without training steps."""
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.inversion_settings import InversionSettings
+
+
+class LearnerAdaptation(Adaptation):
+    """Concepts are what the method's learner makes of demonstrations at once; nothing is trained.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
+        seed: of the evaluation's rows, and of what is random in the learner.
+    """
+
+    def __init__(self, pretrained: str, output: str | None = None, seed: int = 0) -> None:
+        super().__init__(pretrained, 1.0, output)
+        self.save_hyperparameters()
+
+    def learned(self) -> dict[str, Concept]:
+        learn = self.model.method.learn()
+        return learn(self.model, self.demonstrations, InversionSettings(seed=self.hparams["seed"]), 0)

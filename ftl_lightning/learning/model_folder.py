@@ -1,0 +1,89 @@
+"""The folder that a pretrained model is kept in: ``config.json``, ``model.safetensors``, and examples of a user's own data."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.domains.registry import domain_of_file
+from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.learning.concept_model import KIND, ConceptModel
+from ftl_lightning.learning.model_config import CONFIG, VERSION, expect_domain, read_config, upgrade
+from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weights
+from ftl_lightning.learning.prepared import blank
+from ftl_lightning.schema import built
+from ftl_lightning.tensor_file import alone, expect_finite, file_hash, load_tensors, save_tensors, write_text
+
+M = TypeVar("M", bound=ConceptModel)
+EXAMPLES = "demonstrations.safetensors"
+"""In the folder of a model of a user's own data."""
+
+
+def save_model(model: ConceptModel, folder: str | Path) -> None:
+    """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision.
+
+    Where there are examples, they are written too.
+
+    Raises:
+        UserError: before anything is written, for weights that are not finite or too large for half precision.
+    """
+    folder, stored = Path(folder), model.stored()
+    expect_finite(stored, str(folder), "nothing was written; train it anew")
+    header = {"format": VERSION, "hash": model.hash, "kind": model.method.kind}
+    with alone(folder):  # of two that are written to the same folder, the files of one
+        save_tensors(folder / WEIGHTS, KIND, stored, {"domain": model.config.domain})
+        if model.examples is not None:
+            model.examples.save(folder / EXAMPLES)
+        write_text(folder / CONFIG, json.dumps(header | asdict(model.config), indent=2) + "\n")
+
+
+def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) -> M:
+    """Read a folder written by :func:`save_model`; the model is frozen and in evaluation mode.
+
+    Args:
+        kind: the model's class.
+        folder: to read.
+        domain: in place of the one that the folder names; ``None`` for that, if an installed package offers it or a person
+            names it beside the folder.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, or the two files do not belong together.
+    """
+    path = Path(folder) / CONFIG
+    content = read_config(folder)
+    with about(path):
+        if (found := content.pop("kind")) != kind.method.kind:
+            raise UserError(f"key 'kind': expected {kind.method.kind!r}, found {found!r}, the model of another method")
+        if domain is None and content["domain"] != OWN:
+            domain = domain_of_file(content["domain"])
+        if domain is not None:
+            upgrade(content, domain)
+        del content["format"]
+        expected_hash = content.pop("hash")
+        config = built(kind.Config, content, "")
+    weights = Path(folder) / WEIGHTS
+    tensors, _ = load_tensors(weights, KIND)
+    if (found := file_hash(weights)) != expected_hash:
+        raise UserError(
+            f"{weights}: expected the hash {short(expected_hash)} that {CONFIG} names, found {found}; copy both files again"
+        )
+    examples = Demonstrations.load(Path(folder) / EXAMPLES) if config.domain == OWN else None
+    with about(path):
+        if examples is not None:
+            domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
+        assert domain is not None
+        expect_domain(config, domain)
+        # First on paper: a file of a few bytes can name sizes that no memory holds.
+        with torch.device("meta"), at_most(sum(value.numel() for value in tensors.values())):
+            expected = kind(blank(config, domain)).state_dict()
+    with about(weights):
+        expect_weights(tensors, expected)
+    model = kind(blank(config, domain))
+    model.examples = examples
+    model.load_state_dict(tensors)
+    return model.requires_grad_(False).eval()

@@ -1,0 +1,35 @@
+"""Models whose concept space is the text encoder's."""
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.model_config import ModelConfig
+from ftl_lightning.learning.prepared import Prepared
+
+
+class TextConceptModel(ConceptModel):
+    """A model whose concept space is the text encoder's.
+
+    Embeddings are centred on the training concepts and scaled to unit mean square: language models put a large common part into
+    all of them, which hides what tells two concepts apart.
+
+    Args:
+        prepared: with the encoder's embeddings.
+    """
+
+    centre: Tensor
+    spread: Tensor
+
+    def __init__(self, prepared: Prepared[ModelConfig]) -> None:
+        embeddings = prepared.embeddings
+        centre = embeddings[1:].mean(dim=0)
+        spread = (embeddings[1:] - centre).square().mean().sqrt()
+        spread = torch.where(spread > 0, spread, 1)  # of a single training concept
+        super().__init__(prepared.embedded((embeddings - centre) / spread))
+        self.register_buffer("centre", centre)
+        self.register_buffer("spread", spread)
+
+    def standardise(self, embeddings: Tensor) -> Tensor:
+        """The encoder's embeddings ``(..., n)`` to the model's concept space."""
+        return (embeddings - self.centre) / self.spread

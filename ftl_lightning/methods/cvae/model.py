@@ -1,0 +1,78 @@
+"""A conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the concepts it is paired with."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.learning.additive import AdditiveModel, added
+from ftl_lightning.learning.model_config import ModelConfig
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.methods.cvae import METHOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class VAEConfig(ModelConfig):
+    """What the networks need to be built; ``concept_dim`` is the size of z.
+
+    Attributes:
+        hidden_dim: width of the encoder's and of the decoder's hidden layer.
+    """
+
+    hidden_dim: int = 512
+
+
+class VAEModel(AdditiveModel):
+    """Behaviour from an initial state and z, a normal variable in which a concept is a point; composing adds points.
+
+    Args:
+        prepared: what it is built for.
+    """
+
+    method = METHOD
+    Config = VAEConfig
+    config: VAEConfig
+
+    def __init__(self, prepared: Prepared[VAEConfig]) -> None:
+        super().__init__(prepared)
+        config = prepared.config
+        plan, beside, z = config.horizon * config.state_dim, config.vector_dim, config.concept_dim
+        self.encoder = nn.Sequential(nn.Linear(plan + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, 2 * z))
+        self.decoder = nn.Sequential(nn.Linear(z + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, plan))
+
+    def posterior(self, states: Tensor, observed: Observed) -> tuple[Tensor, Tensor]:
+        """Mean and logarithm of the variance of z, ``(batch, z)`` each, of behaviour ``(batch, horizon, state)``."""
+        vector = self.vector(observed)
+        plan = self.encode(states, observed).flatten(1)
+        mean, log_variance = self.encoder(plan if vector is None else torch.cat((plan, vector), dim=-1)).chunk(2, dim=-1)
+        return mean, log_variance
+
+    def plans(self, z: Tensor, observed: Observed) -> Tensor:
+        """Behaviour ``(batch, horizon, state)``, normalised, of ``z (batch, z)``."""
+        vector = self.vector(observed)
+        out: Tensor = self.decoder(z if vector is None else torch.cat((z, vector), dim=-1))
+        return out.unflatten(-1, (self.config.horizon, self.config.state_dim))
+
+    def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
+        """Squared error of the reconstruction ``(batch,)``."""
+        return (self.plans(concepts, observed) - self.encode(states, observed)).square().mean(dim=(1, 2))
+
+    @torch.no_grad()
+    def sample(
+        self,
+        compositions: Sequence[Composition],
+        count: int,
+        sampling: Sampling,
+        generators: Sequence[torch.Generator],
+        observed: Observed | None = None,
+    ) -> Tensor:
+        """The temperature is the variance of the noise that is added to z; sampler and steps do not matter."""
+        shape, (together, own) = (count, self.config.concept_dim), batched(compositions, count, generators)
+        noise = torch.cat([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
+        z = added(together)[own] + sampling.temperature**0.5 * noise
+        seen = observed or {}
+        return self.decode(self.plans(z, seen), seen).unflatten(0, (len(compositions), count))

@@ -1,0 +1,135 @@
+"""Pretraining of our model, a denoiser: Eq. 1 of the paper."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.diffusion import PAPER_SIZE
+from ftl_lightning.diffusion.prediction import LOSSES, loss_weights
+from ftl_lightning.diffusion.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
+from ftl_lightning.domains.data import Batch, PretrainingData
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.learning.model_config import ModelConfig
+from ftl_lightning.learning.options import flat, groups_of
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.methods.ftl_igm.codes import Codes
+from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
+from ftl_lightning.ranges import expect_count, expect_factor, expect_range
+from ftl_lightning.regrouped import PRETRAINING
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossOptions:
+    """What is minimised.
+
+    Attributes:
+        kind: whose squared error, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others weigh noisy timesteps,
+            at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        timestep_power: see :func:`ftl_lightning.diffusion.schedule.timesteps`; 1 is the paper's.
+        discount: state k of a window weighs so much to the power of k: below 1 for plans that are replaced before they end.
+        condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
+            (the published code draws once a batch).
+    """
+
+    kind: str = "epsilon"
+    timestep_power: float = 1.0
+    discount: float = 1.0
+    condition_dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.kind not in LOSSES:
+            raise UserError(f"model.loss.kind: expected one of {', '.join(LOSSES)}, found {short(self.kind)!r}")
+        expect_range("model.loss.condition_dropout", self.condition_dropout, 0, 1)
+        expect_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
+        expect_range("model.loss.discount", self.discount, 0, 1)
+
+
+_LOSS, _CODES = LossOptions(), Codes()
+
+
+class PretrainingModule(Pretraining[GenerativeModel]):
+    """Trains a denoiser on a domain's pairs of behaviour and concept.
+
+    Args:
+        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
+        denoiser_args: its arguments other than the sizes.
+        paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
+        diffusion_steps: T.
+        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
+            which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+        loss: what is minimised.
+        codes: rough codes of behaviour that some samples are told, so that the network has seen concepts that vary over a plan, and
+            concepts that no text names.
+        compile: compile the denoiser for training (worth it on GPUs).
+        learning_rate: of AdamW.
+        guidance: weight omega with which training concepts are generated in evaluation.
+        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+    """
+
+    flat = PRETRAINING
+
+    def __init__(
+        self,
+        denoiser: str = "MLPDenoiser",
+        denoiser_args: Mapping[str, Any] | None = None,
+        paper_size: bool = False,
+        diffusion_steps: int = 100,
+        prediction: str = "epsilon",
+        loss: LossOptions = _LOSS,
+        codes: Codes = _CODES,
+        compile: bool = False,
+        learning_rate: float = 1e-3,
+        guidance: float = 1.2,
+        **options: Any,
+    ) -> None:
+        super().__init__(learning_rate=learning_rate, guidance=guidance, **options)
+        self.save_hyperparameters(ignore=groups_of(PRETRAINING))
+        self.save_hyperparameters(flat({"loss": loss, "codes": codes}, PRETRAINING))
+        self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
+        expect_count("model.diffusion_steps", diffusion_steps, 1, MOST_STEPS)
+        self.loss, self.codes = loss, codes
+
+    def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> GenerativeModel:
+        network = {name: self.hparams[name] for name in ("denoiser", "diffusion_steps", "prediction")}
+        model = GenerativeModel(prepared.configured(DiffusionConfig, denoiser_args=self.denoiser_args, **network))
+        if self.codes.share and self.codes.knots > 1 and not model.over_time:
+            told = f"whose concepts do not vary over a plan, found {self.codes.knots}"
+            raise UserError(f"model.codes.knots: expected 1 for {model.config.denoiser}, {told}")
+        return model
+
+    def configure_model(self) -> None:
+        super().configure_model()
+        if self.hparams["compile"]:
+            self.raw.denoiser.compile()
+
+    def losses(self, model: GenerativeModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Eq. 1; while fitting, concepts are dropped."""
+        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        clean = model.encode(states, seen)
+        context = model.observe(seen)
+        count = len(clean)
+        dropout = self.loss.condition_dropout if model.training else 0.0
+        removed = torch.rand(count, generator=draw, device=self.device) < dropout
+        concepts = torch.cat((model.empty[None], model.training_embeddings))
+        index = torch.where(removed, 0, batch.concepts + 1)
+        if self.codes.share and model.training:
+            concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
+        total, power = self.hparams["diffusion_steps"], self.loss.timestep_power
+        if power == 1:
+            t = torch.randint(total, (count,), generator=draw, device=self.device)
+        else:
+            t = timesteps(torch.rand(count, generator=draw, device=self.device), total, power)
+        noise = torch.randn(clean.shape, generator=draw, device=self.device)
+        losses = denoising_loss(
+            lambda x, t: model.denoiser(x, t, concepts, index, context),
+            clean,
+            noise,
+            t,
+            model.alpha_bar,
+            self.loss.discount,
+        )
+        return losses * loss_weights(self.loss.kind, model.alpha_bar)[t]

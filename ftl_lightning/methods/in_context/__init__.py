@@ -1,0 +1,13 @@
+"""In-context learning (paper, 'Baselines'; Xu et al., 2022): a transformer reads demonstrations and goes on as they do."""
+
+from ftl_lightning.methods.method import Method
+
+METHOD = Method(
+    name="in-context",
+    kind="in-context",
+    model="ftl_lightning.methods.in_context.model:InContextModel",
+    pretraining="ftl_lightning.methods.in_context.pretraining:InContextPretraining",
+    adaptation="ftl_lightning.learning.learner_adaptation:LearnerAdaptation",
+    learner="ftl_lightning.methods.in_context.prompting:prompt",
+    configurations="conf/in_context",
+)

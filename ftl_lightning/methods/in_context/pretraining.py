@@ -1,0 +1,111 @@
+"""Pretraining of the in-context model."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ftl_lightning.domains.data import Batch, PretrainingData
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.model_config import ModelConfig
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.learning.pretraining import Pretraining, expect_shown
+from ftl_lightning.learning.transitions import expect_window
+from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
+
+
+class InContextPretraining(Pretraining[InContextModel]):
+    """Fits the transformer to go on as demonstrations of the same training concept do (negative log-likelihood of bins).
+
+    Args:
+        tokens, bins, width, layers, heads: see :class:`InContextConfig`.
+        prompts: most demonstrations that are given; each step and concept draws one to so many.
+        plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
+        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is one more.
+        images: folder of a trained model of any method, whose image encoders are used as they are, where images are observed:
+            demonstrations are read before training.
+        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+    """
+
+    def __init__(
+        self,
+        tokens: int = 16,
+        bins: int = 20,
+        width: int = 128,
+        layers: int = 4,
+        heads: int = 4,
+        prompts: int = 5,
+        plan_horizon: int | None = None,
+        stride: int = 1,
+        images: str | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.save_hyperparameters()
+        if images is not None:
+            source = load_model(images)
+            if source.images is None:
+                raise UserError(f"model.images: expected a model that observes images, found {images}, which does not")
+            self.image_encoder, self._images = dict(source.config.image_encoder), source.images.state_dict()
+        if prompts < 1:
+            raise UserError(f"model.prompts: expected 1 or more, found {prompts}")
+        self.stride = stride
+
+    def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> InContextModel:
+        config = prepared.config
+        if not config.observed:
+            raise UserError(f"data.class_path: expected a domain with observed features, found {data.domain.name}: nothing follows")
+        if config.image_dim and self.hparams["images"] is None:
+            raise UserError("model.images: expected the folder of a model that reads these images, found none")
+        sizes = {name: self.hparams[name] for name in ("tokens", "bins", "width", "layers", "heads", "stride")}
+        size = sizes["tokens"] * (config.vector_dim + config.state_dim)
+        horizon = self.hparams["plan_horizon"] or data.domain.plans.horizon
+        transformer = prepared.configured(InContextConfig, concept_dim=size, horizon=horizon, **sizes)
+        expect_window(transformer.config, data)
+        model = InContextModel(transformer.embedded(torch.zeros(len(prepared.embeddings), size)))
+        if model.images is not None:
+            take_images(model.images, self._images, self.hparams["images"])
+        self._prompts = model.prompts(data.training)
+        # Whole prompts are perturbed, half of the time, as a present is.
+        self._perturbed = model.prompts(data.training, perturbed=True) if config.perturb else self._prompts
+        texts = data.training.concepts
+        expect_shown(config.training_concepts, texts)
+        self._own = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
+        model.training_embeddings.copy_(self._prompts[[own[0] for own in self._own]])
+        windows = data.first_windows()
+        model.start.copy_(model.encode(windows.states[:, :: self.stride], windows.observed)[:, 0].mean(dim=0))
+        return model
+
+    def losses(self, model: InContextModel, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Negative log-likelihood of the bins of what follows."""
+        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        observed = model.present_vector(seen)
+        target = model.bins(model.encode(states[:, :: self.stride], seen)[:, -1])
+        most, groups = self.hparams["prompts"], len(self._own)
+        rows = [[own[int(u * len(own))] for u in torch.rand(most, generator=draw, device=draw.device)] for own in self._own]
+        counts = torch.randint(1, most + 1, (groups, 1), generator=draw, device=draw.device) if model.training else most
+        given = torch.arange(most, device=draw.device).expand(groups, most) < counts
+        perturbed = torch.rand((groups, 1, 1), generator=draw, device=draw.device) < 0.5
+        straight, other = (prompts[torch.tensor(rows)].to(draw.device) for prompts in (self._prompts, self._perturbed))
+        memory = model.read(torch.where(perturbed, other, straight), given)
+        # The queries of each concept are a row of one batch, padded to the longest.
+        queries = [(batch.concepts == group).nonzero()[:, 0] for group in range(groups)]
+        index = nn.utils.rnn.pad_sequence(queries, batch_first=True, padding_value=-1)
+        logits = model.follow(memory, given, observed[index])[index >= 0]
+        return functional.cross_entropy(logits.movedim(-1, 1), target[index[index >= 0]], reduction="none").mean(dim=1)
+
+
+def take_images(encoders: nn.Module, weights: Mapping[str, Tensor], folder: str) -> None:
+    """Give image encoders the weights of a trained model's, which stay as they are.
+
+    Raises:
+        UserError: for a model that observes other images.
+    """
+    try:
+        encoders.load_state_dict(weights)
+    except RuntimeError as error:
+        raise UserError(f"model.images: expected a model that observes the same images, found {folder}") from error
+    encoders.requires_grad_(False)

@@ -1,0 +1,38 @@
+"""Concepts of the in-context model: demonstrations, as it reads them."""
+
+from collections.abc import Callable
+
+import torch
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.inversion import origin
+from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.methods.in_context.model import InContextModel
+
+
+def prompt(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    tell: Callable[[float], None] = lambda loss: None,
+) -> dict[str, Concept]:
+    """Every concept of some demonstrations, by name; nothing is learned, and ``settings``, ``steps`` and ``tell`` do not matter.
+
+    Args:
+        model: an :class:`InContextModel`.
+        demonstrations: with concept texts, which name the concepts.
+
+    Raises:
+        UserError: for a model of another method, or demonstrations whose features are observed for the first time alone.
+    """
+    if not isinstance(model, InContextModel):
+        raise UserError(f"model: expected one of in-context learning, found one of {model.method.name}")
+    concepts = {}
+    for name in dict.fromkeys(demonstrations.concepts):
+        prompts = model.prompts(demonstrations.select(name))
+        concepts[name] = Concept(prompts, torch.ones(len(prompts)), origin(model, demonstrations, name, "fixed", 0.0))
+    return concepts

@@ -1,0 +1,11 @@
+"""Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, told in words what the new task is."""
+
+from ftl_lightning.methods.ftl_igm import METHOD as OURS
+from ftl_lightning.methods.method import Method
+
+METHOD = Method(
+    name="language",
+    kind=OURS.kind,
+    adaptation="ftl_lightning.methods.language.adaptation:LanguageAdaptation",
+    configurations="conf",
+)

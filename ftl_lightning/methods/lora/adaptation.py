@@ -1,0 +1,21 @@
+"""Fine-tuning the whole denoiser by a low-rank adapter."""
+
+from typing import Any
+
+from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.learning.inversion_settings import AdapterOptions
+
+_WHOLE = AdapterOptions(rank=4, scope="all")
+
+
+class FineTuning(InversionModule):
+    """Learns a concept with an adapter that changes every branch of a composition, the empty concept's too.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        adapter: its rank and learning rate; its scope is ``'all'``.
+        options: see :class:`~ftl_lightning.learning.inversion_module.InversionModule`.
+    """
+
+    def __init__(self, pretrained: str, adapter: AdapterOptions = _WHOLE, **options: Any) -> None:
+        super().__init__(pretrained, adapter=adapter, **options)

@@ -1,0 +1,86 @@
+"""What a method is: one declaration that a package offers through the entry-point group ``ftl_lightning.methods``."""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ftl_lightning.errors import UserError
+
+if TYPE_CHECKING:
+    from ftl_lightning.learning.adaptation import Adaptation
+    from ftl_lightning.learning.concept_model import ConceptModel
+    from ftl_lightning.learning.learner import Learner
+    from ftl_lightning.learning.pretraining import Pretraining
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form of a method's concepts that the paper does not have, which tables show beside the method's own.
+
+    Attributes:
+        name: in the results' column ``form``, such as ``'with modes'``.
+        option: of the adaptation's hyper-parameters, the one that decides.
+        usual: its value in the paper's form.
+    """
+
+    name: str
+    option: str
+    usual: Any
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to learn tasks from a few demonstrations.
+
+    ``model``, ``pretraining``, ``adaptation`` and ``learner`` are ``'package.module:NAME'``, imported when they are needed.
+
+    Attributes:
+        name: in tables and results.
+        kind: of its pretrained models, as their ``config.json`` says. A method that adapts another's models has that one's kind.
+        adaptation: the LightningModule of ``invert``, an :class:`~ftl_lightning.learning.adaptation.Adaptation`.
+        model: the network, a :class:`~ftl_lightning.learning.concept_model.ConceptModel`; empty where it is another method's.
+        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.learning.pretraining.Pretraining`; empty likewise.
+        learner: how concepts are learned without a trainer, a :class:`~ftl_lightning.learning.learner.Learner`; gradient descent
+            through the model's losses unless it says otherwise.
+        forms: of its concepts, in the order in which their names are joined.
+        configurations: folder of its configuration files, one for each domain; empty for none.
+    """
+
+    name: str
+    kind: str
+    adaptation: str = "ftl_lightning.learning.inversion_module:InversionModule"
+    model: str = ""
+    pretraining: str = ""
+    learner: str = "ftl_lightning.learning.inversion:invert"
+    forms: Sequence[Form] = ()
+    configurations: str = ""
+
+    def model_class(self) -> "type[ConceptModel]":
+        """The network's class."""
+        return self._named(self.model)
+
+    def pretraining_class(self) -> "type[Pretraining[Any]]":
+        """The LightningModule of ``fit``."""
+        return self._named(self.pretraining)
+
+    def adaptation_class(self) -> "type[Adaptation]":
+        """The LightningModule of ``invert``."""
+        return self._named(self.adaptation)
+
+    def learn(self) -> "Learner":
+        """How concepts are learned without a trainer."""
+        return self._named(self.learner)
+
+    def form(self, hparams: Mapping[str, Any]) -> str:
+        """The form of concepts that are learned with these options; empty for the paper's."""
+        return " ".join(form.name for form in self.forms if hparams[form.option] != form.usual)
+
+    def _named(self, reference: str) -> Any:
+        module, _, name = reference.partition(":")
+        try:
+            return getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise UserError(
+                f"method {self.name}: expected {reference!r}, found no such thing ({error}); mend its package"
+            ) from error

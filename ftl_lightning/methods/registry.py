@@ -1,0 +1,73 @@
+"""Methods by the names under which installed packages offer them."""
+
+import importlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.methods.method import Method
+from ftl_lightning.trust import entry_points
+
+if TYPE_CHECKING:
+    from ftl_lightning.learning.adaptation import Adaptation
+
+GROUP = "ftl_lightning.methods"
+"""Entry-point group in which a package offers methods: ``name = package.module:METHOD``."""
+SHIPPED = ("ftl_igm", "bc", "cvae", "in_context", "language", "lora")
+"""This package's, in the order of tables; others follow by name."""
+
+
+def method_names() -> tuple[str, ...]:
+    """Names of the methods that installed packages offer, in the order of tables."""
+    offered = _offered()
+    return (*(name for name in SHIPPED if name in offered), *sorted(set(offered) - set(SHIPPED)))
+
+
+def _offered() -> dict[str, str]:
+    """Where the methods are, ``module:ATTRIBUTE`` by name; a name of ours is ours whatever another package offers."""
+    offered = {point.name: point.value for point in reversed(entry_points(GROUP))}
+    return offered | {name: f"ftl_lightning.methods.{name}:METHOD" for name in SHIPPED}
+
+
+def load_method(name: str) -> Method:
+    """A method by the name under which a package offers it.
+
+    Raises:
+        UserError: if there is none of that name, or it is something else.
+    """
+    offered = _offered()
+    if name not in offered:
+        raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")
+    module, _, attribute = offered[name].partition(":")
+    try:
+        method = getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # whatever a module raises that is imported
+        raise UserError(f"method {name!r}: cannot be imported ({type(error).__name__}: {error}); mend its package") from error
+    if not isinstance(method, Method):
+        raise UserError(f"method {name!r}: expected a Method, found {type(method).__name__}; mend its package")
+    return method
+
+
+def methods() -> Iterator[Method]:
+    """All that installed packages offer, in the order of tables; each is imported when it is its turn."""
+    return (load_method(name) for name in method_names())
+
+
+def kinds() -> list[str]:
+    """The kinds of pretrained models that there are."""
+    return [method.kind for method in methods() if method.model]
+
+
+def method_of(kind: str) -> Method | None:
+    """The method whose models are of a kind; ``None`` if no installed package offers one."""
+    return next((method for method in methods() if method.model and method.kind == kind), None)
+
+
+def adapts(adaptation: "type[Adaptation]", kind: str) -> bool:
+    """Whether an adaptation adapts models of a kind: a method of this kind names it, or what it is derived from."""
+    return any(method.kind == kind and issubclass(adaptation, method.adaptation_class()) for method in methods())
+
+
+def kinds_for(adaptation: "type[Adaptation]") -> list[str]:
+    """The kinds of models that an adaptation adapts."""
+    return list(dict.fromkeys(method.kind for method in methods() if issubclass(adaptation, method.adaptation_class())))

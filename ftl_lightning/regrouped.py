@@ -1,0 +1,135 @@
+"""Options that stand in groups today and did not in older configuration files and commands, and classes that have moved.
+
+This is the only place that knows how they were called; what is older keeps working and is told in one line.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ftl_lightning.printing import say
+
+PRETRAINING: Mapping[str, str] = {
+    "condition_dropout": "loss.condition_dropout",
+    "loss": "loss.kind",
+    "timestep_power": "loss.timestep_power",
+    "loss_discount": "loss.discount",
+    "code_share": "codes.share",
+    "code_knots": "codes.knots",
+    "code_size": "codes.size",
+    "code_noise": "codes.noise",
+}
+"""Of our pretraining, where each option is, ``'group.option'``, by its flat name, under which models' records know it."""
+INVERSION: Mapping[str, str] = {
+    "initial_omega": "weights.initial",
+    "off_span": "embeddings.off_span",
+    "initial_spread": "embeddings.initial_spread",
+    "restarts": "budget.restarts",
+    "learning_rate": "budget.learning_rate",
+    "weight_learning_rate": "weights.learning_rate",
+    "samples": "budget.samples",
+    "mode_samples": "modes.samples",
+    "modes": "modes.sets",
+    "tolerance": "budget.tolerance",
+    "knots": "embeddings.knots",
+    "guidance_scale": "weights.scale",
+    "adapter": "adapter.rank",
+    "adapter_learning_rate": "adapter.learning_rate",
+    "adapter_scope": "adapter.scope",
+    "loss": "loss.kind",
+    "timestep_power": "loss.timestep_power",
+    "training_omega": "weights.training",
+}
+"""Of an inversion, where each option is, by its flat name, under which results, checkpoints and the Python API know it."""
+_INVERSIONS = (
+    "ftl_lightning.learning.InversionModule",
+    "ftl_lightning.learning.inversion_module.InversionModule",
+    "ftl_lightning.methods.lora.adaptation.FineTuning",
+)
+_BASELINES = "ftl_lightning.learning.baselines"
+CLASSES: Mapping[str, str] = {
+    "ftl_lightning.learning.diffusion_pretraining.PretrainingModule": "ftl_lightning.learning.PretrainingModule",
+    f"{_BASELINES}.cloning.CloningPretraining": "ftl_lightning.methods.bc.pretraining.CloningPretraining",
+    f"{_BASELINES}.vae.VAEPretraining": "ftl_lightning.methods.cvae.pretraining.VAEPretraining",
+    f"{_BASELINES}.in_context.InContextPretraining": "ftl_lightning.methods.in_context.pretraining.InContextPretraining",
+    f"{_BASELINES}.prompting.InContextAdaptation": "ftl_lightning.learning.learner_adaptation.LearnerAdaptation",
+    f"{_BASELINES}.language.LanguageAdaptation": "ftl_lightning.methods.language.adaptation.LanguageAdaptation",
+}
+"""Where classes are today that configurations name."""
+_EITHER = "learning_rate"
+"""An option of both, which an inversion has in a group: only the class tells."""
+_PLACES: Mapping[str, str] = {name: place for name, place in {**PRETRAINING, **INVERSION}.items() if name != _EITHER}
+
+
+def regrouped(keys: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A configuration file's keys as they are called today; what is older is told in one line.
+
+    Args:
+        keys: of one file, or of several that were merged.
+        where: the file.
+    """
+    model = keys.get("model")
+    if not isinstance(model, Mapping):
+        return dict(keys)
+    renamed, told = dict(model), []
+    path = str(model.get("class_path"))
+    if path in CLASSES:
+        renamed["class_path"] = CLASSES[path]
+        told.append(f"{path} is now {CLASSES[path]}")
+    places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if renamed.get("class_path") in _INVERSIONS else {})
+    options = model.get("init_args")
+    if isinstance(options, Mapping):
+        renamed["init_args"], names = _grouped(options, places)
+        told += [f"model.{name} is now model.{places[name]}" for name in names]
+    if told:
+        _tell(f"note: {where}: {', '.join(told)}")
+    return {**keys, "model": renamed}
+
+
+@functools.cache
+def _tell(note: str) -> None:
+    """Once in a process, however often a file is read."""
+    say(note, error=True)
+
+
+def _grouped(options: Mapping[str, Any], places: Mapping[str, str]) -> tuple[dict[str, Any], list[str]]:
+    """Options with flat ones in their groups, and the names of these."""
+    result: dict[str, Any] = {}
+    moved = []
+    for name, value in options.items():
+        group, _, option = places.get(name, "").partition(".")
+        if group and not (name == group and isinstance(value, Mapping)):
+            result[group] = {**result.get(group, {}), option: value}
+            moved.append(name)
+        elif isinstance(value, Mapping) and isinstance(result.get(name), Mapping):
+            result[name] = {**value, **result[name]}
+        else:
+            result[name] = value
+    return result, moved
+
+
+def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
+    """A command line's options of ``model`` as they are called today; what is older is told in one line.
+
+    Args:
+        arguments: those of a verb, without it.
+        verb: ``invert`` has all of its options of the kind in groups.
+    """
+    places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if verb == "invert" else {})
+    result, told = [], []
+    for index, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        given = value if equals else next(iter(arguments[index + 1 : index + 2]), "")
+        name = option.removeprefix("--model.").removeprefix("init_args.")
+        if option.startswith("--model.") and name in places and not given.lstrip().startswith("{"):
+            told.append(f"{option} is now --model.{places[name]}")
+            argument = f"--model.{places[name]}{equals}{value}"
+        elif option in ("--model", "--model.class_path") and given in CLASSES:
+            told.append(f"{given} is now {CLASSES[given]}")
+            argument = f"{option}={CLASSES[given]}" if equals else argument
+        elif arguments[index - 1 : index] in (["--model"], ["--model.class_path"]):
+            argument = CLASSES.get(argument, argument)
+        result.append(argument)
+    if told:
+        _tell(f"note: {', '.join(dict.fromkeys(told))}")
+    return result
