@@ -116,20 +116,26 @@ def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
         verb: ``invert`` has all of its options of the kind in groups.
     """
     places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if verb == "invert" else {})
-    result, told = [], []
-    for index, argument in enumerate(arguments):
+    result, told, rest = [], [], list(arguments)
+    while rest:
+        argument = rest.pop(0)
         option, equals, value = argument.partition("=")
-        given = value if equals else next(iter(arguments[index + 1 : index + 2]), "")
+        if not option.startswith("--model"):
+            result.append(argument)
+            continue
+        if not equals and rest and not rest[0].startswith("--"):
+            equals, value = "=", rest.pop(0)
         name = option.removeprefix("--model.").removeprefix("init_args.")
-        if option.startswith("--model.") and name in places and not given.lstrip().startswith("{"):
+        if name in places and not value.lstrip().startswith("{"):
             told.append(f"{option} is now --model.{places[name]}")
-            argument = f"--model.{places[name]}{equals}{value}"
-        elif option in ("--model", "--model.class_path") and given in CLASSES:
-            told.append(f"{given} is now {CLASSES[given]}")
-            argument = f"{option}={CLASSES[given]}" if equals else argument
-        elif arguments[index - 1 : index] in (["--model"], ["--model.class_path"]):
-            argument = CLASSES.get(argument, argument)
-        result.append(argument)
+            option, name = f"--model.{places[name]}", places[name]
+        elif name in ("--model", "class_path") and value in CLASSES:
+            told.append(f"{value} is now {CLASSES[value]}")
+            value = CLASSES[value]
+        group, dot, last = name.partition(".")
+        if dot and value == "null":  # which the parser takes for a text in an option of a group, but not in a group
+            option, value = f"--model.{group}", f'{{"{last}": null}}'
+        result.append(f"{option}{equals}{value}")
     if told:
         _tell(f"note: {', '.join(dict.fromkeys(told))}")
     return result
