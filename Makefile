@@ -5,7 +5,7 @@ EXTRAS := dev,cluster,docs,minari
 DOMAIN := object_rearrangement
 LOGS := logs/$(DOMAIN)
 
-.PHONY: install minilm run test lint format report ablation comparison benchmark docs
+.PHONY: install minilm run test lint format report ablation comparison benchmark docs fields
 
 install: .venv/installed
 
@@ -49,3 +49,6 @@ benchmark: install
 
 docs: install # the documentation's pages, in docs/_build/html; a warning is an error
 	$(BIN)/sphinx-build -W --keep-going --quiet -d docs/_build/doctrees docs docs/_build/html
+
+fields: install # the tables of fields in docs/own-domain.md, from the docstrings
+	$(BIN)/python docs/fields.py

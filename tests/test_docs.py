@@ -1,6 +1,8 @@
 """The documentation: its length, its links, and the commands that it shows."""
 
 import re
+import runpy
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -81,3 +83,30 @@ def test_every_page_is_in_the_contents() -> None:
     pages |= {f"cards/{path.stem}" for path in (ROOT / "docs" / "cards").iterdir()}
     pages |= {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")}
     assert pages - listed == set()
+
+
+def test_the_tables_of_fields_are_what_the_docstrings_say() -> None:
+    fields = runpy.run_path(str(ROOT / "docs" / "fields.py"))
+    page = fields["PAGE"].read_text(encoding="utf-8")
+    assert fields["written"](page) == page, "run `make fields`"
+    stale = page.replace("number of states in a plan", "what nobody wrote")
+    assert stale != page
+    assert fields["written"](stale) == page
+
+
+def test_a_docstring_that_leaves_out_a_field_is_an_error() -> None:
+    fields = runpy.run_path(str(ROOT / "docs" / "fields.py"))
+
+    @dataclass
+    class Half:
+        """Half described.
+
+        Attributes:
+            told: what is said.
+        """
+
+        told: int
+        untold: int = 0
+
+    with pytest.raises(ValueError, match=r"Half: the docstring describes \['told'\], the class has \['told', 'untold'\]"):
+        fields["table"](Half)

@@ -20,13 +20,12 @@ class Feature:
     """One part of what is observed.
 
     Attributes:
-        shape: of one sample, such as ``(7,)`` or ``(3, 96, 96)``.
+        shape: shape of one sample, such as ``(7,)`` or ``(3, 96, 96)``.
         kind: ``'vector'`` (float32) or ``'image'`` (uint8, channels first).
-        entities: of a vector, the columns of each of its exchangeable entities, in the same order for each; the other columns say
-            nothing about a single entity.
-        attributes: which of an entity's columns, counted from its first, a concept asks for when it names an entity (its colour,
-            its shape); all where empty.
-        state: of a vector, the columns that hold the state a plan starts from, in its order; none where it holds no such state.
+        entities: for a vector: the columns of each of its exchangeable objects, in the same order for each. The other columns
+            belong to no single object.
+        attributes: which of an object's columns, counted from its first, a concept may refer to (colour, shape); all where empty.
+        state: for a vector: the columns that hold the state a plan starts from, in the order of a state; empty where it holds none.
 
     Raises:
         UserError: at construction, for columns that it does not have.

@@ -1,6 +1,6 @@
 """What a domain is: one object in a few groups. Adding a domain adds such an object, here or in a package of one's own.
 
-Name, plans, concepts and source have to be said; everything else has a default.
+Name, plans, concepts and source are required; everything else has a default.
 """
 
 import difflib
@@ -50,13 +50,13 @@ class Plans:
     Attributes:
         horizon: number of states in a plan.
         columns, units: name and unit of each column of a state.
-        start_exponent: exponent u of the windows' starts in a demonstration, ``start = length * share^u``, for windows as long as a
-            plan: 1 is uniform; 3 where a plan reaches over the whole behaviour, so that the first window matters most. Shorter
-            windows start anywhere: all times are alike to them.
-        at_rest: whether behaviour is at rest where a demonstration ends, so that windows may reach past the end, where the last
-            state stays. Without it they stay within demonstrations, of those that are long enough.
-        groups: columns that belong together, by name, such as a body's legs: a concept may be composed on some of them alone.
-        resolution: columns of states and observed vectors that vary by less, in their units, hold a simulator's rounding alone.
+        start_exponent: where training windows as long as a plan start in a demonstration: ``start = length * share^start_exponent``
+            with a uniform ``share``. 1 is uniform; with 3 half of the windows start in the first eighth, for plans that cover the
+            whole behaviour. Shorter windows start anywhere.
+        at_rest: whether behaviour is at rest at the end of a demonstration. Windows may then reach past the end, where the last
+            state is repeated; otherwise they stay within demonstrations that are long enough.
+        groups: named groups of columns, such as the legs of a body; a composition may restrict a concept to some of them.
+        resolution: columns of states and observed vectors that vary by less than this, in their units, count as constant.
     """
 
     horizon: int
@@ -92,14 +92,15 @@ class Concepts:
     """The behaviour's concepts, in words.
 
     Attributes:
-        training: descriptions of the behaviours of pretraining.
-        suites: what is evaluated, by name: ``'training'`` (training concepts), ``'paper'`` (final evaluation only),
-            ``'validation'`` (for tuning), or any other. Without any, the training concepts alone.
-        descriptions: every text that the table of embeddings holds besides the empty one; without any, the training concepts and
-            the suites' goals.
+        training: texts of the training concepts.
+        suites: evaluation tasks by name of the suite: ``'training'`` (training concepts), ``'validation'`` (for tuning),
+            ``'paper'`` (final evaluation only), or any other. ``invert`` learns the suite ``'paper'`` unless ``data.suite`` says
+            otherwise. By default the training concepts alone.
+        descriptions: every text in the table of embeddings besides the empty one; by default the training concepts and the suites'
+            goals.
         reads: whether a text is a goal that behaviour can be judged by; by default, whether it is one of the descriptions.
-        sentence: how a goal is told to a language model.
-        table: file of the embeddings of all descriptions, made by ``encode``; ``None`` where none ships.
+        sentence: turns a goal into the sentence that a language model embeds; by default the goal itself.
+        table: file with the embeddings of all descriptions, made by ``encode``; ``None`` where none ships.
     """
 
     training: tuple[str, ...]
@@ -151,9 +152,10 @@ class Metric:
 
     Attributes:
         measure: ``(goal, states (sample, horizon, state), initial states or None) -> (sample,)`` of bool (right or wrong) or of
-            numbers; or a single number ``()`` for the whole set, such as a distance of distributions.
+            numbers; or a single number ``()`` for the whole set, such as a distance between distributions.
         less_is_better: whether a smaller value is better.
-        identity: what decides the values besides the code, such as the hash of a trained judge's weights; empty for a rule.
+        identity: what the values depend on besides the code, such as the hash of a trained judge's weights. It is part of the
+            configuration's hash; empty for a rule.
     """
 
     measure: Callable[[str, Tensor, InitialStates | None], Tensor]
@@ -166,11 +168,11 @@ class Show:
     """Pictures of plans.
 
     Attributes:
-        picture: ``(states (sample, horizon, state), right (sample,) of bool or None if nobody judged, title, initial states or
-            None) -> figure``.
-        film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is no motion.
-        wireframe: ``states (horizon, state) -> points and lines that move``, from which a web page draws the same film in a
-            twentieth of its size; ``None`` where a plan is nothing of the kind.
+        picture: ``(states (sample, horizon, state), right (sample,) of bool or None if not judged, title, initial states or None)
+            -> figure``.
+        film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is not a motion.
+        wireframe: ``states (horizon, state) -> moving points and lines``, from which a web page draws the same film in a twentieth
+            of its size; ``None`` where a plan cannot be drawn in this way.
     """
 
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
@@ -195,20 +197,21 @@ class ClosedLoop:
     """How a domain executes plans.
 
     Attributes:
-        environment: makes an environment whose observations are the domain's observed features by name, and whose ``reset`` takes
-            ``options={'scene': (scene,)}``. What its last step tells (``info``) is what ``judge`` knows besides them.
-        act: the planner, ``(plans (episode, horizon, state), steps since they were made, observed (episode, *shape) by name) ->
-            actions (episode, action)``.
-        steps: at most, of an episode.
-        judge: ``(goal, rollout) -> what happened``, by name ``(episode,)``; ``'success'``, of bool, is the paper's metric.
+        environment: makes a Gymnasium environment. Its observations are the domain's observed features by name; its ``reset`` takes
+            ``options={'scene': (scene,)}``. ``judge`` also receives the ``info`` of its last step.
+        act: the planner: ``(plans (episode, horizon, state), steps since the plans were made, observed (episode, *shape) by name)
+            -> actions (episode, action)``.
+        steps: maximum number of steps in an episode.
+        judge: ``(goal, rollout) -> outcomes`` by name, each ``(episode,)``. One of them is ``'success'``, of bool.
         film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``; ``None`` where episodes are
             not filmed.
-        keeps: observed features that ``judge`` and ``film`` ask for; all where empty.
-        less_is_better: of which outcomes less is better.
-        identity: what decides outcomes besides the code and belongs to the configuration that rows are known by; may be empty.
-        others: environments by name, in which plans are also executed where a configuration says so, such as one with another
-            planner.
-        policies: policies to print beside every rate: name to ``(goal, initial states, demonstrations that the behaviour was
+        keeps: names of the observed features that ``judge`` and ``film`` need; all where empty.
+        less_is_better: names of the outcomes of which a smaller value is better, such as ``'crash'``.
+        identity: what outcomes depend on besides the code, such as the planner's name. It is part of the configuration's hash; may
+            be empty.
+        others: more environments by name, such as one with another planner. ``evaluation.environments`` chooses those in which
+            plans are also executed.
+        policies: reference lines that act step by step, by name: ``(goal, initial states, demonstrations that the concept was
             learned from or None, seed) -> policy``, or ``None`` where it would take too long.
     """
 
@@ -233,16 +236,16 @@ class View:
     """How a model sees behaviour, where it is not as it stands in files.
 
     Attributes:
-        features: what the model observes, by name.
-        observe: observed features of the domain to those.
-        encode: ``(states (sample, horizon, state), observed) -> (sample, horizon, state)``.
-        decode: its inverse for behaviour that there can be; of other states, which a network may generate, the nearest such.
-        perturb: ``(states, observed, generator) -> both``, as if the present had been a little different: training on perturbed
-            starts teaches recovery from states outside the demonstrations. Without a generator, only what a new task will not
-            show is hidden. ``None`` where neither is known.
-        act: as of :class:`ClosedLoop`, for a planner that looks at behaviour likewise; ``None`` for the domain's.
-        scales: groups of columns of a state, in the same order: those in the same place of each share a scale.
-        same_columns: what it sees has the columns of a state of the domain.
+        features: the features that the model observes, by name.
+        observe: turns the domain's observed features into these features.
+        encode: ``(states (sample, horizon, state), observed) -> (sample, horizon, state)``, what the model generates.
+        decode: the inverse of ``encode``; of generated states that are impossible, it returns the nearest possible ones.
+        perturb: ``(states, observed, generator) -> (states, observed)`` with a slightly different present state, used in training:
+            it teaches recovery from states outside the demonstrations. Without a generator it only hides what a new task will not
+            show. ``None`` for no perturbation.
+        act: a planner for plans in this view, as ``act`` of :class:`ClosedLoop`; ``None`` for the domain's planner.
+        scales: groups of columns of a state; columns at the same position in each group share a scale.
+        same_columns: whether encoded states have the same columns as the domain's states.
     """
 
     features: Mapping[str, Feature]
@@ -266,26 +269,27 @@ class Domain(Shown):
     """A domain.
 
     Attributes:
-        name: the one under which its package offers it, see :func:`ftl_lightning.domains.registry.load_domain`.
+        name: the name under which its package offers it, see :func:`ftl_lightning.domains.registry.load_domain`.
         plans: the behaviour that is generated.
-        concepts: what it is told by.
-        source: makes the source of demonstrations, given the folder of a user's data or ``None``.
-        show: pictures of it; by default :func:`line_drawings`.
-        observed: features that a plan is conditioned on, by name; empty where behaviour has no initial state.
-        metrics: of plans, by name; the first is what ablations are about. None where only what comes of plans is judged.
-        ours: as what our method stands in results in the form that others are compared with; the paper's by default.
-        headline: what methods are compared by, task for task: a metric's name, or ``'closed loop '`` and an outcome's.
-        references: trivial policies and oracles to print beside every rate: name to ``(goal, samples, initial states or None, seed)
-            -> states (sample, horizon, state)``.
-        views: by name, how a model may see behaviour; without any, as it is.
+        concepts: texts of the concepts, and suites of evaluation tasks.
+        source: makes the source of demonstrations, given the folder of the user's data or ``None``.
+        show: pictures of plans; by default lines over time, or paths where a state has two or three columns.
+        observed: features that a plan is conditioned on, by name; empty where plans have no initial state.
+        metrics: how plans are judged in open loop, by name; the first is the one that ablations report. Empty where behaviour is
+            judged in closed loop only.
+        ours: the name under which results hold the form of our method that is compared with others; by default the paper's method.
+        headline: what methods are compared by: the name of a metric, or ``'closed loop '`` and an outcome.
+        references: reference lines (trivial policies and oracles) by name: ``(goal, samples, initial states or None, seed) ->
+            states (sample, horizon, state)``.
+        views: ways in which a model may see behaviour, by name; without any, the model sees states as they are.
         closed_loop: how plans are executed; ``None`` where they cannot be.
-        distance: of plans, by which novelty and coverage are measured; ``None`` for
-            :func:`~ftl_lightning.domains.distances.scaled_distance` to behaviour of the task.
-        fresh: whether the source can draw behaviour of any goal quickly enough to do so in every evaluation; without it there is no
-            coverage.
-        paper: the paper's numbers, if it has any.
-        prepare: ``(folder of a user's own copy of the data, folder to write or None for the same) -> what to print``, where
-            recordings are read once before they are used; see ``python -m ftl_lightning prepare``.
+        distance: between plans, for novelty and coverage: ``(states (a, horizon, state), others (b, horizon, state)) -> (a, b)``;
+            ``None`` for the root mean square over the plan's times, columns scaled by their spread.
+        fresh: whether the source draws demonstrations of any goal quickly enough to do so in every evaluation; otherwise coverage
+            is not measured.
+        paper: published numbers, if there are any.
+        prepare: ``(folder of the user's copy of the data, folder to write or None for the same) -> text to print``, for recordings
+            that are read once before they are used; see ``python -m ftl_lightning prepare``.
     """
 
     name: str

@@ -18,7 +18,7 @@ class Published:
 
     Attributes:
         setting: as in :class:`~ftl_lightning.domains.tasks.EvaluationTask`.
-        value: accuracy in [0, 1].
+        value: the number, such as an accuracy in [0, 1].
         error: standard error over tasks; ``None`` for a single task or where it is not reported.
         components: K.
         omega: the fixed weight as text, or ``'learned'``.
@@ -43,8 +43,8 @@ class Paper:
 
     Attributes:
         numbers: all of them.
-        omega: guidance weight of two components in its main figures, as text.
-        ours: the weight that our main tables put beside it, as text.
+        omega: guidance weight of two components in the paper's main figures, as text.
+        ours: guidance weight that our main tables compare with it, as text.
     """
 
     numbers: tuple[Published, ...]

@@ -11,18 +11,18 @@ WITHOUT_WEIGHT = -0.5
 
 @dataclass(frozen=True)
 class EvaluationTask:
-    """One bar of a chart: behaviour to generate and the goal it is judged by.
+    """Behaviour to generate, and the goal it is judged by.
 
     Attributes:
-        setting: name of the group it is averaged in, e.g. ``'training composition'``.
-        goal: the task in words, as the domain's metrics read it.
+        setting: name of the group over which results are averaged, e.g. ``'training composition'``.
+        goal: text of the task, as the domain's metrics read it.
         learned: names of the learned concepts that are composed, usually one.
-        texts: training concepts that are composed in.
-        without: training concepts that are composed in with :data:`WITHOUT_WEIGHT`: what the behaviour should not be.
+        texts: training concepts in the composition.
+        without: training concepts in the composition with the negative weight :data:`WITHOUT_WEIGHT`: what behaviour should not be.
         component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
-        on: concepts, learned or texts, whose weight is on some groups of a state's columns alone, each with the groups' names.
-        initial: where behaviour starts, in domains with initial states: in new ones, or in those of the demonstrations that the
-            concept was learned from.
+        on: concepts, learned or texts, that act on some groups of a state's columns only, each with the names of the groups.
+        initial: where plans start, in domains with initial states: in new ones, or in those of the demonstrations that the concept
+            was learned from.
 
     Raises:
         UserError: at construction, for ``learned``, ``texts`` or ``without`` that are no tuples, or where a single component or the
