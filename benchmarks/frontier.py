@@ -25,8 +25,8 @@ from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.paper import OURS, WITH_MODES
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.diversity import Real, lines
-from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
+from ftl_lightning.evaluation.generation import Generation, generate
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion import invert
@@ -107,8 +107,7 @@ def noisy(real: Sequence[Real], seed: int) -> list[tuple[float, Judged]]:
     """Demonstrations in turn, each moved as a whole by normal noise, at every level of :data:`NOISE`."""
     draw, found = torch.Generator().manual_seed(seed), []
     for one, level in itertools.product(real, NOISE):
-        if one.demonstrations is not None and one.fresh is not None:
-            judged = one.replayed()
+        if one.fresh is not None and (judged := one.replayed()) is not None:
             spread = judged.states.flatten(0, 1).std(dim=0)
             noise = level * spread * torch.randn((len(judged.states), 1, len(spread)), generator=draw)
             found.append((level, one.added(Judged.of(one.task, judged.states + noise, judged.starts, one.domain))))
@@ -136,11 +135,11 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
     module: Any = adapted(form, config, concatenate([drawn.select(concept) for concept in learned]), seed)
     sampling = {key: config["evaluation"][key] for key in ("sampler", "steps") if key in config["evaluation"]}
     for temperature in missing:
-        evaluator = Evaluator([suite], samples, temperature=temperature or 0.0, seed=seed, **sampling)
-        judged = evaluator.evaluate(module, tasks=tasks)
-        real = evaluator.real(module, judged)
-        found = [own.added(one) for own, one in zip(real, judged, strict=True)]
-        ours = [row(one, domain, {**run, **method, "temperature": temperature}) for one in found]
+        generation = Generation(samples, temperature=temperature or 0.0, seed=seed, **sampling)
+        judged = generate(module, tasks, generation)
+        real = real_behaviour(judged, domain, module.demonstrated, seed=seed)
+        compared = [behaviour.added(one) for behaviour, one in zip(real, judged, strict=True)]
+        ours = [row(one, domain, {**run, **method, "temperature": temperature}) for one in compared]
         reference = {"variant": "", "temperature": None}
         beside = [row(one, domain, {**run, **reference, "method": line}) for line, each in lines(real).items() for one in each]
         moved = [

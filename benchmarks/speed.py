@@ -16,7 +16,6 @@ import functools
 import json
 import platform
 import time
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -38,7 +37,7 @@ from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
-from ftl_lightning.seeding import generator
+from ftl_lightning.seeding import generator, task_key
 from ftl_lightning.tensor_file import write_text
 from ftl_lightning.tuned import Tuned
 
@@ -161,7 +160,7 @@ class Judge:
 
     def accuracy(self, learned: Mapping[str, Composition]) -> float:
         """Share of :data:`SAMPLES` plans of each concept that show it, mean over the concepts."""
-        draws = [generator("cpu", 0, zlib.crc32(task.encode())) for task in self.tasks]
+        draws = [generator("cpu", 0, task_key(task)) for task in self.tasks]
         plans = self.model.sample([learned[task] for task in self.tasks], SAMPLES, SAMPLING, draws)
         metric = self.model.domain.metrics[ACCURACY].measure
         return mean(float(metric(task, own, None).float().mean()) for task, own in zip(self.tasks, plans, strict=True))
@@ -322,7 +321,7 @@ def main() -> None:
 
 
 def _draw(seed: int, concept: str) -> torch.Generator:
-    return generator("cpu", seed, 4, zlib.crc32(concept.encode()))
+    return generator("cpu", seed, 4, task_key(concept))
 
 
 if __name__ == "__main__":

@@ -21,9 +21,9 @@ from ftl_lightning.concepts.explanation import Explanation, explain
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.errors import UserError, short, shown
-from ftl_lightning.evaluation.execution import Execution, closed_loop_of
+from ftl_lightning.evaluation.execution import Execution
 from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.hub import card as model_card

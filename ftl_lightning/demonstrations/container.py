@@ -1,40 +1,19 @@
-"""The container of demonstrations and its file."""
+"""The container of demonstrations: what there is of one or several tasks, and what is taken from it."""
 
-import lzma
-import math
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed, take
+from ftl_lightning.demonstrations.file_format import INITIAL, read, write
+from ftl_lightning.demonstrations.file_keys import KIND, OBSERVED
 from ftl_lightning.errors import UserError, about, short, shown
-from ftl_lightning.limits import MOST_TENSORS, expect_readable, expect_unpacked
 from ftl_lightning.representation import Shown, counted
-from ftl_lightning.schema import expect_type
-from ftl_lightning.tensor_file import bytes_hash, load_tensors, save_tensors, serialise
-
-KIND = "demonstrations"
-VERSION = 3
-"""Of the form of a file with images: they are compressed (zlib), 1-D uint8 under their keys, with their shapes by key in the header
-as ``compressed``. Forms 1 and 2 still load."""
-PLAIN = 2
-"""The form of a file without images. Older files of this form hold images that are not compressed; form 1 had ``initial_states`` in
-place of observed features and scenes."""
-_OBSERVED = "observed/"
-"""Before the names of observed features in a file."""
-INITIAL = "initial_state"
-"""The observed feature that the initial states of form 1 become."""
-MOST_SHRUNK = 1032
-"""zlib makes one byte of so many at most."""
+from ftl_lightning.tensor_file import bytes_hash, serialise
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,7 +110,7 @@ class Demonstrations(Shown):
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is one, by its key in a file."""
         scenes = {} if self.scenes is None else {"scenes": self.scenes}
-        features = {_OBSERVED + name: values for name, values in self.observed.items()}
+        features = {OBSERVED + name: values for name, values in self.observed.items()}
         return {"states": self.states, "lengths": self.lengths} | features | scenes
 
     @property
@@ -186,8 +165,8 @@ class Demonstrations(Shown):
             States ``(window, horizon, state)`` and what is observed where each starts, by name ``(window, *shape)``.
         """
         times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
-        seen = {name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()}
-        return self.states[rows[:, None], times], seen
+        observed = {name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()}
+        return self.states[rows[:, None], times], observed
 
     @property
     def initial_states(self) -> InitialStates:
@@ -210,9 +189,7 @@ class Demonstrations(Shown):
         return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:
-        """Write one safetensors file with a JSON header, whole or not at all; images are compressed, see :data:`VERSION`."""
-        images = {_OBSERVED + name: values for name, values in self.observed.items() if values.dtype == torch.uint8}
-        packed = {key: _packed(values) for key, values in images.items()}
+        """Write one safetensors file with a JSON header, whole or not at all; images in it are compressed (zlib)."""
         header = {
             "domain": self.domain,
             "state_names": self.state_names,
@@ -220,9 +197,8 @@ class Demonstrations(Shown):
             "concepts": self.concepts,
             "per_step": self.per_step,
             "provenance": dict(self.provenance),
-            **({"compressed": {key: list(values.shape) for key, values in images.items()}} if images else {}),
         }
-        save_tensors(path, KIND, self.tensors | packed, header, VERSION if images else PLAIN)
+        write(path, self.tensors, header)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -235,34 +211,9 @@ class Demonstrations(Shown):
         Raises:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
         """
-        path = Path(path)
-        tensors, header = _read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, PLAIN, VERSION))
+        contents = read(Path(path))
         with about(path):
-            if "states" not in tensors:
-                told = short(", ".join(tensors)) or "nothing"
-                raise UserError(f"key 'states': expected (demo, time, state), found only {told}")
-            states = tensors["states"]
-            demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
-            texts = {key: _texts(key, header[key]) for key in _TEXTS if key in header}
-            per_step, scenes = texts.get("per_step", ()), tensors.get("scenes")
-            if header.get("format") == VERSION and demos:
-                tensors |= _unpacked(tensors, header.get("compressed"), per_step)
-            observed = {name.removeprefix(_OBSERVED): values for name, values in tensors.items() if name.startswith(_OBSERVED)}
-            if (initial := tensors.get("initial_states")) is not None:  # form 1
-                observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()
-                scenes = initial[:, 0] if initial.dim() == 3 else initial
-            return cls(
-                states=states,
-                lengths=tensors.get("lengths", torch.full((demos,), time)),
-                domain=expect_type(header.get("domain", ""), str, "domain"),
-                state_names=texts.get("state_names", tuple(map(str, range(columns)))),
-                state_units=texts.get("state_units", ("",) * columns),
-                concepts=texts.get("concepts", ("",) * demos),
-                observed=observed,
-                per_step=per_step,
-                scenes=scenes,
-                provenance=expect_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
-            )
+            return cls(**contents)
 
     def fitted(self, features: Mapping[str, Feature]) -> Self:
         """The same with the observed features of a domain.
@@ -275,7 +226,7 @@ class Demonstrations(Shown):
         Raises:
             UserError: for a feature that is missing or has another type or shape.
         """
-        found = self
+        separate = self
         if set(self.observed) == {INITIAL} and INITIAL not in features and features:
             values, per_step = self.observed[INITIAL], bool(self.per_step)
             sizes = [feature.size for feature in features.values()]
@@ -286,14 +237,14 @@ class Demonstrations(Shown):
                 name: part.unflatten(-1, feature.shape).contiguous()
                 for (name, feature), part in zip(features.items(), parts, strict=True)
             }
-            found = replace(self, observed=observed, per_step=tuple(features) if per_step else ())
+            separate = replace(self, observed=observed, per_step=tuple(features) if per_step else ())
         for name, feature in features.items():
-            if (own := found.features.get(name)) is None or not own.fits(feature):
-                told = "none" if own is None else own.words
-                if own is not None and own.shape[1:] == feature.shape and name not in found.per_step:
+            if (held := separate.features.get(name)) is None or not held.fits(feature):
+                told = "none" if held is None else held.words
+                if held is not None and held.shape[1:] == feature.shape and name not in separate.per_step:
                     told += " (observed at every time? then list it in per_step)"
                 raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {told}")
-        return found
+        return separate
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
@@ -333,137 +284,12 @@ def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     Returns:
         ``(demo, longest time, ...)``, each padded with its last time, and the lengths ``(demo,)`` int64.
     """
-    lengths = torch.tensor([len(one) for one in behaviours])
+    lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
     longest = int(lengths.max())
-    return torch.cat([_padded(one[None], longest) for one in behaviours]), lengths
+    return torch.cat([_padded(behaviour[None], longest) for behaviour in behaviours]), lengths
 
 
 def _padded(values: Tensor, time: int) -> Tensor:
     """``(demo, time, ...)`` with its last time repeated."""
     last = values[:, -1:].expand(-1, time - values.shape[1], *(-1,) * (values.dim() - 2))
     return torch.cat((values, last), dim=1)
-
-
-_TEXTS = ("state_names", "state_units", "concepts", "per_step")
-"""Keys of a file's header that hold lists of texts."""
-
-
-def _texts(key: str, found: object) -> tuple[str, ...]:
-    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
-        raise UserError(f"key {key!r}: expected a list of texts, found {shown(found)}")
-    return tuple(found)
-
-
-def _packed(images: Tensor) -> Tensor:
-    """Images ``(demo, ...)`` uint8, compressed as one ``(byte,)``."""
-    return torch.frombuffer(bytearray(zlib.compress(images.detach().cpu().numpy().tobytes())), dtype=torch.uint8)
-
-
-def _unpacked(tensors: Mapping[str, Tensor], shapes: object, per_step: Sequence[str]) -> dict[str, Tensor]:
-    """The images of a file whose header names their shapes, by key.
-
-    What they need in memory is bounded: their shapes begin as that of the states, and nothing beyond them is decompressed.
-
-    Args:
-        tensors: as they are in the file; states ``(demo, time, state)`` among them.
-        shapes: by key, as the header says.
-        per_step: names of features that are known at every time.
-
-    Raises:
-        UserError: naming the key, if its shape is none that it can have, or its bytes are damaged.
-    """
-    if not isinstance(shapes, dict):
-        raise UserError(f"key 'compressed': expected shapes of images by key, found {shown(shapes)}")
-    found = {}
-    for key, shape in shapes.items():
-        packed = tensors.get(key)
-        if packed is None or not key.startswith(_OBSERVED) or packed.dtype != torch.uint8 or packed.dim() != 1:
-            told = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"
-            expected = "compressed images, uint8 of shape (byte,) under 'observed/NAME'"
-            raise UserError(f"key {short(key)!r}: expected {expected}, found {told}")
-        leading = list(tensors["states"].shape[: 2 if key.removeprefix(_OBSERVED) in per_step else 1])
-        numbers = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
-        if not numbers or shape[: len(leading)] != leading or math.prod(shape) > MOST_SHRUNK * len(packed):
-            begin = ", ".join(map(str, leading))
-            raise UserError(
-                f"key {key!r}: expected images of shape ({begin}, ...) that fit into {len(packed)} compressed bytes, "
-                f"found the shape {shown(shape)} in the header; the file is damaged"
-            )
-        with about(f"key {short(key)!r}"):
-            expect_unpacked(math.prod(shape), len(packed), "images")
-        content = _decompressed(key, packed.numpy().tobytes(), math.prod(shape))
-        found[key] = torch.from_numpy(np.frombuffer(content, dtype=np.uint8)).reshape(shape)
-    return found
-
-
-def _decompressed(key: str, packed: bytes, size: int) -> bytearray:
-    reader = zlib.decompressobj()
-    try:
-        content = bytearray(reader.decompress(packed, size + 1))  # one more: room to meet the end
-    except zlib.error as error:
-        raise UserError(f"key {key!r}: expected compressed images, found damaged bytes ({error}); take another copy") from error
-    if len(content) != size or not reader.eof or reader.unused_data:
-        more = len(content) > size or reader.unused_data
-        told = "more" if more else f"{len(content)}{'' if reader.eof else ' and no end'}"
-        raise UserError(f"key {key!r}: expected {size} bytes of images, found {told}; the file is damaged: take another copy")
-    return content
-
-
-def _read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    size = expect_readable(path, "demonstrations")
-    try:
-        expect_arrays(path, size)
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: np.asarray(archive[name]) for name in archive.files}
-            texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
-        "".join(text for value in texts.values() for text in np.ravel(value)).encode()
-    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError) as error:
-        told = short(str(error), 100)
-        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({told})") from error
-    tensors = {}
-    for name, array in arrays.items():
-        measured = name.startswith(_OBSERVED) or name in ("states", "lengths", "scenes")
-        if (measured and array.dtype.kind not in "fiub") or (name in (*_TEXTS, "domain") and array.dtype.kind != "U"):
-            told = "numbers" if measured else "texts"
-            raise UserError(f"{path}: key {short(name)!r}: expected an array of {told}, found one of {short(str(array.dtype))}")
-        if array.dtype.kind in "fiub":
-            # Images stay bytes; everything else that is measured is float32.
-            image = array.dtype == np.uint8 and name.startswith(_OBSERVED)
-            kind = np.uint8 if image else np.int64 if name == "lengths" and array.dtype.kind in "iu" else np.float32
-            with np.errstate(over="ignore"):  # what is too large for float32 is told as no finite number
-                tensors[name] = torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
-    for name, value in texts.items():
-        if isinstance(value, str):
-            # One text stands for all demonstrations.
-            several = name == "concepts" and "states" in tensors and tensors["states"].dim()
-            texts[name] = [value] * len(tensors["states"]) if several else [value]
-    header: dict[str, Any] = dict(texts)
-    if len(texts.get("domain", ())) == 1:
-        header["domain"] = texts["domain"][0]
-    return tensors, header
-
-
-_DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)
-"""What numpy and zipfile raise for files that are damaged or none of theirs."""
-
-
-def expect_arrays(path: Path, size: int) -> None:
-    """Refuse an archive that is much larger than its file, or holds an array whose header names another size than its bytes have.
-
-    Raises:
-        ValueError: saying so.
-    """
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        if len(members) > MOST_TENSORS:
-            raise ValueError(f"{len(members)} arrays")
-        with about(path):
-            expect_unpacked(sum(member.file_size for member in members), size, "arrays")
-        for member in members:
-            with archive.open(member) as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(file)
-                stated = math.prod(shape) * dtype.itemsize
-                if not dtype.hasobject and (min(shape, default=0) < 0 or stated != member.file_size - file.tell()):
-                    raise ValueError(f"{member.filename} is not of the size that it says")

@@ -94,8 +94,8 @@ def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None
         if name not in observed:
             found = ", ".join(observed) or "none"
             raise UserError(f"key 'observed': expected the feature {name!r}, {feature.words}, found {found}")
-        if not (own := Feature.of(observed[name])).fits(feature):
-            raise UserError(f"key 'observed/{name}': expected {feature.words} a sample, found {own.words}")
+        if not (given := Feature.of(observed[name])).fits(feature):
+            raise UserError(f"key 'observed/{name}': expected {feature.words} a sample, found {given.words}")
 
 
 @dataclass(frozen=True, repr=False)
@@ -133,6 +133,17 @@ class InitialStates(Shown):
         if self.scenes is None:
             raise UserError("key 'scenes': expected (sample, scene), what an environment is reset with, found none")
         return self.scenes
+
+
+def expect_starts(starts: InitialStates | None) -> InitialStates:
+    """Where behaviour starts, for what cannot do without.
+
+    Raises:
+        UserError: if nothing says where.
+    """
+    if starts is None:
+        raise UserError("starts: expected initial states, found none; give what is observed where plans start")
+    return starts
 
 
 def join(parts: Sequence[InitialStates]) -> InitialStates:

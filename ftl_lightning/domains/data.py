@@ -48,7 +48,8 @@ class Steps(IterableDataset[int]):
         return self.length
 
     def __iter__(self) -> Iterator[int]:
-        assert self.module.trainer is not None
+        if self.module.trainer is None:
+            raise UserError("data: expected a trainer, whose steps decide the batches, found none; give them to Trainer.fit")
         start = self.module.trainer.global_step
         return iter(range(start, start + self.length - start % self.length))
 

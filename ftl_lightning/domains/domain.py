@@ -330,10 +330,10 @@ class Domain(Shown):
         Raises:
             UserError: for a metric that returns neither a number for each plan nor one for all of them.
         """
-        found = {name: metric.measure(goal, states, starts) for name, metric in self.metrics.items()}
-        for name, values in found.items():
+        measured = {name: metric.measure(goal, states, starts) for name, metric in self.metrics.items()}
+        for name, values in measured.items():
             _expect(f"domain {self.name}, metric {name!r}", values, ((len(states),), ()))
-        return found
+        return measured
 
     def distances(self, states: Tensor, others: Tensor, distance: Distance) -> Tensor:
         """Between plans ``(a, horizon, state)`` and others ``(b, horizon, state)``: ``(a, b)``.
@@ -348,24 +348,23 @@ class Domain(Shown):
             UserError: for plans of different shapes, or a distance that returns something else.
         """
         _expect(f"domain {self.name}, distance", others, ((len(others), *states.shape[1:]),))
-        found = distance(states, others)
-        _expect(f"domain {self.name}, distance", found, ((len(states), len(others)),))
-        return found.nan_to_num(nan=torch.inf, posinf=torch.inf)
+        distances = distance(states, others)
+        _expect(f"domain {self.name}, distance", distances, ((len(states), len(others)),))
+        return distances.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def judge(self, goal: str, rollout: Rollout) -> dict[str, Tensor]:
         """What happened in episodes, by name ``(episode,)``.
 
         Raises:
-            UserError: for a judge that returns something else, or no success.
+            UserError: for a domain without an environment, or a judge that returns something else or no success.
         """
-        assert self.closed_loop is not None
-        found = self.closed_loop.judge(goal, rollout)
-        if not isinstance(found, Mapping) or SUCCESS not in found:
-            told = ", ".join(found) if isinstance(found, Mapping) else type(found).__name__
+        outcomes = closed_loop_of(self).judge(goal, rollout)
+        if not isinstance(outcomes, Mapping) or SUCCESS not in outcomes:
+            told = ", ".join(outcomes) if isinstance(outcomes, Mapping) else type(outcomes).__name__
             raise UserError(f"domain {self.name}, judge: expected outcomes by name, {SUCCESS!r} among them, found {told}")
-        for name, values in found.items():
+        for name, values in outcomes.items():
             _expect(f"domain {self.name}, outcome {name!r}", values, ((len(rollout.failed),),))
-        return dict(found)
+        return dict(outcomes)
 
     def expect_goal(self, goal: str, key: str = "goal") -> None:
         """Refuse a goal that the domain cannot read.
@@ -394,3 +393,14 @@ class Domain(Shown):
             outcome = outcome.partition(" (")[0]  # the environment
             return self.closed_loop is not None and outcome in self.closed_loop.less_is_better
         return metric in self.metrics and self.metrics[metric].less_is_better
+
+
+def closed_loop_of(domain: Domain) -> ClosedLoop:
+    """How a domain executes plans.
+
+    Raises:
+        UserError: for one that cannot.
+    """
+    if domain.closed_loop is None:
+        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
+    return domain.closed_loop

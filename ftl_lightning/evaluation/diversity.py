@@ -12,7 +12,7 @@ As many samples are drawn to be covered, and as many for the line.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -24,7 +24,9 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.distances import Distance, scaled_distance
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.progress import bar
 from ftl_lightning.seeding import FRESH_SEED
 
 _LOG = logging.getLogger(__name__)
@@ -78,13 +80,11 @@ class Real:
         parts = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
         return cls(task, domain, count, shown, parts)
 
-    @property
-    def _distance(self) -> Distance:
+    def _distance(self, behaviour: Demonstrations) -> Distance:
+        """The domain's, or that of plans whose columns are scaled as those of real behaviour."""
         if self.domain.distance is not None:
             return self.domain.distance
-        real = self.fresh[0] if self.fresh else self.demonstrations
-        assert real is not None
-        return scaled_distance(self._windows(real), self.domain.plans.resolution)
+        return scaled_distance(self._windows(behaviour), self.domain.plans.resolution)
 
     def _windows(self, demonstrations: Demonstrations) -> Tensor:
         """Their first windows, as long as a plan ``(demo, horizon, state)``."""
@@ -100,31 +100,34 @@ class Real:
         Raises:
             UserError: for plans that the domain's distance does not fit, or a distance that returns something else.
         """
-        found: dict[str, float] = {}
-        if plans.shape[1] != self.domain.plans.horizon:
-            return found
+        measured: dict[str, float] = {}
+        behaviour = self.fresh[0] if self.fresh else self.demonstrations
+        if behaviour is None or plans.shape[1] != self.domain.plans.horizon:
+            return measured
+        distance = self._distance(behaviour)
         if self.demonstrations is not None:
             known = self._windows(self.demonstrations)
-            found[NOVELTY] = novelty(self.domain.distances(plans, known, self._distance))
+            measured[NOVELTY] = novelty(self.domain.distances(plans, known, distance))
         if self.fresh:
-            found[COVERAGE] = coverage(self.domain.distances(plans, self._windows(self.fresh[0]), self._distance))
-        return found
+            measured[COVERAGE] = coverage(self.domain.distances(plans, self._windows(self.fresh[0]), distance))
+        return measured
 
     def lines(self) -> dict[str, Judged]:
         """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples.
 
         Where nothing but novelty is measured, there is nothing to say of demonstrations: theirs is 0.
         """
-        found = {}
-        if self.demonstrations is not None and (self.domain.metrics or self.fresh):
-            found[REPLAYED] = self.replayed()
+        judged = {}
+        if (self.domain.metrics or self.fresh) and (replayed := self.replayed()) is not None:
+            judged[REPLAYED] = replayed
         if self.fresh:
-            found[FRESH] = self._judged(self.fresh[1])
-        return found
+            judged[FRESH] = self._judged(self.fresh[1])
+        return judged
 
-    def replayed(self) -> Judged:
-        """As many plans as are generated, which are the demonstrations in turn."""
-        assert self.demonstrations is not None
+    def replayed(self) -> Judged | None:
+        """As many plans as are generated, which are the demonstrations in turn; ``None`` without any."""
+        if self.demonstrations is None:
+            return None
         turns = torch.arange(self.count) % len(self.demonstrations)
         return self._judged(self.demonstrations.rows(turns.tolist()))
 
@@ -147,10 +150,35 @@ def coverage(distances: Tensor) -> float:
     return float(distances.amin(dim=0).mean())
 
 
-def lines(found: Sequence[Real]) -> dict[str, list[Judged]]:
+def real_behaviour(
+    judged: Sequence[Judged],
+    domain: Domain,
+    demonstrated: Callable[[str], Demonstrations | None],
+    root: Path | None = None,
+    seed: int = 0,
+) -> list[Real]:
+    """The real behaviour that the plans of each task are compared with.
+
+    Args:
+        judged: what was generated.
+        domain: whose tasks they are.
+        demonstrated: what a concept was learned from, by its name.
+        root: folder of the user's copy of the data.
+        seed: of the fresh samples.
+    """
+    behaviour = []
+    with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
+        for one in judged:
+            known = demonstrations_of(one.task, demonstrated)
+            behaviour.append(Real.of(one.task, domain, len(one.states), known, root, seed))
+            advance()
+    return behaviour
+
+
+def lines(real: Sequence[Real]) -> dict[str, list[Judged]]:
     """The reference lines of some tasks, by name."""
-    each = [one.lines() for one in found]
-    return {name: own for name in (REPLAYED, FRESH) if (own := [one[name] for one in each if name in one])}
+    by_task = [behaviour.lines() for behaviour in real]
+    return {name: judged for name in (REPLAYED, FRESH) if (judged := [line[name] for line in by_task if name in line])}
 
 
 def _drawn(domain: Domain, goal: str, count: int, root: Path | None, seed: int) -> Demonstrations | None:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.domain import ClosedLoop, Domain
+from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
@@ -46,8 +46,8 @@ class Execution(Shown):
         """Share of episodes in which something happened, or its mean, by name; empty without a goal."""
         if not self.goal:
             return {}
-        found = self.domain.judge(self.goal, self.rollout)
-        return {name: float(values.float().mean()) for name, values in found.items()}
+        judged = self.domain.judge(self.goal, self.rollout)
+        return {name: float(values.float().mean()) for name, values in judged.items()}
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
         """Pictures ``(height, width, 3)`` of an episode."""
@@ -66,14 +66,3 @@ class Execution(Shown):
         pictures = captioned(self.frames(episode), outcome_text(self.goal, outcomes, episode))
         with atomic(path) as temporary:
             temporary.write_bytes(gif(pictures))
-
-
-def closed_loop_of(domain: Domain) -> ClosedLoop:
-    """How a domain executes plans.
-
-    Raises:
-        UserError: for one that cannot.
-    """
-    if domain.closed_loop is None:
-        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
-    return domain.closed_loop

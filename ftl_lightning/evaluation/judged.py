@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from ftl_lightning.demonstrations.features import InitialStates, join
-from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy
+from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy, closed_loop_of
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import roll_out
@@ -55,11 +55,12 @@ class Judged:
             domain: whose they are.
             environment: of the domain's others, in which they took place; its outcomes are beside those that there are.
         """
-        found = domain.judge(self.task.goal, rollout)
-        found |= {SUCCESS: found[SUCCESS] & ~rollout.failed}
+        outcomes = domain.judge(self.task.goal, rollout)
+        outcomes |= {SUCCESS: outcomes[SUCCESS] & ~rollout.failed}
         if environment:
-            return replace(self, outcomes={**self.outcomes, **{f"{name} ({environment})": one for name, one in found.items()}})
-        return replace(self, rollout=rollout, outcomes=found)
+            named = {f"{name} ({environment})": values for name, values in outcomes.items()}
+            return replace(self, outcomes={**self.outcomes, **named})
+        return replace(self, rollout=rollout, outcomes=outcomes)
 
     def compared(self, diversity: Mapping[str, float]) -> Self:
         """The same with novelty and coverage."""
@@ -114,8 +115,12 @@ def standard_error(values: Sequence[float]) -> float:
 
 
 def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environment: str = "") -> list[Judged]:
-    """The same tasks with their episodes, which run all side by side; in the domain's own environment or one of its others."""
-    assert domain.closed_loop is not None
+    """The same tasks with their episodes, which run all side by side; in the domain's own environment or one of its others.
+
+    Raises:
+        UserError: for a domain without an environment.
+    """
+    loop = closed_loop_of(domain).inside(environment)
     starts = join([one.starts for one in judged if one.starts is not None])
-    parts = roll_out(domain.closed_loop.inside(environment), starts, policy).split([len(one.states) for one in judged])
+    parts = roll_out(loop, starts, policy).split([len(one.states) for one in judged])
     return [one.executed(part, domain, environment) for one, part in zip(judged, parts, strict=True)]

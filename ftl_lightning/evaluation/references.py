@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.demonstrations.features import InitialStates, expect_starts
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
@@ -34,11 +34,12 @@ def references(
         environments: of the domain's others, in which the method's was executed besides its own.
     """
     loop = None if all(one.rollout is None for one in judged) else domain.closed_loop
-    found = {name: [_planned(name, one, domain, loop, seed, environments) for one in judged] for name in domain.references}
-    for name in loop.policies if loop else ():
-        acted = (_acted(name, one, domain, demonstrated, seed, environments) for one in judged)
-        found[name] = [one for one in acted if one is not None]
-    return found
+    lines = {name: [_planned(name, one, domain, loop, seed, environments) for one in judged] for name in domain.references}
+    if loop is not None:
+        for name in loop.policies:
+            acted = (_acted(name, one, domain, loop, demonstrated, seed, environments) for one in judged)
+            lines[name] = [one for one in acted if one is not None]
+    return lines
 
 
 def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
@@ -49,36 +50,35 @@ def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, se
     plans = _KNOWN[key]
     if (expected := (len(one.states), domain.plans.horizon, one.states.shape[2])) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")
-    own = Judged.of(one.task, plans, one.starts, domain)
+    planned = Judged.of(one.task, plans, one.starts, domain)
     if loop is None:
-        return own
-    assert one.starts is not None
+        return planned
+    starts = expect_starts(one.starts)
     for place in ("", *environments):
         if (*key, "executed", place) not in _KNOWN:
             follower = PlanFollower(fixed_plans(plans), loop.act, loop.steps)
-            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), one.starts, follower)
-        own = own.executed(_KNOWN[*key, "executed", place], domain, place)
-    return own
+            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), starts, follower)
+        planned = planned.executed(_KNOWN[*key, "executed", place], domain, place)
+    return planned
 
 
 def _acted(
     name: str,
     one: Judged,
     domain: Domain,
+    loop: ClosedLoop,
     demonstrated: Callable[[str], Demonstrations | None],
     seed: int,
     environments: Sequence[str],
 ) -> Judged | None:
     """A policy that acts as it goes; ``None`` where it would take too long."""
-    loop = domain.closed_loop
-    assert loop is not None
-    assert one.starts is not None
+    starts = expect_starts(one.starts)
     known = demonstrations_of(one.task, demonstrated)
     for place in ("", *environments):
-        key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.starts), seed, place)
+        key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(starts), seed, place)
         if key not in _KNOWN:
-            policy = loop.policies[name](one.task.goal, one.starts, known, seed)
-            _KNOWN[key] = policy and roll_out(loop.inside(place), one.starts, policy)
+            policy = loop.policies[name](one.task.goal, starts, known, seed)
+            _KNOWN[key] = policy and roll_out(loop.inside(place), starts, policy)
         rollout: Rollout | None = _KNOWN[key]
         if rollout is None:
             return None

@@ -5,6 +5,7 @@ task by task, into a table, so that the curves of the loss are not lost among ch
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from numpy.typing import NDArray
 from tensorboard.compat.proto.summary_pb2 import Summary
-from torch.utils.tensorboard.summary import hparams
-from torch.utils.tensorboard.writer import SummaryWriter
+from torch.utils.tensorboard.summary import hparams, scalar
+from torch.utils.tensorboard.writer import FileWriter
 
 from ftl_lightning.evaluation.animation import captioned, gif
 from ftl_lightning.evaluation.judged import LOST, WON
@@ -32,11 +33,11 @@ def setting_means(values: Mapping[tuple[str, str], Mapping[str, float]]) -> dict
     Args:
         values: by setting and task, each by metric.
     """
-    found: dict[str, list[float]] = {}
-    for (setting, _), own in values.items():
-        for metric, value in own.items():
-            found.setdefault(f"{metric}/{setting}", []).append(value)
-    return {name: sum(own) / len(own) for name, own in found.items()}
+    by_name: dict[str, list[float]] = {}
+    for (setting, _), by_metric in values.items():
+        for metric, value in by_metric.items():
+            by_name.setdefault(f"{metric}/{setting}", []).append(value)
+    return {name: sum(each) / len(each) for name, each in by_name.items()}
 
 
 @rank_zero_only
@@ -81,12 +82,11 @@ def log_hparams(logger: TensorBoardLogger, configuration: Mapping[str, Any], met
     for earlier in folder.glob("events.out.tfevents.*"):
         earlier.unlink()
     _, start, end = hparams(plain_values, dict(metrics))
-    with SummaryWriter(str(folder)) as writer:
-        assert writer.file_writer is not None
+    with closing(FileWriter(str(folder))) as writer:
         for summary in (start, end):
-            writer.file_writer.add_summary(summary)
+            writer.add_summary(summary)
         for name, value in metrics.items():
-            writer.add_scalar(name, value, step)
+            writer.add_summary(scalar(name, value), step)
 
 
 def log_projector(logger: TensorBoardLogger, embeddings: Mapping[str, torch.Tensor], step: int) -> None:

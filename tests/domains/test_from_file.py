@@ -1,6 +1,7 @@
 """A file of demonstrations with texts is a domain."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule, PretrainingModule
 from ftl_lightning.learning.generative_model import GenerativeModel
@@ -320,7 +322,9 @@ def test_the_training_concepts_are_learned(fitted: Path) -> None:
 
             return Composition(model.concept(task.goal)[None], torch.ones(1))  # type: ignore[attr-defined]
 
-    judged = Evaluator(samples=8, sampler="ddim", steps=10).evaluate(Known())  # type: ignore[arg-type]
+    known: Any = Known()
+    tasks = tasks_of(model.domain, ["training"], ())
+    judged = generate(known, tasks, Generation(8, "ddim", 10))
     assert [one.task.goal for one in judged] == ["go right", "go up"]
     assert all(one.values["nearest_demonstration"] > 0.8 for one in judged)
 

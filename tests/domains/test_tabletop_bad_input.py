@@ -22,7 +22,7 @@ from ftl_lightning.domains.tabletop.source import NAME, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, TRAINING_CONCEPTS
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation import evaluator
+from ftl_lightning.evaluation import generation
 from ftl_lightning.evaluation.closed_loop import fixed_plans, reset, roll_out
 from ftl_lightning.evaluation.judged import Judged
 
@@ -268,10 +268,11 @@ def test_an_evaluation_goes_on_whose_first_episode_breaks(monkeypatch: pytest.Mo
     assert LOOP is not None
     domain = replace(DOMAIN, closed_loop=replace(LOOP, environment=fragile("reset", RuntimeError("broke")), steps=2))
     plans = still({}, [0], 0)[:, None].repeat(3, 32, 1)
-    monkeypatch.setattr(evaluator, "sampled_plans", lambda *_: fixed_plans(plans.repeat(2, 1, 1)))
+    monkeypatch.setattr(generation, "sampled_plans", lambda *_: fixed_plans(plans.repeat(2, 1, 1)))
     task = EvaluationTask("new concept", PUSH, (PUSH,))
     judged: Any = [Judged(task, plans, {}, starts()), Judged(task, plans, {}, starts())]
-    broken, whole = evaluator.Evaluator()._execute(judged, {task: None}, SimpleNamespace(view=None), domain)
+    module: Any = SimpleNamespace(model=SimpleNamespace(view=None), domain=domain, composition=lambda task: task)
+    broken, whole = generation.execute(module, judged, generation.Generation())
     assert broken.followed is None
     assert broken.rollout.failed.tolist() == [True, False, False]
     assert broken.values["closed loop success"] == 0

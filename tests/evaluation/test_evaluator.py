@@ -17,7 +17,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluable import demonstrations_of
-from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import Row, append_rows, labels, read_rows
 from ftl_lightning.evaluation.rows import configuration
@@ -105,12 +105,14 @@ def test_standard_error_over_tasks() -> None:
 
 
 def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: Path) -> None:
-    evaluator = Evaluator(suites=["training", "paper"], samples=3, sampler="ddim", steps=4)
-    first, again = (evaluator.evaluate(Trained(GenerativeModel.load(tiny))) for _ in range(2))
+    module = Trained(GenerativeModel.load(tiny))
+    tasks = tasks_of(module.domain, ["training", "paper"], ())
+    assert {task.learned for task in tasks} > {()}
+    first, again = (generate(module, tasks, Generation(3, "ddim", 4)) for _ in range(2))
     assert len(first) == 12
     assert all(torch.equal(one.states, other.states) for one, other in zip(first, again, strict=True))
     with pytest.raises(UserError, match="suites: expected some of training, paper"):
-        Evaluator(suites=["exam"]).evaluate(Trained(GenerativeModel.load(tiny)))
+        tasks_of(module.domain, ["exam"], ())
 
 
 def test_what_a_task_is_learned_from_is_that_of_all_its_concepts() -> None:

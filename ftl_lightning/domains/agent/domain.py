@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates, Observed
+from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts
 from ftl_lightning.domains.agent import environment, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
 from ftl_lightning.domains.agent.environment import LOOKAHEAD, MAX_STEPS, AgentEnvironment
@@ -121,21 +121,19 @@ def _straight(world: Tensor, chosen: Tensor) -> Tensor:
 
 
 def _nearest(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    assert starts is not None
-    world = starts.observed[OBSERVED]
+    world = expect_starts(starts).observed[OBSERVED]
     away = torch.linalg.vector_norm(object_positions(world) - world[:, None, :3], dim=-1)
     return _straight(world, away.argmin(dim=1))
 
 
 def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    assert starts is not None
+    world = expect_starts(starts).observed[OBSERVED]
     draw = torch.Generator().manual_seed(seed)
-    return _straight(starts.observed[OBSERVED], torch.randint(2, (len(starts),), generator=draw))
+    return _straight(world, torch.randint(2, (len(world),), generator=draw))
 
 
 def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    assert starts is not None
-    env, world = AgentEnvironment(), starts.observed[OBSERVED]
+    env, world = AgentEnvironment(), expect_starts(starts).observed[OBSERVED]
     drives = [
         torch.from_numpy(expert.demonstrate(env, state, chosen))
         for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)

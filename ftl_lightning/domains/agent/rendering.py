@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.demonstrations.features import InitialStates, expect_starts
 from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
 from ftl_lightning.domains.rollout import Rollout
@@ -30,14 +30,13 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         title: above the grid.
         starts: with ``world (scene, 52)``.
     """
-    assert starts is not None
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(2.6 * columns, 1.3 * rows + 0.4), layout="constrained")
     figure.suptitle(figure_text(title), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     grid = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, plan, initial, frame in zip(grid, states, starts.observed[OBSERVED], frames, strict=False):
+    for axes, plan, initial, frame in zip(grid, states, expect_starts(starts).observed[OBSERVED], frames, strict=False):
         _scene(axes, plan, initial, frame)
     for axes in figure.axes[len(states) :]:
         axes.set_axis_off()

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, Observed, take
+from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts, take
 from ftl_lightning.domains.driving.environment import NAMES, SCENARIO, TRAFFIC
 from ftl_lightning.domains.driving.scenarios import VEHICLES, decision_seconds, make
 from ftl_lightning.domains.rollout import Rollout
@@ -92,7 +92,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         title: above the grid.
         starts: of the scenes.
     """
-    assert starts is not None
+    starts = expect_starts(starts)
     shown = states[:MAX_PANELS].numpy()
     windows = [_window(plan[:, 1:3]) for plan in shown]
     sizes = np.array([high - low for low, high in windows]).max(axis=0)

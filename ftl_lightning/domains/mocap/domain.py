@@ -4,7 +4,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.demonstrations.features import InitialStates, expect_starts
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, deferred
 from ftl_lightning.domains.mocap.actions import TESTED, action, judged
 from ftl_lightning.domains.mocap.judge import identity
@@ -20,8 +20,7 @@ _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.do
 
 def _frozen(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
     """Plans in which nobody moves."""
-    assert starts is not None
-    return starts.observed[POSE][:, None].repeat(1, HORIZON, 1)
+    return expect_starts(starts).observed[POSE][:, None].repeat(1, HORIZON, 1)
 
 
 DOMAIN = Domain(

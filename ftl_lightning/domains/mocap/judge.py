@@ -8,7 +8,7 @@ None has seen generated motion, or people who demonstrate new concepts. ``benchm
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -114,8 +114,7 @@ class Recogniser(nn.Module):
 
     def features(self, states: Tensor) -> Tensor:
         """What the first network decides by: ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
-        network = self.networks[0]
-        assert isinstance(network, Network)
+        network = cast(Network, self.networks[0])
         return self._scaled("embedding", network.embedding(self.courses(states)))
 
     def votes(self, states: Tensor) -> dict[str, Tensor]:
@@ -165,9 +164,7 @@ class Judge(nn.Module):
 
     def part(self, name: str) -> Recogniser:
         """That of :data:`PARTS`."""
-        found = self.parts[name]
-        assert isinstance(found, Recogniser)
-        return found
+        return cast(Recogniser, self.parts[name])
 
     @torch.no_grad()
     def forward(self, states: Tensor) -> Tensor:

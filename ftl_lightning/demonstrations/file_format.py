@@ -1,0 +1,101 @@
+"""The file of demonstrations: what stands in it, in all forms that are still read."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.demonstrations.file_keys import KIND, OBSERVED, TEXTS
+from ftl_lightning.demonstrations.images import compressed, decompressed_images
+from ftl_lightning.demonstrations.npz import read_npz
+from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.schema import expect_type
+from ftl_lightning.tensor_file import load_tensors, save_tensors
+
+VERSION = 3
+"""Of the form of a file with images: they are compressed (zlib), 1-D uint8 under their keys, with their shapes by key in the header
+as ``compressed``. Forms 1 and 2 still load."""
+PLAIN = 2
+"""The form of a file without images. Older files of this form hold images that are not compressed; form 1 had ``initial_states`` in
+place of observed features and scenes."""
+INITIAL = "initial_state"
+"""The observed feature that the initial states of form 1 become."""
+
+
+class Contents(TypedDict):
+    """What a file says, by the attributes of :class:`~ftl_lightning.demonstrations.container.Demonstrations`.
+
+    Types are as there; whether shapes and values fit each other is not yet known.
+    """
+
+    states: Tensor
+    lengths: Tensor
+    domain: str
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    concepts: tuple[str, ...]
+    observed: Observed
+    per_step: tuple[str, ...]
+    scenes: Tensor | None
+    provenance: Mapping[str, Any]
+
+
+def write(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write one safetensors file with a JSON header, whole or not at all.
+
+    Args:
+        path: the file.
+        tensors: by key; what is of uint8 is images and is compressed, see :data:`VERSION`.
+        header: what else there is to say, by key.
+
+    Raises:
+        UserError: where the file cannot be written.
+    """
+    images = {key: values for key, values in tensors.items() if values.dtype == torch.uint8}
+    shapes = {"compressed": {key: list(values.shape) for key, values in images.items()}} if images else {}
+    stored = {**tensors, **{key: compressed(values) for key, values in images.items()}}
+    save_tensors(path, KIND, stored, {**header, **shapes}, VERSION if images else PLAIN)
+
+
+def read(path: Path) -> Contents:
+    """Read what :func:`write` wrote, in any of its forms, or an ``.npz`` file without objects.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, of another kind, or says something of another type.
+    """
+    tensors, header = read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, PLAIN, VERSION))
+    with about(path):
+        if "states" not in tensors:
+            told = short(", ".join(tensors)) or "nothing"
+            raise UserError(f"key 'states': expected (demo, time, state), found only {told}")
+        states = tensors["states"]
+        demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
+        texts = {key: _texts(key, header[key]) for key in TEXTS if key in header}
+        per_step, scenes = texts.get("per_step", ()), tensors.get("scenes")
+        if header.get("format") == VERSION and demos:
+            tensors |= decompressed_images(tensors, header.get("compressed"), per_step)
+        observed = {name.removeprefix(OBSERVED): values for name, values in tensors.items() if name.startswith(OBSERVED)}
+        if (initial := tensors.get("initial_states")) is not None:  # form 1
+            observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()
+            scenes = initial[:, 0] if initial.dim() == 3 else initial
+        return {
+            "states": states,
+            "lengths": tensors.get("lengths", torch.full((demos,), time)),
+            "domain": expect_type(header.get("domain", ""), str, "domain"),
+            "state_names": texts.get("state_names", tuple(map(str, range(columns)))),
+            "state_units": texts.get("state_units", ("",) * columns),
+            "concepts": texts.get("concepts", ("",) * demos),
+            "observed": observed,
+            "per_step": per_step,
+            "scenes": scenes,
+            "provenance": expect_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
+        }
+
+
+def _texts(key: str, listed: object) -> tuple[str, ...]:
+    if not isinstance(listed, list) or not all(isinstance(text, str) for text in listed):
+        raise UserError(f"key {key!r}: expected a list of texts, found {shown(listed)}")
+    return tuple(listed)
