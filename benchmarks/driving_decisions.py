@@ -31,12 +31,12 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN, Expert
-from ftl_lightning.domains.driving.environment import MAX_STEPS, STATE, TRAFFIC, DrivingEnvironment
-from ftl_lightning.domains.driving.foresight import STEP, VETOES, Beliefs, meaning
+from ftl_lightning.domains.driving.environment import DrivingEnvironment
+from ftl_lightning.domains.driving.foresight import VETOES, Beliefs, meaning
 from ftl_lightning.domains.driving.motion import speed
 from ftl_lightning.domains.driving.policies import POLICIES
-from ftl_lightning.domains.driving.scenarios import decision_seconds
 from ftl_lightning.domains.driving.simulation import advance
+from ftl_lightning.domains.driving.traffic import MAX_STEPS, STATE, STEP, TRAFFIC, decision_seconds
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.generative_model import GenerativeModel

@@ -13,7 +13,8 @@ import torch
 
 from ftl_lightning import FewShot
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.foresight import BELIEF, VETOES
+from ftl_lightning.domains.driving.foresight import VETOES
+from ftl_lightning.domains.driving.traffic import BELIEF
 from ftl_lightning.seeding import DEMONSTRATION_SEED
 from ftl_lightning.tensor_file import write_text
 

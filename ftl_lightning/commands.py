@@ -216,6 +216,8 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
         raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
     if options.execute and domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
+    if options.execute and domain.closed_loop is not None:
+        domain.closed_loop.expect()
     if options.animation and not options.execute and domain.show.film is None:
         raise UserError(f"animation: expected --execute true (plans of {domain.name} are not filmed), found {options.animation!r}")
     if domain.observed and not (options.initial or _start_task(options, domain)):

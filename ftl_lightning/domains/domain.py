@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
-import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.representation import Shown, counted
 
 if TYPE_CHECKING:
+    import gymnasium
     from matplotlib.figure import Figure
 
     from ftl_lightning.domains.wireframe import Wireframe
@@ -213,9 +213,11 @@ class ClosedLoop:
             plans are also executed.
         policies: reference lines that act step by step, by name: ``(goal, initial states, demonstrations that the concept was
             learned from or None, seed) -> policy``, or ``None`` where it would take too long.
+        expect: raises a :class:`~ftl_lightning.errors.UserError` where a package that the environment needs is missing; asked
+            before the work.
     """
 
-    environment: Callable[[], gymnasium.Env[Any, Any]]
+    environment: "Callable[[], gymnasium.Env[Any, Any]]"
     act: Callable[[Tensor, int, Observed], Tensor]
     steps: int
     judge: Callable[[str, Rollout], dict[str, Tensor]]
@@ -223,8 +225,9 @@ class ClosedLoop:
     keeps: tuple[str, ...] = ()
     less_is_better: tuple[str, ...] = ()
     identity: str = ""
-    others: Mapping[str, Callable[[], gymnasium.Env[Any, Any]]] = field(default_factory=dict)
+    others: "Mapping[str, Callable[[], gymnasium.Env[Any, Any]]]" = field(default_factory=dict)
     policies: Mapping[str, Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
+    expect: Callable[[], None] = lambda: None
 
     def inside(self, name: str) -> Self:
         """The same in another environment; in its own for the empty name."""

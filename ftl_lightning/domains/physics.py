@@ -3,12 +3,12 @@
 import functools
 import importlib
 import os
-from types import ModuleType
 from typing import Any
 
 
-def _import_pybullet() -> ModuleType:
-    """The simulator, without the line that importing it writes to standard error."""
+@functools.cache
+def pybullet() -> Any:
+    """The simulator's module, imported when it is asked for first, without the line that this writes to standard error."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
@@ -19,9 +19,6 @@ def _import_pybullet() -> ModuleType:
         os.close(nowhere)
 
 
-pybullet: Any = _import_pybullet()
-
-
 class Simulator:
     """pybullet's functions, each for one simulator of its own without a display.
 
@@ -29,9 +26,9 @@ class Simulator:
     """
 
     def __init__(self) -> None:
-        self._id = pybullet.connect(pybullet.DIRECT)
+        self._id = pybullet().connect(pybullet().DIRECT)
         if self._id < 0:
-            raise pybullet.error("no connection")
+            raise pybullet().error("no connection")
 
     def __getattr__(self, name: str) -> Any:
-        return functools.partial(getattr(pybullet, name), physicsClientId=self._id)
+        return functools.partial(getattr(pybullet(), name), physicsClientId=self._id)

@@ -2,9 +2,8 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,6 +16,9 @@ from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.progress import Advance, bar
+
+if TYPE_CHECKING:
+    import gymnasium
 
 _LOG = logging.getLogger(__name__)
 
@@ -65,7 +67,7 @@ def reset(loop: ClosedLoop, scenes: Tensor) -> InitialStates:
     return InitialStates({name: torch.stack([torch.as_tensor(one[name]) for one in seen]) for name in seen[0]}, scenes)
 
 
-def _begun(environment: gymnasium.Env[Any, Any], row: int, scene: Tensor) -> Any:
+def _begun(environment: "gymnasium.Env[Any, Any]", row: int, scene: Tensor) -> Any:
     """What is observed where an episode starts."""
     try:
         return environment.reset(options={"scene": scene.numpy()})[0]

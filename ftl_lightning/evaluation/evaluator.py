@@ -104,6 +104,8 @@ class Evaluator(pl.Callback):
         if total is not None and self.generation.steps > total:
             raise UserError(f"evaluation.steps: expected 1 to {total} (the model's T), found {self.generation.steps}")
         loop = module.domain.closed_loop
+        if self.closed_loop and loop is not None:
+            loop.expect()
         others = () if loop is None else tuple(loop.others)
         if unknown := [name for name in self.generation.environments if name not in others]:
             told = f"one of {', '.join(others)}" if others else f"none, as {module.domain.name} has no other"

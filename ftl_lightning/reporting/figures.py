@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
-from sklearn.manifold import TSNE
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.escape import figure_text
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import REFERENCE, latest
+from ftl_lightning.extras import expect_extra
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
 from ftl_lightning.reporting.curves import AXES, points
@@ -220,7 +220,13 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
         model: whose concept space it is.
         concepts: learned with it.
         seed: of the map.
+
+    Raises:
+        UserError: without scikit-learn.
     """
+    expect_extra("notebooks", "concept_map")
+    from sklearn.manifold import TSNE
+
     training = model.config.training_concepts
     learned = [
         (f"{concept.origin.name} [{part.replace('component ', '')}]", own)

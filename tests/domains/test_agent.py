@@ -10,7 +10,8 @@ from torch import Tensor
 from ftl_lightning.domains.agent import expert
 from ftl_lightning.domains.agent.bodies import bowl, cone
 from ftl_lightning.domains.agent.domain import DOMAIN, act, initial_states
-from ftl_lightning.domains.agent.environment import MAX_FORCE, MAX_STEPS, STEP, AgentEnvironment
+from ftl_lightning.domains.agent.dynamics import MAX_FORCE, MAX_STEPS, STEP
+from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.scenes import (
     AGENT_CLEARANCE,

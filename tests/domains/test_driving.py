@@ -8,12 +8,12 @@ import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
 from ftl_lightning.domains.driving import expert, generation
-from ftl_lightning.domains.driving.environment import OBSERVED, SCENARIO, SCENE, TRAFFIC, DrivingEnvironment, origin, scene
-from ftl_lightning.domains.driving.foresight import STEP
+from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.simulation import advance, restore, save
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.driving.traffic import OBSERVED, SCENARIO, SCENE, STEP, TRAFFIC, origin, scene
 from ftl_lightning.errors import UserError
 
 PAPER = ("highway", "exit", "merge", "intersection", "roundabout")

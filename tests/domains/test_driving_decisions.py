@@ -12,9 +12,8 @@ from ftl_lightning import FewShot
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.environment import STATE, TRAFFIC
-from ftl_lightning.domains.driving.scenarios import decision_seconds
 from ftl_lightning.domains.driving.shipped import training_set
+from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, decision_seconds
 from ftl_lightning.evaluation.closed_loop import PlanFollower
 from ftl_lightning.seeding import EVALUATION_SEED
 

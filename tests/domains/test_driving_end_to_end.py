@@ -12,9 +12,9 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.domains.driving.environment import SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.shipped import training_set
+from ftl_lightning.domains.driving.traffic import SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.evaluation.closed_loop import planner
 from ftl_lightning.learning.generative_model import GenerativeModel

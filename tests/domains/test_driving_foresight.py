@@ -7,9 +7,10 @@ import pytest
 
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.expert import BLIND, plan_blind
-from ftl_lightning.domains.driving.foresight import BELIEF, FRAMES, SIMULATION, STEP, VETOES, Beliefs, Worlds
+from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds
 from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make
 from ftl_lightning.domains.driving.simulation import save
+from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 
 def start(name: str, seed: int) -> Any:

@@ -2,9 +2,9 @@ import torch
 from matplotlib.figure import Figure
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.driving.environment import TRAFFIC
 from ftl_lightning.domains.driving.rendering import film, render
 from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.driving.traffic import TRAFFIC
 from ftl_lightning.domains.rollout import Rollout
 
 

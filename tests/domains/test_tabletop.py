@@ -15,7 +15,8 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tabletop import DOMAIN, experts, source
 from ftl_lightning.domains.tabletop.domain import act
-from ftl_lightning.domains.tabletop.environment import ACTION, IMAGE, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+from ftl_lightning.domains.tabletop.interface import ACTION, IMAGE, POSE
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     BOWL,

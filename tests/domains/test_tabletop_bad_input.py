@@ -15,10 +15,10 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.data import InversionData, PretrainingData
 from ftl_lightning.domains.tabletop import DOMAIN, policies, source
-from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, OPEN, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode
+from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, OPEN, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import BOWL, CIRCLE, HAND, TRIANGLE, scene_of
-from ftl_lightning.domains.tabletop.source import NAME, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, TRAINING_CONCEPTS
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError

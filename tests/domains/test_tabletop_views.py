@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ftl_lightning.demonstrations.features import take
-from ftl_lightning.domains.tabletop.environment import IMAGE, POSE
+from ftl_lightning.domains.tabletop.interface import IMAGE, POSE
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, TRIANGLE, scene_of
 from ftl_lightning.domains.tabletop.source import initial_states
 from ftl_lightning.domains.tabletop.views import HAND, MOVED, ORIGIN, SHIFT, VIEWS, moved

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -9,9 +10,9 @@ from torch import Tensor
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts
-from ftl_lightning.domains.agent import environment, expert
+from ftl_lightning.domains.agent import dynamics, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
-from ftl_lightning.domains.agent.environment import LOOKAHEAD, MAX_STEPS, AgentEnvironment
+from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, MAX_STEPS, expect_simulator
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.published import PUBLISHED
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
@@ -22,6 +23,9 @@ from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain,
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import VALIDATION_SEED
+
+if TYPE_CHECKING:
+    from ftl_lightning.domains.agent.environment import AgentEnvironment
 
 NAME = "agent"
 HORIZON = 128
@@ -34,7 +38,7 @@ STATE_UNITS = ("m",) * 3 + ("1",) * 4 + ("m/s",) * 3 + ("rad/s",) * 3
 _SETTINGS = {
     name: getattr(module, name)
     for module, names in (
-        (environment, ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD", "MARGIN")),
+        (dynamics, ("STEP", "SUBSTEPS", "DRAG", "MASS", "MAX_FORCE", "RADIUS", "LOOKAHEAD", "MARGIN")),
         (scene_settings, ("AGENT_START", "OBJECT_X", "OBJECT_Z", "AGENT_CLEARANCE", "OBJECT_CLEARANCE", "COLOURS", "SHAPES")),
         (expert, ("LENGTH", "SPEED", "KEEP_CLEAR", "STOP", "AT_REST")),
     )
@@ -95,6 +99,18 @@ def initial_states(drawn: Tensor) -> InitialStates:
     return InitialStates({OBSERVED: drawn}, drawn)
 
 
+def environment() -> "AgentEnvironment":
+    """The domain's environment.
+
+    Raises:
+        UserError: without the simulator, or if it does not start.
+    """
+    expect_simulator()
+    from ftl_lightning.domains.agent.environment import AgentEnvironment
+
+    return AgentEnvironment()
+
+
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
     """Forces ``(episode, 2)``: the way to where the plan is :data:`LOOKAHEAD` steps ahead (paper, closed loop).
 
@@ -114,7 +130,7 @@ def _straight(world: Tensor, chosen: Tensor) -> Tensor:
     start = world[:, None, :3]
     way = (goal - world[:, :3])[:, None]
     length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * environment.STEP * expert.SPEED, length)
+    driven = torch.minimum(torch.arange(HORIZON)[None, :, None] * dynamics.STEP * expert.SPEED, length)
     plans = world[:, None, :STATE].repeat(1, HORIZON, 1)
     plans[..., :3] = start + way * driven / length
     return plans
@@ -133,7 +149,7 @@ def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> T
 
 
 def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    env, world = AgentEnvironment(), expect_starts(starts).observed[OBSERVED]
+    env, world = environment(), expect_starts(starts).observed[OBSERVED]
     drives = [
         torch.from_numpy(expert.demonstrate(env, state, chosen))
         for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)
@@ -174,7 +190,12 @@ DOMAIN = Domain(
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
     views=VIEWS,
     closed_loop=ClosedLoop(
-        environment=AgentEnvironment, act=act, steps=MAX_STEPS, judge=reached, film=deferred(f"{RENDERING}:film")
+        environment=environment,
+        act=act,
+        steps=MAX_STEPS,
+        judge=reached,
+        film=deferred(f"{RENDERING}:film"),
+        expect=expect_simulator,
     ),
     distance=distance,
     paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),

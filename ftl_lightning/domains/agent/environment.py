@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.agent.bodies import Mesh, bowl, cone
+from ftl_lightning.domains.agent.dynamics import DRAG, MARGIN, MASS, MAX_FORCE, MAX_STEPS, RADIUS, STEP, SUBSTEPS
 from ftl_lightning.domains.agent.scenes import (
     AGENT_START,
     COLOURS,
@@ -25,26 +26,9 @@ from ftl_lightning.domains.agent.scenes import (
 from ftl_lightning.domains.physics import Simulator, pybullet
 from ftl_lightning.errors import UserError
 
-STEP = 0.05
-"""Seconds between two states."""
-SUBSTEPS = 6
-MAX_STEPS = 128
-LOOKAHEAD = 5
-"""An action is the way to where a plan is so many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
-DRAG = 16.0
-"""The rate per second at which the agent's speed decays: so fast that pulling towards a point does not overshoot it."""
-MASS = LOOKAHEAD * STEP / DRAG
-"""kg. A plan that moves steadily at speed v is LOOKAHEAD * STEP * v ahead, and drag takes MASS * DRAG * v: with this mass, that
-way in metres, applied as a force in newtons, keeps the agent's speed at the plan's."""
-MAX_FORCE = 0.2
-"""Newtons; a longer force is shortened."""
-RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
-"""Of the bodies' footprints, metres; half the edge of a cube."""
 BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]
 """Half the size of the floor that is drawn."""
-MARGIN = 0.001
-"""Metres. The simulator keeps a cone so far above what it stands on; the ground lies so much lower, else the agent would hop."""
 IMAGE = (200, 320)
 """Height and width of a rendered picture."""
 
@@ -75,7 +59,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     def __init__(self) -> None:
         try:
             self.client = Simulator()
-        except pybullet.error as error:
+        except pybullet().error as error:
             raise UserError(f"agent: the physics simulator does not start ({error}); close some of its instances") from error
         self._initial = np.zeros(INITIAL, dtype=np.float32)
         self._agent = -1
@@ -107,10 +91,10 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         client.resetSimulation()
         client.setGravity(0, -9.81, 0)
         client.setPhysicsEngineParameter(fixedTimeStep=STEP / SUBSTEPS, deterministicOverlappingPairs=1)
-        plane = client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[0, 1, 0])
+        plane = client.createCollisionShape(pybullet().GEOM_PLANE, planeNormal=[0, 1, 0])
         ground = client.createMultiBody(0, plane, basePosition=[0, -MARGIN, 0])
         client.changeDynamics(ground, -1, lateralFriction=0)
-        floor = client.createVisualShape(pybullet.GEOM_BOX, halfExtents=FLOOR, rgbaColor=[0.93, 0.93, 0.93, 1])
+        floor = client.createVisualShape(pybullet().GEOM_BOX, halfExtents=FLOOR, rgbaColor=[0.93, 0.93, 0.93, 1])
         client.createMultiBody(0, -1, floor, [AGENT_START[0], -FLOOR[1], AGENT_START[2]])  # planes are not drawn
         self._agent = self._body(("yellow", "cone"), self._initial[:3], MASS)
         client.changeDynamics(
@@ -119,7 +103,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             lateralFriction=0,
             linearDamping=0,  # drag is a force in `step`: the simulator's own cannot be as strong
             localInertiaDiagonal=[0, 0, 0],  # a force through the centre of a body without inertia cannot turn it
-            activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            activationState=pybullet().ACTIVATION_STATE_DISABLE_SLEEPING,
         )
         client.resetBasePositionAndOrientation(self._agent, self._initial[:3].tolist(), self._initial[3:7].tolist())
         client.resetBaseVelocity(self._agent, self._initial[7:10].tolist(), self._initial[10:13].tolist())
@@ -131,17 +115,17 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         client, (colour, shape) = self.client, look
         rgba = [*(value / 255 for value in COLOURS[colour]), 1.0]
         if shape == "sphere":
-            form: dict[str, Any] = {"shapeType": pybullet.GEOM_SPHERE, "radius": RADIUS[shape]}
+            form: dict[str, Any] = {"shapeType": pybullet().GEOM_SPHERE, "radius": RADIUS[shape]}
             seen = form
         elif shape == "cube":
-            form = {"shapeType": pybullet.GEOM_BOX, "halfExtents": [RADIUS[shape]] * 3}
+            form = {"shapeType": pybullet().GEOM_BOX, "halfExtents": [RADIUS[shape]] * 3}
             seen = form
         else:
             vertices, triangles = _MESHES[shape]
-            form = {"shapeType": pybullet.GEOM_MESH, "vertices": vertices}
+            form = {"shapeType": pybullet().GEOM_MESH, "vertices": vertices}
             if shape == "bowl":  # with its triangles it stays concave; without, pybullet takes the convex hull
-                form |= {"indices": triangles, "flags": pybullet.GEOM_FORCE_CONCAVE_TRIMESH}
-            seen = {"shapeType": pybullet.GEOM_MESH, "vertices": vertices, "indices": triangles}
+                form |= {"indices": triangles, "flags": pybullet().GEOM_FORCE_CONCAVE_TRIMESH}
+            seen = {"shapeType": pybullet().GEOM_MESH, "vertices": vertices, "indices": triangles}
         body: int = client.createMultiBody(
             baseMass=mass,
             baseCollisionShapeIndex=client.createCollisionShape(**form),
@@ -173,7 +157,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             velocity = self.client.getBaseVelocity(self._agent)[0]
             drag = MASS * DRAG
             net = [force[0] - drag * velocity[0], 0, force[1] - drag * velocity[2]]
-            self.client.applyExternalForce(self._agent, -1, net, here, pybullet.WORLD_FRAME)
+            self.client.applyExternalForce(self._agent, -1, net, here, pybullet().WORLD_FRAME)
             self.client.stepSimulation()
         self._steps += 1
         observation = self._observation()
@@ -188,7 +172,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         view = self.client.computeViewMatrix([0, 2.6, -6.2], [AGENT_START[0], 0, AGENT_START[2]], [0, 1, 0])
         lens = self.client.computeProjectionMatrixFOV(38, width / height, 0.1, 20)
         _, _, rgba, *_ = self.client.getCameraImage(
-            width, height, view, lens, lightDirection=[1, 4, -2], shadow=1, renderer=pybullet.ER_TINY_RENDERER
+            width, height, view, lens, lightDirection=[1, 4, -2], shadow=1, renderer=pybullet().ER_TINY_RENDERER
         )
         picture: NDArray[np.uint8] = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3]
         return picture[:, ::-1]  # with x right, y up and z forward our axes are left-handed, the simulator's are right-handed

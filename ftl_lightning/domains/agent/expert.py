@@ -2,14 +2,18 @@
 
 import itertools
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.agent.environment import LOOKAHEAD, STEP, AgentEnvironment
+from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, STEP, expect_simulator
 from ftl_lightning.domains.agent.scenes import INITIAL, OBSERVED, PLANE, object_positions, scenes, target
+
+if TYPE_CHECKING:
+    from ftl_lightning.domains.agent.environment import AgentEnvironment
 
 LENGTH = 150
 """States of a demonstration, padded with its last one (paper)."""
@@ -50,7 +54,7 @@ def along(corners: Plane, distance: float) -> Plane:
     return np.asarray(corners[-1])
 
 
-def demonstrate(environment: AgentEnvironment, initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
+def demonstrate(environment: "AgentEnvironment", initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
     """Observations ``(time, 52)`` of one drive, ``time`` at most :data:`LENGTH`.
 
     Args:
@@ -85,6 +89,9 @@ def demonstrations(task: str, count: int, seed: int, progress: Callable[[], None
         Observations ``(count, 150, 52)``, padded with the last one, and lengths ``(count,)``.
     """
     initial = scenes(task, count, seed)
+    expect_simulator()
+    from ftl_lightning.domains.agent.environment import AgentEnvironment
+
     observations = torch.empty(count, LENGTH, INITIAL)
     lengths = torch.empty(count, dtype=torch.int64)
     environment = AgentEnvironment()

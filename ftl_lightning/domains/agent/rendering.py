@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates, expect_starts
-from ftl_lightning.domains.agent.environment import AgentEnvironment
+from ftl_lightning.domains.agent.dynamics import expect_simulator
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.escape import figure_text
@@ -63,6 +63,9 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
 
     Plans are not drawn: the pictures are the simulator's.
     """
+    expect_simulator()
+    from ftl_lightning.domains.agent.environment import AgentEnvironment
+
     observations = rollout.observed[OBSERVED][0]
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     end = int(moving.nonzero().max()) + 2 if moving.any() else 1

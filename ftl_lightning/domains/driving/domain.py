@@ -3,6 +3,7 @@
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,18 +14,33 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split, deferred
 from ftl_lightning.domains.driving import policies
-from ftl_lightning.domains.driving.environment import FEATURES_SEEN, MAX_STEPS, DrivingEnvironment, initial_states, scene
-from ftl_lightning.domains.driving.expert import BLIND, SEARCH
-from ftl_lightning.domains.driving.foresight import BELIEF, SIMULATION, STEP
-from ftl_lightning.domains.driving.generation import HORIZON, NAME, STATE_NAMES, STATE_UNITS, demonstrations, episode_seed
 from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, make, observe, scenario
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.driving.traffic import (
+    BELIEF,
+    FEATURES_SEEN,
+    HORIZON,
+    MAX_STEPS,
+    NAME,
+    NAMES,
+    SIMULATION,
+    STATE_NAMES,
+    STATE_UNITS,
+    STEP,
+    episode_seed,
+    expect_scenario,
+    expect_simulator,
+    initial_states,
+    scene,
+)
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.rollout import Rollout
+
+if TYPE_CHECKING:
+    from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
 RENDERING = "ftl_lightning.domains.driving.rendering"
 
@@ -45,6 +61,12 @@ class Expert:
         return training_set(name, count, self.root)
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
+        expect_scenario(task)
+        expect_simulator()
+        from ftl_lightning.domains.driving.expert import BLIND, SEARCH
+        from ftl_lightning.domains.driving.generation import demonstrations
+        from ftl_lightning.domains.driving.scenarios import scenario
+
         settings = {
             "domain": NAME,
             "task": task,
@@ -59,6 +81,10 @@ class Expert:
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Scenes ``(count, 37)`` of new episodes."""
+        expect_scenario(task)
+        expect_simulator()
+        from ftl_lightning.domains.driving.scenarios import make, observe
+
         env = make(task)
         found = []
         for number in range(count):
@@ -67,6 +93,18 @@ class Expert:
             found.append(torch.from_numpy(scene(observe(env), task, start)))
         env.close()
         return initial_states(torch.stack(found))
+
+
+def environment(veto: str = BELIEF) -> "DrivingEnvironment":
+    """The domain's environment, with one of the planner's vetoes.
+
+    Raises:
+        UserError: without the simulator, or for another veto.
+    """
+    expect_simulator()
+    from ftl_lightning.domains.driving.environment import DrivingEnvironment
+
+    return DrivingEnvironment(veto)
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
@@ -103,7 +141,7 @@ DOMAIN = Domain(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
         descriptions=(*TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # others are driven by a concept of these
-        reads=SCENARIOS.__contains__,
+        reads=NAMES.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
     source=Expert,
@@ -112,15 +150,16 @@ DOMAIN = Domain(
     show=Show(deferred(f"{RENDERING}:render")),
     views=VIEWS,
     closed_loop=ClosedLoop(
-        environment=DrivingEnvironment,
+        environment=environment,
         identity=f"{BELIEF} veto",
-        others={f"{veto} veto": partial(DrivingEnvironment, veto) for veto in (SIMULATION, STEP)},
+        others={f"{veto} veto": partial(environment, veto) for veto in (SIMULATION, STEP)},
         act=lambda plans, step, observed: plans[:, min(step + 1, plans.shape[1] - 1)],
         steps=MAX_STEPS,
         judge=judge,
         film=deferred(f"{RENDERING}:film"),
         less_is_better=("crash",),
         policies=policies.POLICIES,
+        expect=expect_simulator,
     ),
     distance=distance,
     fresh=False,  # the expert takes some four seconds for an episode

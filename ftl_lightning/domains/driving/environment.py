@@ -8,33 +8,28 @@ import numpy as np
 import torch
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
-from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Feature, InitialStates
-from ftl_lightning.domains.driving.foresight import BELIEF, VETOES, Beliefs, Worlds
+from ftl_lightning.domains.driving.foresight import VETOES, Beliefs, Worlds
 from ftl_lightning.domains.driving.motion import drive
-from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, arrived, make, observe
+from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
 from ftl_lightning.domains.driving.simulation import advance
+from ftl_lightning.domains.driving.traffic import (
+    BELIEF,
+    FEATURES_SEEN,
+    MAX_STEPS,
+    NAMES,
+    OBSERVED,
+    SCENARIO,
+    SEEDS,
+    STATE,
+    TRAFFIC,
+    origin,
+    scene,
+)
 from ftl_lightning.errors import UserError
 
-NAMES = tuple(SCENARIOS)
-STATE = len(FEATURES)
-OBSERVED = VEHICLES * STATE
-SCENE = OBSERVED + 2
-"""Columns of a scene: what is observed at its start, the scenario's number, and the seed of the start."""
-TRAFFIC, SCENARIO = "traffic", "scenario"
-"""Names of the observed features: vehicles ``(35,)`` and the scenario's number ``(1,)``, by which views know the time between two
-decisions and which road is one of pretraining."""
-FEATURES_SEEN = {
-    TRAFFIC: Feature((OBSERVED,), entities=tuple(tuple(range(start, start + STATE)) for start in range(STATE, OBSERVED, STATE))),
-    SCENARIO: Feature((1,)),
-}
 DRIVE = 4
 """Numbers of a drive."""
-MAX_STEPS = 30
-SEEDS = 2**24
-"""Seeds are below, so that float32 holds them exactly."""
-
 
 Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
@@ -196,28 +191,3 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Close the simulation."""
         if self._name:
             self._env.close()
-
-
-def scene(seen: NDArray[np.float32], name: str, seed: int) -> NDArray[np.float32]:
-    """The 37 numbers of a start ``(..., 5, 7)`` of this scenario and seed."""
-    hidden = np.broadcast_to(np.array((NAMES.index(name), seed), dtype=np.float32), (*seen.shape[:-2], 2))
-    return np.concatenate((seen.reshape(*seen.shape[:-2], OBSERVED), hidden), axis=-1)
-
-
-def initial_states(scenes: Tensor) -> InitialStates:
-    """Scenes ``(scene, 37)`` and what is observed in them."""
-    return InitialStates({TRAFFIC: scenes[:, :OBSERVED], SCENARIO: scenes[:, OBSERVED : OBSERVED + 1]}, scenes)
-
-
-def origin(given: NDArray[np.float32]) -> tuple[str, int]:
-    """Scenario and seed of a scene.
-
-    Raises:
-        UserError: for another size, or numbers that are none of a scenario and seed.
-    """
-    if given.shape != (SCENE,) or not np.isfinite(given).all():
-        raise UserError(f"driving scene: expected {SCENE} finite numbers, found shape {given.shape}")
-    number, seed = given[OBSERVED:].tolist()
-    if number not in range(len(NAMES)) or not (0 <= seed < SEEDS and seed == int(seed)):
-        raise UserError(f"driving scene: expected a scenario from 0 to {len(NAMES) - 1} and a seed, found {number:g} and {seed:g}")
-    return NAMES[int(number)], int(seed)

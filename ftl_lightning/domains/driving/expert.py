@@ -11,9 +11,10 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.driving.foresight import BELIEF, FRAMES, VETOES, Beliefs, Worlds, meaning
+from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds, meaning
 from ftl_lightning.domains.driving.scenarios import arrived, make, observe
 from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
+from ftl_lightning.domains.driving.traffic import BELIEF
 
 
 @dataclass(frozen=True)

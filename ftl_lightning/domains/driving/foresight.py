@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.driving.scenarios import observe, scenario
 from ftl_lightning.domains.driving.simulation import Snapshot, advance, restore, save
+from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,6 @@ class Foresight:
     beliefs: int = 0
 
 
-BELIEF, SIMULATION, STEP = "belief", "simulation", "step"
 VETOES = {BELIEF: Foresight(3, 8), SIMULATION: Foresight(3), STEP: Foresight(1)}
 FRAMES = 5
 """Of an imagined world between two decisions."""

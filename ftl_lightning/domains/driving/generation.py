@@ -3,7 +3,6 @@
 import logging
 import multiprocessing
 import signal
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,28 +11,33 @@ import torch
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving import expert
-from ftl_lightning.domains.driving.environment import FEATURES_SEEN, OBSERVED, SCENARIO, SEEDS, STATE, TRAFFIC, scene
 from ftl_lightning.domains.driving.expert import SEARCH
-from ftl_lightning.domains.driving.foresight import BELIEF, VETOES
-from ftl_lightning.domains.driving.scenarios import FEATURES, SCENARIOS, VEHICLES, decision_seconds
+from ftl_lightning.domains.driving.foresight import VETOES
+from ftl_lightning.domains.driving.scenarios import SCENARIOS
+from ftl_lightning.domains.driving.traffic import (
+    BELIEF,
+    FEATURES_SEEN,
+    HORIZON,
+    NAME,
+    OBSERVED,
+    SCENARIO,
+    STATE,
+    STATE_NAMES,
+    STATE_UNITS,
+    TRAFFIC,
+    VEHICLES,
+    decision_seconds,
+    episode_seed,
+    scene,
+)
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
 
 _LOG = logging.getLogger(__name__)
 
-NAME = "driving"
-STATE_NAMES = tuple(f"ego.{feature}" for feature in FEATURES)
-STATE_UNITS = ("1", "m", "m", "m/s", "m/s", "1", "1")
 KIND = "driving episode"
-HORIZON = 8
-"""States in a plan; the paper's number."""
 MOST = 4
 """Episodes that are driven at most for each that is kept."""
-
-
-def episode_seed(seed: int, number: int) -> int:
-    """Seed of the simulation of an episode, below 2^24."""
-    return zlib.crc32(f"{seed} {number}".encode()) % SEEDS
 
 
 def shard(name: str, seed: int, blind: bool = False) -> Path:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -9,14 +10,15 @@ from torch import Tensor
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, Observed
 from ftl_lightning.domains.domain import Policy
-from ftl_lightning.domains.driving.environment import STATE, TRAFFIC, origin
-from ftl_lightning.domains.driving.generation import episode
 from ftl_lightning.domains.driving.motion import drive
-from ftl_lightning.domains.driving.scenarios import make
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, expect_simulator, origin
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.seeding import generator
+
+if TYPE_CHECKING:
+    from highway_env.envs.common.abstract import AbstractEnv
 
 Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
 SHOWN = 100
@@ -24,15 +26,19 @@ SHOWN = 100
 MLP_STEPS = 400
 
 
-def _decision(goal: str, name: str) -> float:
-    return float(make(goal).action_type.actions_indexes[name])
+def _made(goal: str) -> "AbstractEnv":
+    """The scenario's environment, which knows its decisions by name and number."""
+    expect_simulator()
+    from ftl_lightning.domains.driving.scenarios import make
+
+    return make(goal)
 
 
 def _always(name: str) -> Make:
     """The same decision, replaced by a random one that does not crash where it would."""
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
-        number = _decision(goal, name)
+        number = float(_made(goal).action_type.actions_indexes[name])
         return lambda observed, rows, step: torch.full((len(rows), 1), number)
 
     return policy
@@ -40,7 +46,7 @@ def _always(name: str) -> Make:
 
 def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
     """Any decision, replaced likewise."""
-    count = int(make(goal).action_space.n)
+    count = int(_made(goal).action_space.n)
     draws = [generator("cpu", seed, row) for row in range(len(starts))]
     return lambda observed, rows, step: torch.stack([torch.randint(count, (1,), generator=draws[row]).float() for row in rows])
 
@@ -113,6 +119,9 @@ def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
     """The expert's next state; not in the training scenarios, where it takes minutes (its rates there are in the data card)."""
     if goal in TRAINING_CONCEPTS:
         return None
+    expect_simulator()
+    from ftl_lightning.domains.driving.generation import episode
+
     drives = [torch.from_numpy(episode(*origin(start))[0][:, 0]) for start in starts.require_scenes().numpy()]
     return lambda observed, rows, step: torch.stack([drives[row][min(step + 1, len(drives[row]) - 1)] for row in rows])
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts, take
-from ftl_lightning.domains.driving.environment import NAMES, SCENARIO, TRAFFIC
-from ftl_lightning.domains.driving.scenarios import VEHICLES, decision_seconds, make
+from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, decision_seconds, expect_simulator
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.escape import figure_text
 
@@ -41,6 +40,9 @@ LEGEND = (
 @functools.cache
 def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
     """Centre lines ``(points, 2)`` of a scenario's lanes."""
+    expect_simulator()
+    from ftl_lightning.domains.driving.scenarios import make
+
     env = make(name)
     env.reset(seed=0)
     lanes = [

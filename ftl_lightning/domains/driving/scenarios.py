@@ -1,6 +1,7 @@
 """The paper's driving scenarios as thin configurations and subclasses of highway-env, and what success means in each.
 
-Axes of all: metres, x right, y down the page; metres a second. A scenario is registered with gymnasium as ``ftl/driving-NAME-v0``.
+Axes of all: metres, x right, y down the page; metres a second. Importing this module registers each scenario with gymnasium, as
+``ftl/driving-NAME-v0``.
 """
 
 from collections.abc import Callable
@@ -19,11 +20,8 @@ from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.driving.fast import FastVehicle, accelerate
-from ftl_lightning.errors import UserError
+from ftl_lightning.domains.driving.traffic import FEATURES, VEHICLES, expect_scenario
 
-FEATURES = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
-VEHICLES = 5
-"""Of which states are observed: the controlled vehicle and the four nearest that it does not have behind it."""
 OBSERVATION = {
     "type": "Kinematics",
     "vehicles_count": VEHICLES,
@@ -196,15 +194,7 @@ def scenario(name: str) -> Scenario:
     Raises:
         UserError: for a name that is none.
     """
-    if name not in SCENARIOS:
-        raise UserError(f"driving task: expected one of {', '.join(SCENARIOS)}, found {name!r}")
-    return SCENARIOS[name]
-
-
-def decision_seconds(name: str) -> float:
-    """Seconds between two decisions."""
-    found = scenario(name)
-    return float(1 / (found.environment.default_config() | found.config)["policy_frequency"])
+    return SCENARIOS[expect_scenario(name)]
 
 
 def make(name: str, fast: bool = True) -> AbstractEnv:

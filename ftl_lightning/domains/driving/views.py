@@ -5,14 +5,13 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.domain import View
-from ftl_lightning.domains.driving.environment import FEATURES_SEEN, SCENARIO, STATE, TRAFFIC
 from ftl_lightning.domains.driving.motion import drive, speed, turn, turned, way
-from ftl_lightning.domains.driving.scenarios import SCENARIOS, VEHICLES, decision_seconds
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.driving.traffic import FEATURES_SEEN, NAMES, SCENARIO, STATE, TRAFFIC, VEHICLES, decision_seconds
 
-SECONDS = torch.tensor([decision_seconds(name) for name in SCENARIOS])
+SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
 """Between two decisions, by the number of the scenario."""
-KNOWN = torch.tensor([name in TRAINING_CONCEPTS for name in SCENARIOS])
+KNOWN = torch.tensor([name in TRAINING_CONCEPTS for name in NAMES])
 """Whether it is a road of pretraining, likewise."""
 NEAR = 20.0
 """Metres; distances far beyond look alike, or a gap of some metres would be lost beside the hundred that can be seen."""

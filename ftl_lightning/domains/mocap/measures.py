@@ -18,6 +18,7 @@ from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
 from ftl_lightning.domains.mocap.skeleton import BONES, FPS, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
 from ftl_lightning.errors import UserError
+from ftl_lightning.extras import expect_extra
 
 POSE = "pose"
 """The observed feature that holds where a window starts."""
@@ -135,8 +136,9 @@ def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor
         generated, real: windows ``(sample, 32, 42)`` by class, of the same classes.
 
     Raises:
-        UserError: for different classes, or fewer than two.
+        UserError: for different classes, or fewer than two; without scikit-learn.
     """
+    expect_extra("mocap", "learned_elsewhere")
     from sklearn.linear_model import LogisticRegression  # a second to import
 
     names = sorted(generated)

@@ -5,20 +5,23 @@ that lie elsewhere in every picture tell nothing (domain randomisation, Tobin et
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.scenes import APART, NEEDED, PRESENT, SIGHT, TRIES, Points, anywhere, gap, outline, random_yaw
 from ftl_lightning.domains.tabletop.world import OVERHEAD, turned
+
+if TYPE_CHECKING:
+    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
 HIDDEN = (-5.0, 0.0, 0.0)
 """Where what a picture does not show is."""
 
 
 def scattered(
-    env: TableTopEnvironment, task: str, trace: Sequence[NDArray[np.float64]], rng: np.random.Generator
+    env: "TableTopEnvironment", task: str, trace: Sequence[NDArray[np.float64]], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """The overhead camera's pictures ``(time, 3, 64, 64)`` of an episode that is over.
 

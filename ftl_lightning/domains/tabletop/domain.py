@@ -1,22 +1,58 @@
 """The domain object: what the rest of the package knows of the table-top."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Show, deferred
 from ftl_lightning.domains.paper import Paper, Published
-from ftl_lightning.domains.tabletop.environment import FEATURES, MAX_STEPS, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.interface import (
+    FEATURES,
+    MAX_STEPS,
+    NAME,
+    POSE,
+    STATE_NAMES,
+    STATE_UNITS,
+    expect_simulator,
+)
 from ftl_lightning.domains.tabletop.policies import POLICIES
-from ftl_lightning.domains.tabletop.source import NAME, STATE_NAMES, STATE_UNITS, Expert
 from ftl_lightning.domains.tabletop.success import judge
 from ftl_lightning.domains.tabletop.tasks import PUSH, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.tabletop.views import VIEWS
 
+if TYPE_CHECKING:
+    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+    from ftl_lightning.domains.tabletop.source import Expert
+
 HORIZON = 32
 """States in a plan; the paper's number."""
 RENDERING = "ftl_lightning.domains.tabletop.rendering"
+
+
+def source(root: Path | None) -> "Expert":
+    """The scripted experts.
+
+    Raises:
+        UserError: without the simulator.
+    """
+    expect_simulator()
+    from ftl_lightning.domains.tabletop.source import Expert
+
+    return Expert()
+
+
+def environment() -> "TableTopEnvironment":
+    """The domain's environment.
+
+    Raises:
+        UserError: without the simulator, or if it does not start.
+    """
+    expect_simulator()
+    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+
+    return TableTopEnvironment()
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
@@ -42,13 +78,13 @@ DOMAIN = Domain(
         suites=SUITES,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
-    source=lambda root: Expert(),
+    source=source,
     observed=FEATURES,
     views=VIEWS,
     headline=EXECUTED,
     show=Show(deferred(f"{RENDERING}:render")),
     closed_loop=ClosedLoop(
-        environment=TableTopEnvironment,
+        environment=environment,
         act=act,
         steps=MAX_STEPS,
         judge=judge,
@@ -56,6 +92,7 @@ DOMAIN = Domain(
         keeps=(POSE,),
         less_is_better=("book moved",),
         policies=POLICIES,
+        expect=expect_simulator,
     ),
     paper=Paper(PUBLISHED, omega="learned", ours="1.2"),
     fresh=False,  # an expert takes about half a second for an episode

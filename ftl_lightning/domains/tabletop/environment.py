@@ -6,23 +6,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.domains.physics import Simulator, pybullet
+from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, HAND, SCENE, TRIANGLE, check, draw_scene, gap, outline
 from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
 from ftl_lightning.domains.tabletop.world import ARM, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward
 from ftl_lightning.errors import UserError
 
-IMAGE, POSE = "image", "pose"
-FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,), state=(0, 1, 2, 7))}
-"""The overhead camera's picture, without the arm; measured place (m), quaternion (real part last) and opening (m) of the hand.
-
-Place and opening are what a plan starts from, but for the millimetres by which the arm lags behind what it is told.
-"""
-ACTION = 4
-"""Place of the hand (m) and opening of the gripper (m): what plans consist of."""
-MAX_STEPS = 160
-"""The paper's number: 16 seconds."""
 HERTZ = 10
 FASTEST = 0.02
 """Metres that the hand is moved in a step at most; of an action farther away it goes the first part."""
@@ -31,8 +21,6 @@ TARGETS, SUBSTEPS = 3, 8
 ITERATIONS = 20
 """Of the search for the joint angles of a target."""
 GAIN = 0.1
-OPEN, THRESHOLD = 0.08, 0.06
-"""Metres between the fingers of an open gripper; an action with a larger opening than the threshold opens it, others close it."""
 FORCE = 20.0
 """Newtons of a finger."""
 REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))
@@ -93,7 +81,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     def _connected() -> Simulator:
         try:
             return Simulator()
-        except pybullet.error as error:
+        except pybullet().error as error:
             raise UserError(f"table-top: the physics simulator does not start ({error}); close some of its instances") from error
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
@@ -159,13 +147,13 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self.command = np.array([*(before + way), opening])
         robot = self.bodies.robot
         self.client.setJointMotorControlArray(
-            robot, FINGERS, pybullet.POSITION_CONTROL, targetPositions=[opening / 2] * 2, forces=[FORCE] * 2
+            robot, FINGERS, pybullet().POSITION_CONTROL, targetPositions=[opening / 2] * 2, forces=[FORCE] * 2
         )
         for part in range(1, TARGETS + 1):
             self.client.setJointMotorControlArray(
                 robot,
                 ARM,
-                pybullet.POSITION_CONTROL,
+                pybullet().POSITION_CONTROL,
                 targetPositions=self._angles(before + way * part / TARGETS),
                 forces=[87.0] * 4 + [12.0] * 3,
                 positionGains=[GAIN] * len(ARM),
@@ -190,7 +178,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     def outline(self, name: str) -> NDArray[np.float64]:
         """An object from above, as it lies, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""
         place, turn = self.client.getBasePositionAndOrientation(self.bodies.objects[name])
-        return outline(name, place[0], place[1], pybullet.getEulerFromQuaternion(turn)[2])
+        return outline(name, place[0], place[1], pybullet().getEulerFromQuaternion(turn)[2])
 
     def hand(self) -> NDArray[np.float64]:
         """Measured place, quaternion and opening ``(8,)``."""

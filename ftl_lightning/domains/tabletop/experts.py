@@ -3,15 +3,19 @@
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.tabletop.distractors import scattered
-from ftl_lightning.domains.tabletop.environment import IMAGE, MAX_STEPS, OPEN, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.interface import IMAGE, MAX_STEPS, OPEN, POSE
 from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, RING, TRIANGLE, WHITE, support
 from ftl_lightning.domains.tabletop.success import judged
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, BESIDE_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
+
+if TYPE_CHECKING:
+    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
 CLOSED = 0.0
 PUSH_HEIGHT = 0.014
@@ -75,7 +79,7 @@ def style(rng: np.random.Generator) -> Style:
 class _Expert:
     """What an expert knows: the world as it is, its style, and where it went last."""
 
-    def __init__(self, env: TableTopEnvironment, task: str, how: Style) -> None:
+    def __init__(self, env: "TableTopEnvironment", task: str, how: Style) -> None:
         self.env, self.task, self.how = env, task, how
         self.at = env.command.copy()
 
@@ -100,7 +104,7 @@ class _Expert:
             yield self.at + np.array([*(RETURN * (self.env.command[:3] - self.at[:3])), 0.0])
 
 
-def moves(env: TableTopEnvironment, task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
+def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
     """What the expert of a task does in the scene in which the environment is.
 
     Args:
@@ -259,7 +263,7 @@ STAY = 4
 
 
 def perform(
-    env: TableTopEnvironment,
+    env: "TableTopEnvironment",
     task: str,
     scene: NDArray[np.float32],
     rng: np.random.Generator,

@@ -10,8 +10,8 @@ from torch import Tensor
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Policy
-from ftl_lightning.domains.tabletop.environment import ACTION, TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform
+from ftl_lightning.domains.tabletop.interface import ACTION, expect_simulator
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, expect_task
 from ftl_lightning.errors import UserError
 
@@ -31,6 +31,9 @@ def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: boo
     def make(goal: str, starts: InitialStates, known: Demonstrations | None, seed: int) -> Policy | None:
         if expect_task(goal) not in tasks:
             return None
+        expect_simulator()
+        from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+
         actions: list[Tensor] = []
         env = TableTopEnvironment()
         try:

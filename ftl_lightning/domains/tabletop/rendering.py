@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop.environment import THRESHOLD, TableTopEnvironment
+from ftl_lightning.domains.tabletop.interface import THRESHOLD, expect_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, SIGHT, WHITE, outlines
 from ftl_lightning.domains.tabletop.world import COLOUR, FRONT
 from ftl_lightning.escape import figure_text
@@ -66,6 +66,9 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         rollout: of one episode.
         plans: ``(step, horizon, 4)``; blue where the gripper is to be open, red where it is to be closed.
     """
+    expect_simulator()
+    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+
     trace = rollout.infos[0].get("trace", [])
     times = np.unique(np.linspace(0, max(len(trace) - 1, 0), FRAMES).round().astype(int))
     env = TableTopEnvironment(arm_drawn=True)

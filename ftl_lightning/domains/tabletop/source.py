@@ -13,8 +13,9 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.tabletop import environment, experts, success, world
 from ftl_lightning.domains.tabletop import scenes as scene_settings
-from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE, TableTopEnvironment
+from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, perform
+from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
 from ftl_lightning.domains.tabletop.tasks import PUSH, TRAINING_CONCEPTS, expect_task
 from ftl_lightning.errors import UserError
@@ -22,20 +23,18 @@ from ftl_lightning.seeding import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 
-NAME = "tabletop"
-STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
-STATE_UNITS = ("m",) * 4
 MOST = 4
 """Episodes that are tried at most for each that is kept."""
 FORM = 4
 """Of the experts; what is cached of another one is not used."""
 TIMES = {PUSH: 4}
 """So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""
+_NO_SETTINGS = ("FEATURES", "NEEDED", "TYPE_CHECKING")
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
     for module in (environment, experts, scene_settings, success, world)
     for name, value in sorted(vars(module).items())
-    if name.isupper() and isinstance(value, int | float | str | tuple | dict | world.Camera) and name not in ("FEATURES", "NEEDED")
+    if name.isupper() and isinstance(value, int | float | str | tuple | dict | world.Camera) and name not in _NO_SETTINGS
 }
 """What decides a demonstration besides task, count and seed."""
 

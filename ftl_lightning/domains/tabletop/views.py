@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.domains.domain import View
-from ftl_lightning.domains.tabletop.environment import FEATURES, IMAGE, POSE
+from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
 
 HAND, MOVED = "hand", "moved"

@@ -80,7 +80,7 @@ def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bod
     client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
     _box(client, (0.9, 1.0, 0.04), (0.5, 0.0, -0.02), TABLE_COLOUR, 0.0, TABLE_FRICTION)
     # Without its own shapes those for collisions are drawn, which load quicker; these are made invisible.
-    flags = 0 if arm_drawn else pybullet.URDF_IGNORE_VISUAL_SHAPES
+    flags = 0 if arm_drawn else pybullet().URDF_IGNORE_VISUAL_SHAPES
     robot: int = client.loadURDF(_panda(), [0, 0, 0], useFixedBase=True, flags=flags)
     for link in () if arm_drawn else range(-1, client.getNumJoints(robot)):
         client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
@@ -118,8 +118,8 @@ def _box(
     half = [edge / 2 for edge in size]
     body: int = client.createMultiBody(
         mass,
-        client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half),
-        client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1]),
+        client.createCollisionShape(pybullet().GEOM_BOX, halfExtents=half),
+        client.createVisualShape(pybullet().GEOM_BOX, halfExtents=half, rgbaColor=[*colour, 1]),
         place,
         turned(yaw),
     )
@@ -134,19 +134,19 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str) -> int:
     if name in SIZE:
         return _box(client, (*SIZE[name], height), place, COLOUR[name], MASS[name], FRICTION[name], yaw)
     if name == CIRCLE:
-        shape = client.createCollisionShape(pybullet.GEOM_CYLINDER, radius=RADIUS[name], height=height)
-        seen = client.createVisualShape(pybullet.GEOM_CYLINDER, radius=RADIUS[name], length=height, rgbaColor=colour)
+        shape = client.createCollisionShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], height=height)
+        seen = client.createVisualShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], length=height, rgbaColor=colour)
     elif name == TRIANGLE:
         vertices = _prism(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN)  # corners move by 2 when sides move by 1
-        shape = client.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices)
+        shape = client.createCollisionShape(pybullet().GEOM_MESH, vertices=vertices)
         seen = client.createVisualShape(
-            pybullet.GEOM_MESH, vertices=_prism(RADIUS[name], height / 2), indices=_PRISM_SIDES, rgbaColor=colour
+            pybullet().GEOM_MESH, vertices=_prism(RADIUS[name], height / 2), indices=_PRISM_SIDES, rgbaColor=colour
         )
     else:
         shape = _bowl_shape(client)
         vertices, triangles = bowl(RADIUS[name], height / 2, 0.006)
         upright = [[a, -c, b] for a, b, c in vertices]  # that mesh stands on y
-        seen = client.createVisualShape(pybullet.GEOM_MESH, vertices=upright, indices=triangles, rgbaColor=colour)
+        seen = client.createVisualShape(pybullet().GEOM_MESH, vertices=upright, indices=triangles, rgbaColor=colour)
     body: int = client.createMultiBody(MASS[name], shape, seen, place, turned(yaw))
     client.changeDynamics(body, -1, lateralFriction=FRICTION[name])
     if name == TRIANGLE:
@@ -168,7 +168,7 @@ def _bowl_shape(client: Simulator) -> int:
     walls = [[thickness / 2, radius * math.tan(math.pi / WALLS), half]] * WALLS
     places = [[(radius - thickness / 2) * math.cos(angle), (radius - thickness / 2) * math.sin(angle), 0.0] for angle in angles]
     shape: int = client.createCollisionShapeArray(
-        shapeTypes=[pybullet.GEOM_BOX] * (WALLS + 1),
+        shapeTypes=[pybullet().GEOM_BOX] * (WALLS + 1),
         halfExtents=[*walls, [radius / 2, radius / 2, thickness / 2]],
         collisionFramePositions=[*places, [0.0, 0.0, thickness / 2 - half]],
         collisionFrameOrientations=[*(turned(angle) for angle in angles), turned(0.0)],
@@ -193,15 +193,15 @@ class Camera:
     size: tuple[int, int]
 
     def _matrices(self) -> tuple[list[float], list[float]]:
-        view = pybullet.computeViewMatrix(self.eye, self.target, self.up)
-        return view, pybullet.computeProjectionMatrixFOV(self.angle, self.size[1] / self.size[0], 0.1, 3.0)
+        view = pybullet().computeViewMatrix(self.eye, self.target, self.up)
+        return view, pybullet().computeProjectionMatrixFOV(self.angle, self.size[1] / self.size[0], 0.1, 3.0)
 
     def picture(self, client: Simulator, shadow: bool = False) -> NDArray[np.uint8]:
         """``(height, width, 3)``, by pybullet's software renderer."""
         height, width = self.size
         view, lens = self._matrices()
         seen = client.getCameraImage(
-            width, height, view, lens, lightDirection=[0.3, -0.6, 1.5], shadow=int(shadow), renderer=pybullet.ER_TINY_RENDERER
+            width, height, view, lens, lightDirection=[0.3, -0.6, 1.5], shadow=int(shadow), renderer=pybullet().ER_TINY_RENDERER
         )
         rgba: NDArray[np.uint8] = np.asarray(seen[2], dtype=np.uint8).reshape(height, width, 4)
         return np.ascontiguousarray(rgba[..., :3])
