@@ -280,8 +280,9 @@ class Fuzz:
         }
         np.savez(folder / "good.npz", **self.arrays)  # type: ignore[arg-type]
         self.demonstrations = self._bytes(Demonstrations.load(folder / "good.npz").save)
-        own = ["agent", "paper", "go", "BC", "", "method", "1", "1.2", "5", "0", "10", "accuracy", "0.5", "a" * 16, "b" * 16, "1.0"]
-        self.rows = [COLUMNS, own, [*own[:9], "1", *own[10:]]]
+        numbers = ["accuracy", "0.5", "a" * 16, "b" * 16, "1.0"]
+        own = ["agent", "paper", "go", "BC", "", "", "method", "1", "1.2", "5", "0", "10", *numbers]
+        self.rows = [COLUMNS, own, [*own[:10], "1", *own[11:]]]
         self.kinds: dict[str, Callable[[random.Random], None]] = {
             "config.json": self.config,
             "concept": self.concept,

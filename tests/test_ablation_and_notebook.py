@@ -225,7 +225,7 @@ def test_a_ray_cluster_of_two_workers_measures_the_same(quick: dict[str, object]
     finally:
         ray.shutdown()
     one, other = (
-        read_rows(name).sort_values(["method", "variant", "omega", "setting", "task"], ignore_index=True)
+        read_rows(name).sort_values(["method", "form", "variant", "omega", "setting", "task"], ignore_index=True)
         for name in ("r.csv", "s.csv")
     )
     assert one.equals(other)

@@ -20,7 +20,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
 from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.distances import Distance
-from ftl_lightning.domains.paper import OURS, Paper
+from ftl_lightning.domains.paper import PAPERS_METHOD, Method, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
 from ftl_lightning.errors import UserError, short, shown
@@ -273,7 +273,7 @@ class Domain(Shown):
         show: pictures of it; by default :func:`line_drawings`.
         observed: features that a plan is conditioned on, by name; empty where behaviour has no initial state.
         metrics: of plans, by name; the first is what ablations are about. None where only what comes of plans is judged.
-        ours: as what our method stands in results in the form that others are compared with; the paper's by default.
+        ours: our method in the form that others are compared with; the paper's by default.
         headline: what methods are compared by, task for task: a metric's name, or ``'closed loop '`` and an outcome's.
         references: trivial policies and oracles to print beside every rate: name to ``(goal, samples, initial states or None, seed)
             -> states (sample, horizon, state)``.
@@ -295,7 +295,7 @@ class Domain(Shown):
     show: Show = _UNSAID
     observed: Mapping[str, Feature] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
-    ours: str = OURS
+    ours: Method = PAPERS_METHOD
     headline: str = ACCURACY
     references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
     views: Mapping[str, View] = field(default_factory=dict)

@@ -85,6 +85,7 @@ def rows(
     hparams = module.hparams
     ours = {
         "method": module.method,
+        "form": module.form,
         "variant": module.variant if variant is None else variant,
         "role": METHOD,
         "K": hparams.get("components", 0),
@@ -94,7 +95,7 @@ def rows(
     }
     alike = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
     alike += [configured["environment"]] if "environment" in configured else []
-    nobody = {"variant": "", "role": REFERENCE, "K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
+    nobody = {"role": REFERENCE, "K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
 
     policies = domain.closed_loop.policies if domain.closed_loop else {}
 

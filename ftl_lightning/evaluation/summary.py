@@ -70,7 +70,7 @@ def _title(rows: Sequence[Row]) -> str:
     row = rows[0]
     components = f", K = {row.K}" if row.K else ""
     weight = "" if row.omega == "none" else ", learned weights" if row.omega == "learned" else f", omega {row.omega}"
-    return f"{row.domain}: {label(row.method, row.variant)}{components}{weight}"
+    return f"{row.domain}: {label(row.method, row.form, row.variant)}{components}{weight}"
 
 
 def _mean(rows: Sequence[Row], metric: str, error: bool = True) -> str:

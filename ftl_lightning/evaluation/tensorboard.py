@@ -57,7 +57,7 @@ def log_test(logger: TensorBoardLogger, configuration: Mapping[str, Any], rows: 
         values.setdefault((row.setting, row.task), {})[row.metric] = row.value
     tasks = list(dict.fromkeys(row.task for row in measured))
     first = measured[0]
-    what = {"domain": first.domain, "method": first.method, "variant": first.variant, "tasks": ", ".join(tasks)}
+    what = {"domain": first.domain, "method": first.method, "form": first.form, "variant": first.variant, "tasks": ", ".join(tasks)}
     log_hparams(logger, what | dict(configuration), setting_means(values), step)
     logger.experiment.add_text("results/settings", plain(summary_table(rows)), step)
     logger.experiment.add_text("results/tasks", plain(summary_table(rows, tasks)), step)

@@ -81,12 +81,20 @@ class InversionModule(Adaptation):
 
     @property
     def method(self) -> str:
+        """The model's; with an adapter of the whole network it is fine-tuning."""
+        return FINE_TUNED if self._fine_tuned else super().method
+
+    @property
+    def form(self) -> str:
         """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
-        if self.settings.adapter and self.settings.adapter_scope == "all":
-            return FINE_TUNED
+        if self._fine_tuned:
+            return ""
         modes, knots, adapter = (self.settings.modes != 1, self.settings.knots > 1, self.settings.adapter > 0)
-        forms = [name for name, has in ((WITH_MODES, modes), (WITH_KNOTS, knots), (WITH_ADAPTER, adapter)) if has]
-        return "".join((super().method, *forms))
+        return " ".join(name for name, has in ((WITH_MODES, modes), (WITH_KNOTS, knots), (WITH_ADAPTER, adapter)) if has)
+
+    @property
+    def _fine_tuned(self) -> bool:
+        return self.settings.adapter > 0 and self.settings.adapter_scope == "all"
 
     @property
     def variant(self) -> str:

@@ -60,6 +60,8 @@ class Pretraining(pl.LightningModule, ABC):
 
     method: str
     """The method's name in tables."""
+    form: str = ""
+    """Words behind the name in tables, of a method that has several forms."""
     variant: str = ""
     """What tells it apart from others of the same method in tables."""
     concepts: tuple[str, ...] = ()
