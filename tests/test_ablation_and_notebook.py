@@ -76,6 +76,7 @@ def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
     rows = read_rows(path)
     assert set(rows["seed"]) == {0, 1}
     assert set(rows.loc[rows["K"] > 0, "K"]) == {1, 2}
+    rows.drop(columns="form").to_csv(path, index=False)  # as older files are
     assert main(["ablate", "--config", config]) == 0
     out = capsys.readouterr().out
     assert out.count("in the results already") == 8

@@ -55,7 +55,13 @@ class Real:
 
     @classmethod
     def of(
-        cls, task: EvaluationTask, domain: Domain, count: int, known: Demonstrations | None, root: Path | None = None, seed: int = 0
+        cls,
+        task: EvaluationTask,
+        domain: Domain,
+        count: int,
+        demonstrations: Demonstrations | None,
+        root: Path | None = None,
+        seed: int = 0,
     ) -> Self:
         """What there is.
 
@@ -67,16 +73,16 @@ class Real:
             task: what is generated.
             domain: whose task it is.
             count: of plans that are generated.
-            known: demonstrations of the task's learned concept, if there are any.
+            demonstrations: of the task's learned concept, if there are any.
             root: folder of the user's copy of the data.
             seed: of the fresh samples.
         """
         if task.initial == "demonstrated":
             return cls(task, domain, count, None, None)
-        shown = known if known is not None and task.learned == (task.goal,) and len(known) else None
+        shown = task.learned == (task.goal,) and demonstrations is not None and len(demonstrations) > 0
         drawn = _drawn(domain, task.goal, 2 * count, root, seed)
-        parts = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
-        return cls(task, domain, count, shown, parts)
+        fresh = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
+        return cls(task, domain, count, demonstrations if shown else None, fresh)
 
     @property
     def _distance(self) -> Distance:
@@ -100,27 +106,26 @@ class Real:
         Raises:
             UserError: for plans that the domain's distance does not fit, or a distance that returns something else.
         """
-        found: dict[str, float] = {}
+        values: dict[str, float] = {}
         if plans.shape[1] != self.domain.plans.horizon:
-            return found
+            return values
         if self.demonstrations is not None:
-            known = self._windows(self.demonstrations)
-            found[NOVELTY] = novelty(self.domain.distances(plans, known, self._distance))
+            values[NOVELTY] = novelty(self.domain.distances(plans, self._windows(self.demonstrations), self._distance))
         if self.fresh:
-            found[COVERAGE] = coverage(self.domain.distances(plans, self._windows(self.fresh[0]), self._distance))
-        return found
+            values[COVERAGE] = coverage(self.domain.distances(plans, self._windows(self.fresh[0]), self._distance))
+        return values
 
     def lines(self) -> dict[str, Judged]:
         """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples.
 
         Where nothing but novelty is measured, there is nothing to say of demonstrations: theirs is 0.
         """
-        found = {}
+        by_name = {}
         if self.demonstrations is not None and (self.domain.metrics or self.fresh):
-            found[REPLAYED] = self.replayed()
+            by_name[REPLAYED] = self.replayed()
         if self.fresh:
-            found[FRESH] = self._judged(self.fresh[1])
-        return found
+            by_name[FRESH] = self._judged(self.fresh[1])
+        return by_name
 
     def replayed(self) -> Judged:
         """As many plans as are generated, which are the demonstrations in turn."""
@@ -132,9 +137,9 @@ class Real:
         starts = behaviour.initial_states if self.domain.observed else None
         return self.added(Judged.of(self.task, self._windows(behaviour), starts, self.domain))
 
-    def added(self, one: Judged) -> Judged:
-        """The same with its novelty and coverage."""
-        return one.compared(self.values(one.states))
+    def added(self, judged: Judged) -> Judged:
+        """The same behaviour with its novelty and coverage."""
+        return judged.compared(self.values(judged.states))
 
 
 def novelty(distances: Tensor) -> float:
@@ -147,10 +152,11 @@ def coverage(distances: Tensor) -> float:
     return float(distances.amin(dim=0).mean())
 
 
-def lines(found: Sequence[Real]) -> dict[str, list[Judged]]:
+def lines(real: Sequence[Real]) -> dict[str, list[Judged]]:
     """The reference lines of some tasks, by name."""
-    each = [one.lines() for one in found]
-    return {name: own for name in (REPLAYED, FRESH) if (own := [one[name] for one in each if name in one])}
+    by_task = [behaviour.lines() for behaviour in real]
+    by_name = {name: [judged[name] for judged in by_task if name in judged] for name in (REPLAYED, FRESH)}
+    return {name: judged for name, judged in by_name.items() if judged}
 
 
 def _drawn(domain: Domain, goal: str, count: int, root: Path | None, seed: int) -> Demonstrations | None:

@@ -55,11 +55,12 @@ class Judged:
             domain: whose they are.
             environment: of the domain's others, in which they took place; its outcomes are beside those that there are.
         """
-        found = domain.judge(self.task.goal, rollout)
-        found |= {SUCCESS: found[SUCCESS] & ~rollout.failed}
+        outcomes = domain.judge(self.task.goal, rollout)
+        outcomes |= {SUCCESS: outcomes[SUCCESS] & ~rollout.failed}
         if environment:
-            return replace(self, outcomes={**self.outcomes, **{f"{name} ({environment})": one for name, one in found.items()}})
-        return replace(self, rollout=rollout, outcomes=found)
+            there = {f"{name} ({environment})": values for name, values in outcomes.items()}
+            return replace(self, outcomes={**self.outcomes, **there})
+        return replace(self, rollout=rollout, outcomes=outcomes)
 
     def compared(self, diversity: Mapping[str, float]) -> Self:
         """The same with novelty and coverage."""
@@ -85,12 +86,12 @@ def share(values: Tensor) -> float:
     return float(metric.compute())
 
 
-def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
-    """In which episodes ``(sample,)`` one succeeds and a policy, from the same initial state, does not, and the reverse.
+def paired(generated: Judged, reference: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
+    """In which episodes ``(sample,)`` a method succeeds and a policy, from the same initial state, does not, and the reverse.
 
     Args:
-        one: what a method did.
-        other: what the policy did.
+        generated: what the method did.
+        reference: what the policy did.
         policy: its name.
         domain: whose headline decides, if it is an outcome, else success.
 
@@ -98,13 +99,13 @@ def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str,
         both by their metric's name, in the domain's own environment and in each other in which both acted.
     """
     name = domain.headline.removeprefix(f"{CLOSED} ")
-    compared = name if name != domain.headline else SUCCESS
-    found: dict[str, Tensor] = {}
-    for place, ours in one.outcomes.items():
-        if place in other.outcomes and (place == compared or place.startswith(f"{compared} (")):
-            theirs, named = other.outcomes[place], f"{policy}{place.removeprefix(compared)}"
-            found |= {f"{WON}{named}": ours & ~theirs, f"{LOST}{named}": theirs & ~ours}
-    return found
+    decisive = name if name != domain.headline else SUCCESS
+    episodes: dict[str, Tensor] = {}
+    for outcome, by_method in generated.outcomes.items():
+        if outcome in reference.outcomes and (outcome == decisive or outcome.startswith(f"{decisive} (")):
+            by_policy, named = reference.outcomes[outcome], f"{policy}{outcome.removeprefix(decisive)}"
+            episodes |= {f"{WON}{named}": by_method & ~by_policy, f"{LOST}{named}": by_policy & ~by_method}
+    return episodes
 
 
 def standard_error(values: Sequence[float]) -> float:
@@ -116,6 +117,7 @@ def standard_error(values: Sequence[float]) -> float:
 def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environment: str = "") -> list[Judged]:
     """The same tasks with their episodes, which run all side by side; in the domain's own environment or one of its others."""
     assert domain.closed_loop is not None
-    starts = join([one.starts for one in judged if one.starts is not None])
-    parts = roll_out(domain.closed_loop.inside(environment), starts, policy).split([len(one.states) for one in judged])
-    return [one.executed(part, domain, environment) for one, part in zip(judged, parts, strict=True)]
+    starts = join([behaviour.starts for behaviour in judged if behaviour.starts is not None])
+    counts = [len(behaviour.states) for behaviour in judged]
+    rollouts = roll_out(domain.closed_loop.inside(environment), starts, policy).split(counts)
+    return [behaviour.executed(rollout, domain, environment) for behaviour, rollout in zip(judged, rollouts, strict=True)]

@@ -33,57 +33,58 @@ def references(
         seed: of the policies.
         environments: of the domain's others, in which the method's was executed besides its own.
     """
-    loop = None if all(one.rollout is None for one in judged) else domain.closed_loop
-    found = {name: [_planned(name, one, domain, loop, seed, environments) for one in judged] for name in domain.references}
+    loop = None if all(behaviour.rollout is None for behaviour in judged) else domain.closed_loop
+    by_policy = {name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.references}
     for name in loop.policies if loop else ():
-        acted = (_acted(name, one, domain, demonstrated, seed, environments) for one in judged)
-        found[name] = [one for one in acted if one is not None]
-    return found
+        acted = (_acted(name, like, domain, demonstrated, seed, environments) for like in judged)
+        by_policy[name] = [behaviour for behaviour in acted if behaviour is not None]
+    return by_policy
 
 
-def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
-    """A policy that makes its plan once."""
-    key = (name, domain.name, one.task.goal, len(one.states), _hash(one.starts), seed)
+def _planned(name: str, like: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
+    """A policy that makes its plan once, for the task and the initial states of a method's behaviour."""
+    task, starts, (count, _, columns) = like.task, like.starts, like.states.shape
+    key = (name, domain.name, task.goal, count, _hash(starts), seed)
     if key not in _KNOWN:
-        _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.starts, seed)
+        _KNOWN[key] = domain.references[name](task.goal, count, starts, seed)
     plans = _KNOWN[key]
-    if (expected := (len(one.states), domain.plans.horizon, one.states.shape[2])) != tuple(plans.shape):
+    if (expected := (count, domain.plans.horizon, columns)) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")
-    own = Judged.of(one.task, plans, one.starts, domain)
+    behaviour = Judged.of(task, plans, starts, domain)
     if loop is None:
-        return own
-    assert one.starts is not None
+        return behaviour
+    assert starts is not None
     for place in ("", *environments):
         if (*key, "executed", place) not in _KNOWN:
             follower = PlanFollower(fixed_plans(plans), loop.act, loop.steps)
-            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), one.starts, follower)
-        own = own.executed(_KNOWN[*key, "executed", place], domain, place)
-    return own
+            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), starts, follower)
+        behaviour = behaviour.executed(_KNOWN[*key, "executed", place], domain, place)
+    return behaviour
 
 
 def _acted(
     name: str,
-    one: Judged,
+    like: Judged,
     domain: Domain,
     demonstrated: Callable[[str], Demonstrations | None],
     seed: int,
     environments: Sequence[str],
 ) -> Judged | None:
-    """A policy that acts as it goes; ``None`` where it would take too long."""
-    loop = domain.closed_loop
+    """A policy that acts as it goes, from the initial states of a method's behaviour; ``None`` where it would take too long."""
+    loop, task, starts = domain.closed_loop, like.task, like.starts
     assert loop is not None
-    assert one.starts is not None
-    known = demonstrations_of(one.task, demonstrated)
+    assert starts is not None
+    demonstrations, behaviour = demonstrations_of(task, demonstrated), like
     for place in ("", *environments):
-        key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(one.starts), seed, place)
+        key = (name, domain.name, task.goal, demonstrations.hash if demonstrations else "", _hash(starts), seed, place)
         if key not in _KNOWN:
-            policy = loop.policies[name](one.task.goal, one.starts, known, seed)
-            _KNOWN[key] = policy and roll_out(loop.inside(place), one.starts, policy)
+            policy = loop.policies[name](task.goal, starts, demonstrations, seed)
+            _KNOWN[key] = policy and roll_out(loop.inside(place), starts, policy)
         rollout: Rollout | None = _KNOWN[key]
         if rollout is None:
             return None
-        one = one.executed(rollout, domain, place)
-    return one
+        behaviour = behaviour.executed(rollout, domain, place)
+    return behaviour
 
 
 def _hash(starts: InitialStates | None) -> str:

@@ -159,12 +159,12 @@ def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
     """The rows of the files of this name in a folder; without a name, of all that are not shown apart. Maybe none.
 
     Raises:
-        UserError: as :func:`read_rows`.
+        UserError: if there is no such path, or a file has other columns or a cell that is none of its column's.
     """
     path = Path(path)
     files = _files(path) if path.is_dir() else [path]
-    own = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES))]
-    return pd.concat([read_rows(file) for file in own], ignore_index=True) if own else pd.DataFrame(columns=COLUMNS)
+    named = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES))]
+    return pd.concat([read_rows(file) for file in named], ignore_index=True) if named else pd.DataFrame(columns=COLUMNS)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -184,8 +184,8 @@ def _read(file: Path) -> pd.DataFrame:
     if list(table.columns) not in (COLUMNS, _BEFORE_FORMS, _BEFORE_VARIANTS):
         told = short(", ".join(map(str, table.columns)), 80)
         raise UserError(f"expected the columns {short(', '.join(COLUMNS), 140)}, found {told}")
-    if (found := _bad_cell(table)) is not None:
-        row, column, expected = found
+    if (bad := _bad_cell(table)) is not None:
+        row, column, expected = bad
         cell = _table(file, str).fillna("").iloc[row][column]
         raise UserError(f"row {row + 2}, column {column!r}: expected {expected}, found {shown(cell)}; it is damaged")
     return upgraded(table)
