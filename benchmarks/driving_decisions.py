@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning import FewShot
 from ftl_lightning.concepts.composition import Composition
@@ -39,7 +40,6 @@ from ftl_lightning.domains.driving.simulation import advance
 from ftl_lightning.domains.driving.traffic import MAX_STEPS, STATE, STEP, TRAFFIC, decision_seconds
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.progress import bar
 from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
 from ftl_lightning.tensor_file import write_text

@@ -22,7 +22,7 @@ from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
-from ftl_lightning.domains.paper import OURS, WITH_MODES
+from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
@@ -47,14 +47,14 @@ class Form:
     """A method in one of its forms.
 
     Attributes:
-        method: its name in tables.
-        variant: what tells it apart from others of the same method; may be empty.
+        method: its name in tables, and its form.
+        variant: what tells it apart from others of the same method and form; may be empty.
         config: configuration file of ``invert``, where ``{domain}`` stands for the domain.
         changes: of the module's arguments, for ours those of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
         tempered: whether the temperature matters.
     """
 
-    method: str
+    method: Compared
     variant: str
     config: str
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -62,12 +62,12 @@ class Form:
 
 
 FORMS = {
-    "one": Form(OURS, "", "conf/invert/{domain}.yaml"),
-    "modes": Form(f"{OURS}{WITH_MODES}", "", "conf/invert/{domain}.yaml", {"modes": "auto"}),
-    "BC": Form("BC", "", "conf/baseline/bc/invert/{domain}.yaml", tempered=False),
-    "CVAE": Form("CVAE", "", "conf/baseline/cvae/invert/{domain}.yaml"),
-    "in-context": Form("in-context", "", "conf/baseline/in_context/invert/{domain}.yaml"),
-    "language": Form("language", "", "conf/baseline/language/invert/{domain}.yaml"),
+    "one": Form(PAPERS_METHOD, "", "conf/invert/{domain}.yaml"),
+    "modes": Form(Compared(OURS, WITH_MODES), "", "conf/invert/{domain}.yaml", {"modes": "auto"}),
+    "BC": Form(Compared("BC"), "", "conf/baseline/bc/invert/{domain}.yaml", tempered=False),
+    "CVAE": Form(Compared("CVAE"), "", "conf/baseline/cvae/invert/{domain}.yaml"),
+    "in-context": Form(Compared("in-context"), "", "conf/baseline/in_context/invert/{domain}.yaml"),
+    "language": Form(Compared("language"), "", "conf/baseline/language/invert/{domain}.yaml"),
 }
 """By name on the command line."""
 
@@ -119,7 +119,7 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
     tasks = [task for task in domain.concepts.suites[suite].tasks if task.initial == "new"]
     tasks = [task for task in tasks if not only or task.name in only or task.setting in only]
     run = {"domain": domain.name, "suite": suite, "seed": seed}
-    method = {"method": form.method, "variant": form.variant}
+    method = {"method": form.method.name, "form": form.method.form, "variant": form.variant}
     known = read_frontier(out)
     known = known[(known["n"] == samples) & _alike(known, {**run, **method})]
     missing = []
@@ -140,11 +140,9 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
         real = real_behaviour(judged, domain, module.demonstrated, seed=seed)
         compared = [behaviour.added(one) for behaviour, one in zip(real, judged, strict=True)]
         ours = [row(one, domain, {**run, **method, "temperature": temperature}) for one in compared]
-        reference = {"variant": "", "temperature": None}
+        reference = {"form": "", "variant": "", "temperature": None}
         beside = [row(one, domain, {**run, **reference, "method": line}) for line, each in lines(real).items() for one in each]
-        moved = [
-            row(one, domain, {**run, "method": NOISY, "variant": "", "temperature": level}) for level, one in noisy(real, seed)
-        ]
+        moved = [row(one, domain, {**run, "method": NOISY, **reference, "temperature": level}) for level, one in noisy(real, seed)]
         write_frontier(out, ours + beside + moved)
 
 

@@ -30,6 +30,7 @@ import numpy as np
 import safetensors.torch
 import torch
 import yaml
+from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.concepts.adapter import LowRank, adaptable
 from ftl_lightning.concepts.composition import Composition, Modes
@@ -41,7 +42,6 @@ from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
 from ftl_lightning.learning.checkpoint import read_checkpoint
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.seeding import generator
 from ftl_lightning.shipped import pretrained_folder
@@ -280,8 +280,9 @@ class Fuzz:
         }
         np.savez(folder / "good.npz", **self.arrays)  # type: ignore[arg-type]
         self.demonstrations = self._bytes(Demonstrations.load(folder / "good.npz").save)
-        own = ["agent", "paper", "go", "BC", "", "method", "1", "1.2", "5", "0", "10", "accuracy", "0.5", "a" * 16, "b" * 16, "1.0"]
-        self.rows = [COLUMNS, own, [*own[:9], "1", *own[10:]]]
+        numbers = ["accuracy", "0.5", "a" * 16, "b" * 16, "1.0"]
+        own = ["agent", "paper", "go", "BC", "", "", "method", "1", "1.2", "5", "0", "10", *numbers]
+        self.rows = [COLUMNS, own, [*own[:10], "1", *own[11:]]]
         self.kinds: dict[str, Callable[[random.Random], None]] = {
             "config.json": self.config,
             "concept": self.concept,

@@ -23,6 +23,7 @@ from statistics import mean, median
 from typing import Any, TypeVar
 
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition, composed_epsilon
@@ -32,7 +33,6 @@ from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import ACCURACY
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.progress import bar

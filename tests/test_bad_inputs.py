@@ -353,7 +353,7 @@ def test_a_small_archive_of_a_large_array(capsys: Told) -> None:
 
 # Results
 
-CELLS = ["agent", "paper", "go", "BC", "", "method", "1", "1.2", "5", "0", "10", "accuracy", "0.5", ZERO, ZERO, "1"]
+CELLS = ["agent", "paper", "go", "BC", "", "", "method", "1", "1.2", "5", "0", "10", "accuracy", "0.5", ZERO, ZERO, "1"]
 ROW = dict(zip(COLUMNS, CELLS, strict=True))
 
 

@@ -249,7 +249,7 @@ def test_the_version_of_a_checkpoint(version: object, checkpoint: Path, capsys: 
     refused(capsys, [*FIT, "--ckpt_path=c.ckpt"], "c.ckpt: key 'pytorch-lightning_version': expected")
 
 
-CELLS = ["agent", "paper", "go", "BC", "", "method", "1", "1.2", "5", "0", "10", "accuracy", "0.5", "0" * 16, "0" * 16, "1"]
+CELLS = ["agent", "paper", "go", "BC", "", "", "method", "1", "1.2", "5", "0", "10", "accuracy", "0.5", "0" * 16, "0" * 16, "1"]
 
 
 @pytest.mark.parametrize(

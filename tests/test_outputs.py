@@ -88,7 +88,7 @@ def write_results(folder: Path) -> Path:
     rows = [
         row(NAMES[number % 6], method, variant=name, omega=name, task="two" if method == "FTL-IGM" else "one", **role)
         for number, name in enumerate(NAMES)
-        for method, role in ((f"FTL-IGM{name}", {}), (name, {}), ("FTL-IGM", {}), (name, {"role": "reference"}))
+        for method, role in (("FTL-IGM", {"form": name}), (name, {}), ("FTL-IGM", {}), (name, {"role": "reference"}))
     ]
     for name in ("ablation", "comparison"):
         append_rows(folder / f"{name}.csv", rows)

@@ -243,6 +243,7 @@ def test_rows_name_no_code(name: str) -> None:
         "go",
         "evil.Called",
         "evil:make",
+        "evil:make",
         "method",
         "1",
         "1.2",

@@ -19,7 +19,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
 from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.distances import Distance
-from ftl_lightning.domains.paper import OURS, Paper
+from ftl_lightning.domains.paper import PAPERS_METHOD, Compared, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
 from ftl_lightning.errors import UserError, short, shown
@@ -302,7 +302,7 @@ class Domain(Shown):
     show: Show = _UNSAID
     observed: Mapping[str, Feature] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
-    ours: str = OURS
+    ours: Compared = PAPERS_METHOD
     headline: str = ACCURACY
     references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
     views: Mapping[str, View] = field(default_factory=dict)

@@ -1,15 +1,33 @@
-"""Numbers that a paper reports, to be shown beside ours."""
+"""Names of methods and of their forms, and numbers that a paper reports, to be shown beside ours."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 OURS = "FTL-IGM"
 """The name of the paper's method."""
 FINE_TUNED = "LoRA fine-tuning"
 """Learning a concept with an adapter that changes the whole network: what ours is compared with."""
-WITH_MODES = " with modes"
-WITH_KNOTS = " over time"
-WITH_ADAPTER = " with adapter"
-"""Added to the name of a method whose concepts have modes, several knots or an adapter, which the paper's have not."""
+WITH_MODES, WITH_KNOTS, WITH_ADAPTER = "with modes", "over time", "with adapter"
+"""Forms of a method whose concepts have modes, several knots or an adapter, which the paper's have not."""
+FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER)
+"""In the order in which several are joined, by one space: ``'with modes over time'``."""
+
+
+class Compared(NamedTuple):
+    """A method in one of its forms, which tables compare with others.
+
+    Attributes:
+        name: such as ``'FTL-IGM'`` or ``'BC'``.
+        form: how its concepts are otherwise than in one set of embeddings that is alike at all times, the paper's form: some of
+            :data:`FORMS`, or a method's own words; empty for the paper's.
+    """
+
+    name: str
+    form: str = ""
+
+
+PAPERS_METHOD = Compared(OURS)
+"""Ours as the paper has it."""
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,11 @@ class EvaluationTask:
 
     def __post_init__(self) -> None:
         for key in ("learned", "texts", "without"):
-            if not isinstance(found := getattr(self, key), tuple):
-                raise UserError(f"evaluation task {self.goal!r}: {key}: expected a tuple of names, found {found!r}")
+            if not isinstance(names := getattr(self, key), tuple):
+                raise UserError(f"evaluation task {self.goal!r}: {key}: expected a tuple of names, found {names!r}")
         if len(self.learned) != 1 and (self.component is not None or self.initial == "demonstrated"):
-            what = "component" if self.component is not None else "initial"
-            raise UserError(f"evaluation task {self.goal!r}: {what}: expected one learned concept, found {len(self.learned)}")
+            key = "component" if self.component is not None else "initial"
+            raise UserError(f"evaluation task {self.goal!r}: {key}: expected one learned concept, found {len(self.learned)}")
 
     @property
     def name(self) -> str:

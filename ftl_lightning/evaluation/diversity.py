@@ -57,7 +57,13 @@ class Real:
 
     @classmethod
     def of(
-        cls, task: EvaluationTask, domain: Domain, count: int, known: Demonstrations | None, root: Path | None = None, seed: int = 0
+        cls,
+        task: EvaluationTask,
+        domain: Domain,
+        count: int,
+        demonstrations: Demonstrations | None,
+        root: Path | None = None,
+        seed: int = 0,
     ) -> Self:
         """What there is.
 
@@ -69,16 +75,16 @@ class Real:
             task: what is generated.
             domain: whose task it is.
             count: of plans that are generated.
-            known: demonstrations of the task's learned concept, if there are any.
+            demonstrations: of the task's learned concept, if there are any.
             root: folder of the user's copy of the data.
             seed: of the fresh samples.
         """
         if task.initial == "demonstrated":
             return cls(task, domain, count, None, None)
-        shown = known if known is not None and task.learned == (task.goal,) and len(known) else None
+        shown = task.learned == (task.goal,) and demonstrations is not None and len(demonstrations) > 0
         drawn = _drawn(domain, task.goal, 2 * count, root, seed)
-        parts = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
-        return cls(task, domain, count, shown, parts)
+        fresh = None if drawn is None else (drawn.rows(list(range(count))), drawn.rows(list(range(count, 2 * count))))
+        return cls(task, domain, count, demonstrations if shown else None, fresh)
 
     def _distance(self, behaviour: Demonstrations) -> Distance:
         """The domain's, or that of plans whose columns are scaled as those of real behaviour."""
@@ -135,9 +141,9 @@ class Real:
         starts = behaviour.initial_states if self.domain.observed else None
         return self.added(Judged.of(self.task, self._windows(behaviour), starts, self.domain))
 
-    def added(self, one: Judged) -> Judged:
-        """The same with its novelty and coverage."""
-        return one.compared(self.values(one.states))
+    def added(self, judged: Judged) -> Judged:
+        """The same behaviour with its novelty and coverage."""
+        return judged.compared(self.values(judged.states))
 
 
 def novelty(distances: Tensor) -> float:

@@ -14,7 +14,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 @runtime_checkable
 class Evaluable(Protocol):
-    """The model, names of the method, of its variant and of learned concepts, and embeddings."""
+    """The model, names of the method, of its form, of its variant and of learned concepts, and embeddings."""
 
     model: ConceptModel
     hparams: Any
@@ -24,6 +24,9 @@ class Evaluable(Protocol):
 
     @property
     def method(self) -> str: ...
+
+    @property
+    def form(self) -> str: ...
 
     @property
     def variant(self) -> str: ...

@@ -86,12 +86,12 @@ def share(values: Tensor) -> float:
     return float(metric.compute())
 
 
-def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
-    """In which episodes ``(sample,)`` one succeeds and a policy, from the same initial state, does not, and the reverse.
+def paired(generated: Judged, reference: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
+    """In which episodes ``(sample,)`` a method succeeds and a policy, from the same initial state, does not, and the reverse.
 
     Args:
-        one: what a method did.
-        other: what the policy did.
+        generated: what the method did.
+        reference: what the policy did.
         policy: its name.
         domain: whose headline decides, if it is an outcome, else success.
 
@@ -99,13 +99,13 @@ def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str,
         both by their metric's name, in the domain's own environment and in each other in which both acted.
     """
     name = domain.headline.removeprefix(f"{CLOSED} ")
-    compared = name if name != domain.headline else SUCCESS
-    found: dict[str, Tensor] = {}
-    for place, ours in one.outcomes.items():
-        if place in other.outcomes and (place == compared or place.startswith(f"{compared} (")):
-            theirs, named = other.outcomes[place], f"{policy}{place.removeprefix(compared)}"
-            found |= {f"{WON}{named}": ours & ~theirs, f"{LOST}{named}": theirs & ~ours}
-    return found
+    decisive = name if name != domain.headline else SUCCESS
+    episodes: dict[str, Tensor] = {}
+    for outcome, by_method in generated.outcomes.items():
+        if outcome in reference.outcomes and (outcome == decisive or outcome.startswith(f"{decisive} (")):
+            by_policy, named = reference.outcomes[outcome], f"{policy}{outcome.removeprefix(decisive)}"
+            episodes |= {f"{WON}{named}": by_method & ~by_policy, f"{LOST}{named}": by_policy & ~by_method}
+    return episodes
 
 
 def standard_error(values: Sequence[float]) -> float:

@@ -33,57 +33,58 @@ def references(
         seed: of the policies.
         environments: of the domain's others, in which the method's was executed besides its own.
     """
-    loop = None if all(one.rollout is None for one in judged) else domain.closed_loop
-    lines = {name: [_planned(name, one, domain, loop, seed, environments) for one in judged] for name in domain.references}
+    loop = None if all(behaviour.rollout is None for behaviour in judged) else domain.closed_loop
+    by_policy = {name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.references}
     if loop is not None:
         for name in loop.policies:
-            acted = (_acted(name, one, domain, loop, demonstrated, seed, environments) for one in judged)
-            lines[name] = [one for one in acted if one is not None]
-    return lines
+            acted = (_acted(name, like, domain, loop, demonstrated, seed, environments) for like in judged)
+            by_policy[name] = [behaviour for behaviour in acted if behaviour is not None]
+    return by_policy
 
 
-def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
-    """A policy that makes its plan once."""
-    key = (name, domain.name, one.task.goal, len(one.states), _hash(one.starts), seed)
+def _planned(name: str, like: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
+    """A policy that makes its plan once, for the task and the initial states of a method's behaviour."""
+    task, starts, (count, _, columns) = like.task, like.starts, like.states.shape
+    key = (name, domain.name, task.goal, count, _hash(starts), seed)
     if key not in _KNOWN:
-        _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.starts, seed)
+        _KNOWN[key] = domain.references[name](task.goal, count, starts, seed)
     plans = _KNOWN[key]
-    if (expected := (len(one.states), domain.plans.horizon, one.states.shape[2])) != tuple(plans.shape):
+    if (expected := (count, domain.plans.horizon, columns)) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")
-    planned = Judged.of(one.task, plans, one.starts, domain)
+    behaviour = Judged.of(task, plans, starts, domain)
     if loop is None:
-        return planned
-    starts = expect_starts(one.starts)
+        return behaviour
+    initial = expect_starts(starts)
     for place in ("", *environments):
         if (*key, "executed", place) not in _KNOWN:
             follower = PlanFollower(fixed_plans(plans), loop.act, loop.steps)
-            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), starts, follower)
-        planned = planned.executed(_KNOWN[*key, "executed", place], domain, place)
-    return planned
+            _KNOWN[*key, "executed", place] = roll_out(loop.inside(place), initial, follower)
+        behaviour = behaviour.executed(_KNOWN[*key, "executed", place], domain, place)
+    return behaviour
 
 
 def _acted(
     name: str,
-    one: Judged,
+    like: Judged,
     domain: Domain,
     loop: ClosedLoop,
     demonstrated: Callable[[str], Demonstrations | None],
     seed: int,
     environments: Sequence[str],
 ) -> Judged | None:
-    """A policy that acts as it goes; ``None`` where it would take too long."""
-    starts = expect_starts(one.starts)
-    known = demonstrations_of(one.task, demonstrated)
+    """A policy that acts as it goes, from the initial states of a method's behaviour; ``None`` where it would take too long."""
+    task, starts = like.task, expect_starts(like.starts)
+    demonstrations, behaviour = demonstrations_of(task, demonstrated), like
     for place in ("", *environments):
-        key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(starts), seed, place)
+        key = (name, domain.name, task.goal, demonstrations.hash if demonstrations else "", _hash(starts), seed, place)
         if key not in _KNOWN:
-            policy = loop.policies[name](one.task.goal, starts, known, seed)
+            policy = loop.policies[name](task.goal, starts, demonstrations, seed)
             _KNOWN[key] = policy and roll_out(loop.inside(place), starts, policy)
         rollout: Rollout | None = _KNOWN[key]
         if rollout is None:
             return None
-        one = one.executed(rollout, domain, place)
-    return one
+        behaviour = behaviour.executed(rollout, domain, place)
+    return behaviour
 
 
 def _hash(starts: InitialStates | None) -> str:

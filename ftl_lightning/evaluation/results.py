@@ -1,6 +1,7 @@
 """The results file: one row for every evaluated number."""
 
 import csv
+import itertools
 import math
 import re
 from dataclasses import asdict, dataclass, fields
@@ -9,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from ftl_lightning.domains.paper import FORMS
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.tensor_file import alone, atomic, visible
@@ -24,8 +26,9 @@ class Row:
 
     Attributes:
         domain, setting, task: what was evaluated.
-        method: the method's family, for example ``'FTL-IGM'`` or ``'BC'``, or a reference line's name.
-        variant: what tells methods of one family apart, for example ``'entities, free'``; may be empty.
+        method: the method's name, for example ``'FTL-IGM'`` or ``'BC'``, or a reference line's.
+        form: of the method, see :class:`~ftl_lightning.domains.paper.Method`, for example ``'with modes'``; empty for the paper's.
+        variant: what tells settings of one method and form apart, for example ``'entities, free'``; may be empty.
         role: :data:`METHOD` or :data:`REFERENCE`.
         K: number of concept components; 0 where nothing was learned.
         omega: the fixed guidance weight as text, ``'learned'``, or ``'none'`` for a method without; empty for a reference line.
@@ -43,6 +46,7 @@ class Row:
     setting: str
     task: str
     method: str
+    form: str = ""
     variant: str = ""
     role: str = METHOD
     K: int
@@ -63,53 +67,77 @@ LARGEST_WHOLE = 2**53
 """Of whole numbers, seeds among them."""
 COLUMNS = [field.name for field in fields(Row)]
 _WHOLE = [field.name for field in fields(Row) if field.type is int]
-_MAYBE_EMPTY = ("setting", "task", "variant", "omega", "model_hash")
+_MAYBE_EMPTY = ("setting", "task", "form", "variant", "omega", "model_hash")
 _TEXT = {field.name: str for field in fields(Row) if field.type is str}
-_BEFORE_VARIANTS = [name for name in COLUMNS if name not in ("variant", "role")]
-"""The columns of files of version 0.1.0 and older."""
-_SUBJECT = ["domain", "setting", "task", "method", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
+_BEFORE_FORMS = [name for name in COLUMNS if name != "form"]
+_BEFORE_VARIANTS = [name for name in _BEFORE_FORMS if name not in ("variant", "role")]
+"""The columns of older files, see :func:`upgraded`."""
+_IN_BRACKETS = r"\((?P<variant>.*)\)"
+_ENDING = f"(?P<form>{'|'.join(' '.join(some) for count in (1, 2, 3) for some in itertools.combinations(FORMS, count))})"
+"""What names in older files end with."""
+_SUBJECT = ["domain", "setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
 _KEY = [*_SUBJECT, "n", "config_hash"]
 """What makes a row the same measurement as another, which it then replaces."""
 
 
 def append_rows(path: str | Path, rows: list[Row]) -> None:
-    """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all."""
+    """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all.
+
+    An older file gets today's columns, also where no rows are added, see :func:`upgraded`.
+    """
     add_rows(path, pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS))
 
 
 def add_rows(path: str | Path, table: pd.DataFrame) -> None:
-    """The same of rows that were read from another file; processes that add to the same file wait for one another."""
+    """Add rows of a table, as :func:`append_rows` does. Processes that add to the same file wait for one another."""
     path = Path(path)
     with alone(path.parent):
         if path.is_file():
-            table = pd.concat([read_rows(path), table])
+            known = read_rows(path)
+            table = known if table.empty else pd.concat([known, table])
         with atomic(path) as temporary:
             table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
 
 
 def upgraded(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a file from before there were the columns ``variant`` and ``role``; nothing else changes, nor their order.
+    """Rows of an older file, under today's columns; nothing else changes, nor their order.
 
-    There a method told its variant in brackets, ``'FTL-IGM (entities, free)'``, and an empty omega marked a reference line, whose
-    name may have brackets of its own, ``'expert (oracle)'``.
+    Before there was ``form``, a method's name told it: ``'FTL-IGM with modes'``. Before there were ``variant`` and ``role``, the
+    name told the variant, too, in brackets, ``'FTL-IGM with modes (entities, free)'``, and an empty omega marked a reference line,
+    whose name may have brackets of its own, ``'expert (oracle)'``.
     """
-    reference = table["omega"] == ""
-    parts = table["method"].str.extract(r"^(?P<method>.*?)(?: \((?P<variant>.*)\))?$").fillna("")
-    return table.assign(
-        method=parts["method"].where(~reference, table["method"]),
-        variant=parts["variant"].where(~reference, ""),
-        role=reference.map({False: METHOD, True: REFERENCE}),
-    )[COLUMNS]
+    if "role" not in table:
+        reference = table["omega"] == ""
+        table = _split(table.assign(variant="", role=reference.map({False: METHOD, True: REFERENCE})), ~reference, _IN_BRACKETS)
+    return (table if "form" in table else split_forms(table.assign(form=""), table["role"] == METHOD))[COLUMNS]
 
 
-def label(method: str, variant: str = "") -> str:
-    """A method's name with its variant in brackets, for tables and legends."""
-    return f"{method} ({variant})" if variant else method
+def split_forms(table: pd.DataFrame, older: pd.Series) -> pd.DataFrame:
+    """With the forms of older rows, which their methods' names end with, in the column ``form``.
+
+    Args:
+        table: with the columns ``method`` and ``form``.
+        older: whether a row is from before there was ``form``; others stay as they are.
+    """
+    return _split(table, older, _ENDING)
+
+
+def _split(table: pd.DataFrame, chosen: pd.Series, ending: str) -> pd.DataFrame:
+    """With what chosen rows' methods end with, a pattern of one named group, in the column of that name."""
+    parts = table["method"].str.extract(rf"(?s)^(?P<method>.+?)(?: {ending})?\Z")
+    return table.assign(**{str(name): values.fillna("").where(chosen, table[name]) for name, values in parts.items()})
+
+
+def label(method: str, form: str = "", variant: str = "") -> str:
+    """What tables and legends show: a method's name and form, and its variant in brackets."""
+    name = f"{method} {form}".strip()
+    return f"{name} ({variant})" if variant else name
 
 
 def labels(rows: pd.DataFrame) -> pd.Series:
     """:func:`label` of each row."""
-    return pd.Series([label(*pair) for pair in zip(rows["method"], rows["variant"], strict=True)], rows.index, dtype=str)
+    told = zip(rows["method"], rows["form"], rows["variant"], strict=True)
+    return pd.Series([label(*names) for names in told], rows.index, dtype=str)
 
 
 def replaced(rows: pd.DataFrame) -> int:
@@ -131,12 +159,12 @@ def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
     """The rows of the files of this name in a folder; without a name, of all that are not shown apart. Maybe none.
 
     Raises:
-        UserError: as :func:`read_rows`.
+        UserError: if there is no such path, or a file has other columns or a cell that is none of its column's.
     """
     path = Path(path)
     files = _files(path) if path.is_dir() else [path]
-    own = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES))]
-    return pd.concat([read_rows(file) for file in own], ignore_index=True) if own else pd.DataFrame(columns=COLUMNS)
+    named = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES))]
+    return pd.concat([read_rows(file) for file in named], ignore_index=True) if named else pd.DataFrame(columns=COLUMNS)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -153,14 +181,14 @@ def _read(file: Path) -> pd.DataFrame:
     table = _table(file, _TEXT)
     if not isinstance(table.index, pd.RangeIndex):
         raise UserError(f"expected {len(table.columns)} cells in each row, found more in some; it is damaged")
-    if list(table.columns) not in (COLUMNS, _BEFORE_VARIANTS):
+    if list(table.columns) not in (COLUMNS, _BEFORE_FORMS, _BEFORE_VARIANTS):
         told = short(", ".join(map(str, table.columns)), 80)
         raise UserError(f"expected the columns {short(', '.join(COLUMNS), 140)}, found {told}")
-    if (found := _bad_cell(table)) is not None:
-        row, column, expected = found
+    if (bad := _bad_cell(table)) is not None:
+        row, column, expected = bad
         cell = _table(file, str).fillna("").iloc[row][column]
         raise UserError(f"row {row + 2}, column {column!r}: expected {expected}, found {shown(cell)}; it is damaged")
-    return table if list(table.columns) == COLUMNS else upgraded(table)
+    return upgraded(table)
 
 
 def _table(file: Path, kinds: Any) -> pd.DataFrame:

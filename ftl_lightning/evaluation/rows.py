@@ -42,7 +42,7 @@ def configuration(
         settings: the evaluator's.
         trainer: what learns. Unusual options of ours count, unless a model is pretrained, which is known by its weights.
     """
-    own, loop = data.hparams.get("demonstrations"), module.model.domain.closed_loop
+    demonstrations, loop = data.hparams.get("demonstrations"), module.model.domain.closed_loop
     unusual = getattr(trainer, "unusual", {}) if "pretrained" in module.hparams else {}
     hparams = [(key, value) for key, value in _public(module.hparams) if key not in ("pretrained", "output")]
     return {
@@ -54,9 +54,13 @@ def configuration(
         "model/pretrained": module.model.hash,
         # A trained judge decides values, too; rules have no identity.
         **{f"metric/{name}": metric.identity for name, metric in module.model.domain.metrics.items() if metric.identity},
-        # A data set with a name and a version, which is no file, is known by these.
-        **({"data/demonstrations": file_hash(own) if Path(own).is_file() else own} if own else {}),
+        **({"data/demonstrations": _identity(demonstrations)} if demonstrations else {}),
     }
+
+
+def _identity(demonstrations: str) -> str:
+    """A file's hash; a data set with a name and a version, which is no file, is known by these."""
+    return file_hash(demonstrations) if Path(demonstrations).is_file() else demonstrations
 
 
 def config_hash(configured: Mapping[str, Any]) -> str:
@@ -83,8 +87,9 @@ def rows(
         variant: told beside the method's name, in place of the module's own words.
     """
     hparams = module.hparams
-    ours = {
+    learned = {
         "method": module.method,
+        "form": module.form,
         "variant": module.variant if variant is None else variant,
         "role": METHOD,
         "K": hparams.get("components", 0),
@@ -92,29 +97,40 @@ def rows(
         "model_hash": module.model.hash,
         "config_hash": config_hash(configured),
     }
-    alike = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
-    alike += [configured["environment"]] if "environment" in configured else []
-    nobody = {"variant": "", "role": REFERENCE, "K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(alike)}
+    shared = [__version__, configured["evaluation/samples"], configured["evaluation/sample_seed"]]
+    shared += [configured["environment"]] if "environment" in configured else []
+    unlearned = {"role": REFERENCE, "K": 0, "omega": "", "model_hash": "", "config_hash": content_hash(shared)}
 
     policies = domain.closed_loop.policies if domain.closed_loop else {}
 
-    def of(one: Judged, what: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
-        subject = {"domain": domain.name, "setting": one.task.setting, "task": one.task.name, "seed": hparams["seed"]}
+    def task_rows(behaviour: Judged, source: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
+        task = behaviour.task
+        subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
         # Reference plans are drawn without demonstrations; policies are given them.
-        known = demonstrations_of(one.task, module.demonstrated) if what["method"] not in domain.references else None
-        subject["demonstrations"] = 0 if known is None else len(known)
-        return [Row(**subject, **what, n=len(one.states), metric=name, value=round(value, 6)) for name, value in values.items()]
+        given = demonstrations_of(task, module.demonstrated) if source["method"] not in domain.references else None
+        subject["demonstrations"] = 0 if given is None else len(given)
+        count = len(behaviour.states)
+        return [Row(**subject, **source, n=count, metric=name, value=round(value, 6)) for name, value in values.items()]
 
     compared = [
         row
-        for name in policies
-        for other in references.get(name, ())
-        for one in judged
-        if one.task == other.task
-        for row in of(one, ours, {metric: share(only) for metric, only in paired(one, other, name, domain).items()})
+        for policy in policies
+        for reference in references.get(policy, ())
+        for behaviour in judged
+        if behaviour.task == reference.task
+        for row in task_rows(
+            behaviour,
+            learned,
+            {metric: share(episodes) for metric, episodes in paired(behaviour, reference, policy, domain).items()},
+        )
     ]
     return [
-        *(row for one in judged for row in of(one, ours, one.values)),
+        *(row for behaviour in judged for row in task_rows(behaviour, learned, behaviour.values)),
         *compared,
-        *(row for name, found in references.items() for one in found for row in of(one, nobody | {"method": name}, one.values)),
+        *(
+            row
+            for name, behaviours in references.items()
+            for behaviour in behaviours
+            for row in task_rows(behaviour, unlearned | {"method": name}, behaviour.values)
+        ),
     ]

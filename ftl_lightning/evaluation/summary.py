@@ -20,7 +20,7 @@ OWN = "own demonstrations"
 """The setting of learned concepts that no suite asks for."""
 
 
-def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
+def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
     """One evaluation: the user's own concepts first, each with its numbers, then the mean of each setting.
 
     Below each, in lines that begin with a dash, stand the reference lines of the same tasks. Errors are standard errors over tasks;
@@ -28,7 +28,7 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
 
     Args:
         rows: of one evaluation, see :func:`ftl_lightning.evaluation.rows.rows`.
-        own: names of tasks that get a line of their own, for example the concepts of the user's own demonstrations.
+        single: names of tasks that get a line of their own, for example the concepts of the user's own demonstrations.
     """
     measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
     metrics = list(dict.fromkeys(row.metric for row in measured))
@@ -37,29 +37,28 @@ def summary_table(rows: Sequence[Row], own: Sequence[str] = ()) -> Table:
     table.add_column("mean ± error over tasks")
     for name in (*metrics, "n"):
         table.add_column(literal(name), justify="right")
-    # Own concepts first, in their order; they are not part of their setting's mean.
-    order = {name: number for number, name in enumerate(own)}
-    single = sorted((row for row in measured if row.task in order), key=lambda row: order[row.task])
-    subjects = dict.fromkeys(_subject(row, own) for row in (*single, *(row for row in measured if row.task not in order)))
+    # Single tasks first, in their order; they are not part of their setting's mean.
+    order = {name: number for number, name in enumerate(single)}
+    task_rows = sorted((row for row in measured if row.task in order), key=lambda row: order[row.task])
+    subjects = dict.fromkeys(_subject(row, single) for row in (*task_rows, *(row for row in measured if row.task not in order)))
     for subject in subjects:
-        alike = [row for row in rows if _subject(row, own) == subject]
-        found = [row for row in measured if _subject(row, own) == subject]
-        table.add_row(literal(_name(found, own)), *(_mean(found, name) for name in metrics), _samples(found))
-        references = [row for row in alike if row.role == REFERENCE]
+        method_rows = [row for row in measured if _subject(row, single) == subject]
+        table.add_row(literal(_name(method_rows, single)), *(_mean(method_rows, name) for name in metrics), _samples(method_rows))
+        references = [row for row in rows if row.role == REFERENCE and _subject(row, single) == subject]
         for name in dict.fromkeys(row.method for row in references):
-            beside = [row for row in references if row.method == name]
-            table.add_row(literal(f"- {name}"), *(_mean(beside, metric, False) for metric in metrics), "", style="dim")
+            reference_rows = [row for row in references if row.method == name]
+            table.add_row(literal(f"- {name}"), *(_mean(reference_rows, metric, False) for metric in metrics), "", style="dim")
     return table
 
 
-def _subject(row: Row, own: Sequence[str]) -> tuple[str, str]:
-    """What a line is about: a task of one's own, or a setting."""
-    return (row.setting, row.task if row.task in own else "")
+def _subject(row: Row, single: Sequence[str]) -> tuple[str, str]:
+    """What a line is about: a single task, or a setting."""
+    return (row.setting, row.task if row.task in single else "")
 
 
-def _name(rows: Sequence[Row], own: Sequence[str]) -> str:
+def _name(rows: Sequence[Row], single: Sequence[str]) -> str:
     setting, task = rows[0].setting, rows[0].task
-    if task in own:
+    if task in single:
         return task if setting == OWN else f"{task} ({setting})"
     return setting
 
@@ -70,7 +69,7 @@ def _title(rows: Sequence[Row]) -> str:
     row = rows[0]
     components = f", K = {row.K}" if row.K else ""
     weight = "" if row.omega == "none" else ", learned weights" if row.omega == "learned" else f", omega {row.omega}"
-    return f"{row.domain}: {label(row.method, row.variant)}{components}{weight}"
+    return f"{row.domain}: {label(row.method, row.form, row.variant)}{components}{weight}"
 
 
 def _mean(rows: Sequence[Row], metric: str, error: bool = True) -> str:
@@ -96,13 +95,13 @@ def literal(text: str, style: str = "") -> Text:
 
 def plain(table: Table) -> str:
     """The table as Markdown, as wide as it needs to be: for log files, pipes and TensorBoard."""
-    own = Table(box=box.MARKDOWN, padding=(0, 1, 0, 1))
+    in_markdown = Table(box=box.MARKDOWN, padding=(0, 1, 0, 1))
     for column in table.columns:
-        own.add_column(Text(markdown(str(column.header))), justify=column.justify)
+        in_markdown.add_column(Text(markdown(str(column.header))), justify=column.justify)
     for cells in zip(*(column.cells for column in table.columns), strict=True):
-        own.add_row(*(Text(markdown(str(cell))) for cell in cells))
+        in_markdown.add_row(*(Text(markdown(str(cell))) for cell in cells))
     file = io.StringIO()
-    Console(file=file, width=100_000, color_system=None).print(own)
+    Console(file=file, width=100_000, color_system=None).print(in_markdown)
     return "\n".join([markdown(str(table.title)), *(row.rstrip() for row in file.getvalue().rstrip().splitlines())])
 
 

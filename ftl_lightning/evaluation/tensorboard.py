@@ -37,7 +37,7 @@ def setting_means(values: Mapping[tuple[str, str], Mapping[str, float]]) -> dict
     for (setting, _), by_metric in values.items():
         for metric, value in by_metric.items():
             by_name.setdefault(f"{metric}/{setting}", []).append(value)
-    return {name: sum(each) / len(each) for name, each in by_name.items()}
+    return {name: sum(task_values) / len(task_values) for name, task_values in by_name.items()}
 
 
 @rank_zero_only
@@ -58,8 +58,8 @@ def log_test(logger: TensorBoardLogger, configuration: Mapping[str, Any], rows: 
         values.setdefault((row.setting, row.task), {})[row.metric] = row.value
     tasks = list(dict.fromkeys(row.task for row in measured))
     first = measured[0]
-    what = {"domain": first.domain, "method": first.method, "variant": first.variant, "tasks": ", ".join(tasks)}
-    log_hparams(logger, what | dict(configuration), setting_means(values), step)
+    subject = {key: getattr(first, key) for key in ("domain", "method", "form", "variant")} | {"tasks": ", ".join(tasks)}
+    log_hparams(logger, subject | dict(configuration), setting_means(values), step)
     logger.experiment.add_text("results/settings", plain(summary_table(rows)), step)
     logger.experiment.add_text("results/tasks", plain(summary_table(rows, tasks)), step)
 

@@ -57,6 +57,11 @@ class Adaptation(pl.LightningModule, ABC):
         return self.model.method.name
 
     @property
+    def form(self) -> str:
+        """How its concepts are otherwise than in the method's usual form, in words behind its name in tables; empty for that."""
+        return ""
+
+    @property
     def variant(self) -> str:
         """What tells it apart from others of the same method in tables; may be empty."""
         return ""

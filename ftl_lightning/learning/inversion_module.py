@@ -7,7 +7,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.domains.paper import FINE_TUNED, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
+from ftl_lightning.domains.paper import FINE_TUNED
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion import Inversion, check_settings
@@ -93,12 +93,17 @@ class InversionModule(ExactResume, Adaptation):
 
     @property
     def method(self) -> str:
+        """The model's; with an adapter of the whole network it is fine-tuning."""
+        return FINE_TUNED if self._fine_tuned else super().method
+
+    @property
+    def form(self) -> str:
         """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
-        if self.settings.adapter.rank and self.settings.adapter.scope == "all":
-            return FINE_TUNED
-        modes, knots, adapter = (self.settings.modes.sets != 1, self.settings.embeddings.knots > 1, self.settings.adapter.rank > 0)
-        forms = [name for name, has in ((WITH_MODES, modes), (WITH_KNOTS, knots), (WITH_ADAPTER, adapter)) if has]
-        return "".join((super().method, *forms))
+        return "" if self._fine_tuned else self.model.method.form(self.hparams)
+
+    @property
+    def _fine_tuned(self) -> bool:
+        return self.settings.adapter.rank > 0 and self.settings.adapter.scope == "all"
 
     @property
     def variant(self) -> str:

@@ -65,6 +65,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     raw: M
     flat: ClassVar[Mapping[str, str]] = {}
     """Of options in groups, where each is by its flat name, ``'group.option'``, see :mod:`ftl_lightning.learning.options`."""
+    form: str = ""
+    """Words behind the name in tables, of a method that has several forms."""
     variant: str = ""
     """What tells it apart from others of the same method in tables."""
     concepts: tuple[str, ...] = ()

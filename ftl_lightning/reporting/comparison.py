@@ -6,8 +6,8 @@ from itertools import zip_longest
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS, WITH_MODES, Published
-from ftl_lightning.evaluation.results import METHOD, REFERENCE, latest
+from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
+from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
 from ftl_lightning.reporting.paired import leads, least_certain, same_outcome, signed
 from ftl_lightning.reporting.shown import (
     domain_of,
@@ -19,10 +19,21 @@ from ftl_lightning.reporting.shown import (
     settings,
     training_settings,
 )
-from ftl_lightning.reporting.tables import MISSING, Number, Table, against, difference_to, make_table, paper, select, summarise
+from ftl_lightning.reporting.tables import (
+    MISSING,
+    Number,
+    Table,
+    against,
+    difference_to,
+    make_table,
+    of_method,
+    paper,
+    select,
+    summarise,
+)
 
 LANGUAGE = "language"
-METHODS = (OURS, f"{OURS}{WITH_MODES}", "BC", "CVAE", "in-context", LANGUAGE)
+METHODS = (PAPERS_METHOD, Compared(OURS, WITH_MODES), *map(Compared, ("BC", "CVAE", "in-context", LANGUAGE)))
 """The order of methods in tables; others come after them."""
 ALIKE = 0.9
 """In this share of episodes, at least, a reference policy ends as ours does to be told."""
@@ -40,9 +51,10 @@ def compared(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
     return latest(select(results, domain=domain.name, role=METHOD))
 
 
-def methods(rows: pd.DataFrame) -> list[str]:
-    """The methods among the rows: ours, the paper's baselines, and others as they appear."""
-    measured = dict.fromkeys(rows.loc[rows["role"] == METHOD, "method"])
+def methods(rows: pd.DataFrame) -> list[Compared]:
+    """The methods among the rows, each in its forms: ours, the paper's baselines, and others as they appear."""
+    learned = rows[rows["role"] == METHOD]
+    measured = dict.fromkeys(map(Compared, learned["method"], learned["form"]))
     return [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
 
 
@@ -59,16 +71,16 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
     for setting in settings(domain, rows):
         for metric in shown or metrics(domain):
             own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
-            numbers = [(method, summarise(select(own, method=method))) for method in methods(rows)]
-            numbers += [(name, summarise(select(around, method=name))) for name in sorted(set(around["method"]))]
+            numbers = [(method, summarise(of_method(own, method))) for method in methods(rows)]
+            numbers += [(Compared(name), summarise(select(around, method=name))) for name in sorted(set(around["method"]))]
             tested = {
                 lead.baseline: [signed(lead.difference), lead.shown]
                 for lead in leads(own, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
             }
             for method, number in numbers:
                 if number:
-                    theirs = lookup(domain, setting, metric, method=method)
-                    lines.append([setting, metric, method, *beside(number, theirs), *tested.get(method, [MISSING, MISSING])])
+                    told = beside(number, lookup(domain, setting, metric, method=method))
+                    lines.append([setting, metric, label(*method), *told, *tested.get(method, [MISSING, MISSING])])
     caption = f"{domain.name}: all methods{_learned_from(rows)}"
     return make_table(
         domain, "comparison", caption, lines, ["setting", "metric", "method", *BESIDE, "ours is better by", "ours is"]
@@ -92,10 +104,10 @@ def beside(number: Number, theirs: Published | None) -> list[str]:
     return [f"{number.mean:.2f}", error, spread, paper(theirs), difference_to(theirs, number)]
 
 
-def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[str]:
+def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
     """The baselines of a setting; of training concepts language is ours, the same model and the same words."""
     same = setting in training_settings(domain)
-    return [name for name in methods(rows) if not name.startswith(OURS) and not (name == LANGUAGE and same)]
+    return [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and same)]
 
 
 def overview(results: pd.DataFrame) -> Table:
@@ -132,7 +144,7 @@ def _overview(results: pd.DataFrame, lines: list[list[str]]) -> Table:
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{papers}; lead: by how much ours is better than the best baseline"
     )
-    columns = ["domain", "setting, metric", *methods(results), "lead", "reference lines"]
+    columns = ["domain", "setting, metric", *(label(*method) for method in methods(results)), "lead", "reference lines"]
     return Table("overview", caption, pd.DataFrame(lines, columns=columns, dtype=str))
 
 
@@ -141,17 +153,17 @@ def _domains(results: pd.DataFrame) -> list[Domain]:
 
 
 def _line(
-    domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, names: Sequence[str]
+    domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, names: Sequence[Compared]
 ) -> list[str]:
     own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
     cells = [_cell(domain, own, method, setting, metric) for method in names]
     lead = least_certain(leads(own, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric)))
-    alike = _alike(domain, select(rows, setting=setting, method=domain.ours)) if metric == domain.headline else {}
+    alike = _alike(domain, of_method(select(rows, setting=setting), domain.ours)) if metric == domain.headline else {}
     return [domain.name, f"{setting}, {metric}", *cells, MISSING if lead is None else str(lead), _around(around, alike)]
 
 
-def _cell(domain: Domain, rows: pd.DataFrame, method: str, setting: str, metric: str) -> str:
-    number, theirs = summarise(select(rows, method=method)), lookup(domain, setting, metric, method=method)
+def _cell(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> str:
+    number, theirs = summarise(of_method(rows, method)), lookup(domain, setting, metric, method=method)
     if number is None:
         return MISSING
     error = "" if number.error is None else f" ± {number.error:.2f}"

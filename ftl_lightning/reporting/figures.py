@@ -12,6 +12,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.escape import figure_text
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import REFERENCE, latest
+from ftl_lightning.evaluation.results import label as method_label
 from ftl_lightning.extras import expect_extra
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
@@ -19,7 +20,7 @@ from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.frontier import NOISY
 from ftl_lightning.reporting.shown import lookup, main_omega, settings
 from ftl_lightning.reporting.speed import Measured, reached
-from ftl_lightning.reporting.tables import labelled, main_rows, select, summarise
+from ftl_lightning.reporting.tables import labelled, main_rows, of_method, select, summarise
 
 PAPER_COLOUR = "#9a9a9a"
 COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3", "#c9a227")
@@ -98,10 +99,10 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3), 3.4), layout="constrained")
     axes = figure.subplots()
     for index, method in enumerate(names):
-        own, colour = select(rows, method=method), colours[method]
+        own, colour = of_method(rows, method), colours[method]
         for place, setting in enumerate(shown):
             where = place + (index - (len(names) - 1) / 2) * width
-            label = None if place else figure_text(method)
+            label = None if place else figure_text(method_label(*method))
             if number := summarise(own[own["setting"] == setting]):
                 axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
             elif label and not own.empty:

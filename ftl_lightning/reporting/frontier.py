@@ -14,16 +14,17 @@ import numpy as np
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS
+from ftl_lightning.domains.paper import PAPERS_METHOD
+from ftl_lightning.evaluation.results import label, split_forms
 from ftl_lightning.reporting.listed import read_listed
-from ftl_lightning.reporting.tables import MISSING, Table, make_table
+from ftl_lightning.reporting.tables import MISSING, Table, make_table, of_method
 from ftl_lightning.tensor_file import write_text
 
 FRONTIER = "frontier.json"
 """Name of the file in a folder of results."""
 NOISY = "demonstrations with noise"
 """A line for which nothing is learned; its temperature is the noise, as a share of the demonstrations' standard deviation."""
-SUBJECT = ["domain", "suite", "setting", "task", "method", "variant", "temperature", "seed", "n"]
+SUBJECT = ["domain", "suite", "setting", "task", "method", "form", "variant", "temperature", "seed", "n"]
 """Columns that tell one measurement from another; ``temperature`` is missing for reference lines and for methods without one."""
 COLUMNS = [*SUBJECT, "accuracy", "novelty", "coverage"]
 """``accuracy`` is the domain's main metric; what was not measured is missing."""
@@ -43,6 +44,7 @@ class _Row:
     method: str
     seed: int
     n: int
+    form: str | None = None
     variant: str = ""
     temperature: float = math.nan
     accuracy: float = math.nan
@@ -53,6 +55,8 @@ class _Row:
 def read_frontier(path: str | Path) -> pd.DataFrame:
     """The measurements of a file, or of the folder that holds it; none where there is no file.
 
+    Older rows have no ``form``; their methods' names tell it, see :func:`ftl_lightning.evaluation.results.split_forms`.
+
     Raises:
         UserError: naming the file and the row, for one of something else.
     """
@@ -61,7 +65,9 @@ def read_frontier(path: str | Path) -> pd.DataFrame:
     if not path.is_file() or path.suffix != ".json":
         return pd.DataFrame(columns=COLUMNS)
     rows = [asdict(row) for row in read_listed(path, "rows", _Row, f"rows of {', '.join(COLUMNS)}")]
-    return pd.DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(_NUMBERS, float))
+    table = pd.DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(_NUMBERS, float))
+    older = table["form"].isna()
+    return split_forms(table.assign(form=table["form"].fillna("").astype(str)), older)
 
 
 def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
@@ -91,13 +97,14 @@ def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
     lines = []
     rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])
     for (suite, setting), own in rows.groupby(["suite", "setting"], sort=False):
-        reference = own[(own["method"] == OURS) & (own["temperature"] == 1.0)]["coverage"].mean()
-        for method, each in own.groupby("method", sort=False):
+        ours = of_method(own, PAPERS_METHOD)
+        reference = ours[ours["temperature"] == 1.0]["coverage"].mean()
+        for method, each in own.groupby(["method", "form"], sort=False):
             equal = accuracy_at(each, reference)
             means = each.groupby("temperature", dropna=False)[["accuracy", "novelty", "coverage"]].mean().reset_index()
             for values in means.to_numpy():
                 numbers = [*(f"{value:.2f}" for value in values[1:]), "" if equal is None else f"{equal:.2f}"]
-                cells = [suite, setting, method, f"{values[0]:g}", *numbers]
+                cells = [suite, setting, label(*map(str, method)), f"{values[0]:g}", *numbers]
                 lines.append([MISSING if cell in ("nan", "") else str(cell) for cell in cells])
     columns = ["suite", "setting", "method", "temperature", "accuracy", "novelty", "coverage", "accuracy at equal coverage"]
     return make_table(domain, "frontier", f"{domain.name}: accuracy, novelty and coverage (less is better)", lines, columns)

@@ -8,6 +8,9 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binom
 
+from ftl_lightning.domains.paper import Compared
+from ftl_lightning.evaluation.results import label
+
 LEVEL = 0.05
 """A difference is shown where p is below this."""
 EXACT = 20
@@ -62,14 +65,14 @@ class Lead:
     """Ours beside a baseline, in one setting and metric.
 
     Attributes:
-        baseline: its name.
+        baseline: which.
         difference: by how much ours is better, negative where the baseline is: the mean over tasks of means over seeds.
         pairs: of task and seed that both were measured on.
         p: after Holm's correction; ``None`` where the pairs are too few to show anything.
         same: whether every pair is equal.
     """
 
-    baseline: str
+    baseline: Compared
     difference: float
     pairs: int
     p: float | None
@@ -93,7 +96,7 @@ class Lead:
         return f"{self.verdict} ({because})"
 
     def __str__(self) -> str:
-        return f"{signed(self.difference)} against {self.baseline}, {self.shown}"
+        return f"{signed(self.difference)} against {label(*self.baseline)}, {self.shown}"
 
 
 def signed(difference: float) -> str:
@@ -115,7 +118,7 @@ def chance(p: float) -> str:
     return "p = 1" if p == 1 else f"p = {p:.{3 if p < 0.1 else 2}f}".replace("0.", ".", 1)
 
 
-def leads(rows: pd.DataFrame, ours: str, baselines: Sequence[str], less: bool = False) -> list[Lead]:
+def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], less: bool = False) -> list[Lead]:
     """Ours beside each baseline, by a sign-flip permutation test of differences paired by task and seed.
 
     Seeds of a task are not independent tasks. Where tasks are enough, the signs of whole tasks are flipped, and p speaks of tasks
@@ -125,7 +128,7 @@ def leads(rows: pd.DataFrame, ours: str, baselines: Sequence[str], less: bool = 
     no matter that the best of them is known only afterwards.
 
     Args:
-        rows: of one setting and metric, with ``task``, ``seed``, ``method`` and ``value``.
+        rows: of one setting and metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
         ours: the method that is compared.
         baselines: methods that it is compared with; those without rows are left out.
         less: whether of the metric less is better.
@@ -133,11 +136,14 @@ def leads(rows: pd.DataFrame, ours: str, baselines: Sequence[str], less: bool = 
     Returns:
         In the order of ``baselines``; none where ours or all of them were not measured.
     """
-    values = rows.pivot_table(index=["task", "seed"], columns="method", values="value") * (-1 if less else 1)
+    values = {
+        Compared(*map(str, named)): measured.groupby(["task", "seed"])["value"].mean() * (-1 if less else 1)
+        for named, measured in rows.groupby(["method", "form"])
+    }
     found = {
-        name: differences
-        for name in baselines
-        if {ours, name} <= set(values.columns) and not (differences := (values[ours] - values[name]).dropna()).empty
+        baseline: differences
+        for baseline in baselines
+        if {ours, baseline} <= set(values) and not (differences := (values[ours] - values[baseline]).dropna()).empty
     }
     parts = {name: _parts(differences, len(found)) for name, differences in found.items()}
     corrected = dict(zip(parts, holm([sign_flip(flipped) for flipped in parts.values()]), strict=True))

@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS
+from ftl_lightning.domains.paper import OURS, PAPERS_METHOD
 from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
 from ftl_lightning.limits import read_text
@@ -20,7 +20,7 @@ from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, fron
 from ftl_lightning.reporting.frontier import FRONTIER, frontier_table, read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.tables import Table, select, tables
+from ftl_lightning.reporting.tables import Table, of_method, select, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
@@ -62,7 +62,7 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
             found.append(_written(comparison_table(domain, comparison), out / name))
             for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
                 _save(comparison_bars(domain, comparison, metric), out / name / f"comparison_{_file(metric)}.png")
-        elif any(not method.startswith(OURS) for method in methods(compared(domain, ablations))):
+        elif any(method.name != OURS for method in methods(compared(domain, ablations))):
             found.append(_written(comparison_table(domain, ablations), out / name))
         if name in set(curves["domain"]):
             found.append(_written(curves_table(domain, curves), out / name))
@@ -92,8 +92,8 @@ def _expect_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
     if (count := len({name for rows in studies for name in rows["domain"]})) > MOST_DOMAINS:
         raise UserError(f"{results}: expected at most {MOST_DOMAINS} domains, found {count}; report fewer files at a time")
     for domain, own in (found for rows in studies for found in rows.groupby("domain")):
-        ours = own[own["method"] == OURS]
-        cells = own["setting"].nunique() * len(own.groupby(["method", "variant"]))
+        ours = of_method(own, PAPERS_METHOD)
+        cells = own["setting"].nunique() * len(own.groupby(["method", "form", "variant"]))
         cells += ours["setting"].nunique() * ours["variant"].nunique() * ours["K"].nunique() * ours["omega"].nunique()
         if cells > MOST_CELLS:
             raise UserError(

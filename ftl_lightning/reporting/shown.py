@@ -8,7 +8,7 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.from_file import OWN
-from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError, shown
@@ -114,7 +114,13 @@ def papers_omega(domain: Domain) -> str:
 
 
 def lookup(
-    domain: Domain, setting: str, metric: str, task: str = "", components: int = 2, omega: str = "", method: str = OURS
+    domain: Domain,
+    setting: str,
+    metric: str,
+    task: str = "",
+    components: int = 2,
+    omega: str = "",
+    method: Compared = PAPERS_METHOD,
 ) -> Published | None:
     """The paper's number, if it has one.
 
@@ -123,13 +129,13 @@ def lookup(
         setting, metric, task: as in a row of the results; without a task the mean of the setting.
         components: K; of a baseline it does not matter.
         omega: the guidance weight as text; empty for that of the paper's main figures. Of a baseline it does not matter.
-        method: ours, or a baseline.
+        method: ours, or a baseline; the paper has numbers of its own form alone.
     """
-    form = (components, omega or papers_omega(domain))
-    for found in published(domain):
-        same = (found.setting, found.metric, found.task, found.method) == (setting, metric, task, method)
-        if same and (method != OURS or (found.components, found.omega) == form):
-            return found
+    learned = (components, omega or papers_omega(domain))
+    for number in published(domain):
+        same = (number.setting, number.metric, number.task, Compared(number.method)) == (setting, metric, task, method)
+        if same and (method.name != OURS or (number.components, number.omega) == learned):
+            return number
     return None
 
 

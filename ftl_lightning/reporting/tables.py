@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
-from ftl_lightning.domains.paper import OURS, Published
+from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.errors import UserError
 from ftl_lightning.escape import latex, latex_row, markdown
 from ftl_lightning.evaluation.judged import LOST, WON, standard_error
@@ -111,6 +111,11 @@ def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
     return rows
 
 
+def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:
+    """The rows of a method in one of its forms."""
+    return select(rows, method=method.name, form=method.form)
+
+
 def paper(found: Published | None) -> str:
     """The paper's number with its standard error."""
     if found is None:
@@ -158,7 +163,7 @@ def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
 
 
 def labelled(rows: pd.DataFrame) -> pd.DataFrame:
-    """With a column ``label``: the method with its variant."""
+    """With a column ``label``: the method with its form and variant."""
     return rows.assign(label=labels(rows))
 
 
@@ -192,7 +197,7 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
         components, weight = usual if usual in measured else measured.most_common(1)[0][0]
         chosen.append(select(own, K=components, omega=weight))
     found = pd.concat(chosen).loc[lambda some: rows.index.intersection(some.index)] if chosen else rows
-    ours = found["method"].str.startswith(OURS)
+    ours = found["method"] == OURS
     forms = set(_forms(found[ours]))
     common = usual if usual in forms or not forms else next(iter(forms)) if len(forms) == 1 else None
     marks = [
@@ -318,7 +323,7 @@ def _grid(
 
 def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The ablation on the number of learned concepts, with learned weights."""
-    own = select(rows, method=OURS, omega=LEARNED)
+    own = select(of_method(rows, PAPERS_METHOD), omega=LEARNED)
     lines = [
         (
             setting,
@@ -335,7 +340,7 @@ def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
 
 def _omega(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The effect of the guidance weight, K = 2, or the K that was measured most."""
-    own = select(rows, method=OURS)
+    own = of_method(rows, PAPERS_METHOD)
     counts = Counter(components for components, _ in _forms(own) if components)
     count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
     own = select(own, K=count)

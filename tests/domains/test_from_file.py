@@ -308,7 +308,7 @@ def test_the_training_concepts_are_learned(fitted: Path) -> None:
     model = load_model(fitted)
 
     class Known:
-        method, variant, concepts, hparams = "known", "", (), {"seed": 0}
+        method, form, variant, concepts, hparams = "known", "", "", (), {"seed": 0}
 
         def __init__(self) -> None:
             self.model = model

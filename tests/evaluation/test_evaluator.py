@@ -19,7 +19,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, standard_error
-from ftl_lightning.evaluation.results import Row, append_rows, labels, read_rows
+from ftl_lightning.evaluation.results import COLUMNS, Row, append_rows, label, labels, read_rows
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning.generative_model import GenerativeModel
 
@@ -28,6 +28,7 @@ class Trained:
     """The least that an evaluated module offers: a model and its training concepts."""
 
     method = "trained"
+    form = ""
     variant = ""
     concepts: tuple[str, ...] = ()
 
@@ -169,8 +170,73 @@ def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path) -> Non
     new = pd.read_csv(path, dtype=str, keep_default_na=False)
     kept = [name for name in old.columns if name != "method"]
     assert new[kept].head(len(old)).equals(old[kept])  # text for text
+    assert (new["form"] == "").all()
     append_rows(path, [row(task="a, b", method="FTL-IGM", variant="steps, set, near span 0.1", value=0.75)])
     assert read_rows(path)["value"].tolist() == [1.0, 0.25, 0.1, 0.5, 0.75]  # the same measurement, replaced
+
+
+BEFORE_FORMS = """domain,setting,task,method,variant,role,K,omega,demonstrations,seed,n,metric,value,model_hash,config_hash,version
+d,s,a,FTL-IGM,free,method,2,1.2,5,0,50,accuracy,0.5,00e1,c,0.1.0
+d,s,a,FTL-IGM with modes over time,"free, 8 knots",method,2,learned,5,0,50,accuracy,0.333333,00e1,d,0.1.0
+d,s,a,FTL-IGM over time with adapter,free,method,1,1.0,5,0,50,accuracy,1e-06,00e1,e,0.1.0
+d,s,a,MINE with adapter,,method,1,1.0,5,0,50,accuracy,1.0,00e1,f,0.1.0
+d,s,a,without modes,,method,1,1.0,5,0,50,accuracy,1.0,00e1,g,0.1.0
+d,s,a,a walk with modes,,reference,0,,5,0,50,accuracy,0.1,,h,0.1.0
+"""
+TOLD_APART = [
+    ("FTL-IGM", ""),
+    ("FTL-IGM", "with modes over time"),
+    ("FTL-IGM", "over time with adapter"),
+    ("MINE", "with adapter"),
+    ("without modes", ""),
+    ("a walk with modes", ""),
+]
+
+
+def test_in_a_file_from_before_forms_methods_and_their_forms_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(BEFORE_FORMS)
+    table = read_rows(path)
+    assert table.columns.tolist() == COLUMNS
+    assert list(zip(table["method"], table["form"], strict=True)) == TOLD_APART
+    assert [label(*told) for told in TOLD_APART] == pd.read_csv(path)["method"].tolist()
+
+
+def test_a_file_from_before_variants_may_tell_a_form_too(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(OLD.replace("FTL-IGM (steps", "FTL-IGM with modes (steps"))
+    told = read_rows(path)[["method", "form", "variant", "role"]]
+    assert told.iloc[0].tolist() == ["FTL-IGM", "with modes", "steps, set, near span 0.1", "method"]
+    assert told.iloc[1].tolist() == ["expert (oracle)", "", "", "reference"]
+
+
+@pytest.mark.parametrize("added", [[], [{"task": "b"}]])
+def test_a_file_from_before_forms_is_written_with_them_and_keeps_the_rest_text_for_text(
+    added: list[dict[str, object]], tmp_path: Path
+) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(BEFORE_FORMS)
+    old = pd.read_csv(path, dtype=str, keep_default_na=False)
+    append_rows(path, [row(**changes) for changes in added])
+    new = pd.read_csv(path, dtype=str, keep_default_na=False)
+    assert new.columns.tolist() == COLUMNS
+    assert len(new) == len(old) + len(added)
+    assert list(zip(new["method"], new["form"], strict=True))[: len(old)] == TOLD_APART
+    kept = [name for name in old.columns if name != "method"]
+    assert new[kept].head(len(old)).equals(old[kept])
+    written = path.read_bytes()
+    append_rows(path, [])
+    assert path.read_bytes() == written  # once is enough
+
+
+def test_the_same_measurement_in_an_older_file_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(BEFORE_FORMS)
+    same = {"method": "FTL-IGM", "form": "with modes over time", "variant": "free, 8 knots", "omega": "learned"}
+    append_rows(path, [row(task="a", config_hash="d", value=0.75, **same)])
+    table = read_rows(path)
+    assert len(table) == len(TOLD_APART)
+    assert table.loc[table["form"] == "with modes over time", "value"].tolist() == [0.75]
 
 
 def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_by_name_and_version(tiny: Path) -> None:

@@ -46,7 +46,7 @@ def test_the_hparams_tab_shows_all_domains_with_their_metrics_and_tasks(tmp_path
     experiment = context.experiment_from_metadata(asked, "", True, content, [])
     assert {info.name.tag for info in experiment.metric_infos} == {"accuracy/new concept", "accuracy/new initial state"}
     found = {info.name: info for info in experiment.hparam_infos}
-    assert {"domain", "method", "variant", "tasks", "model/omega", "model/levels"} == set(found)
+    assert {"domain", "method", "form", "variant", "tasks", "model/omega", "model/levels"} == set(found)
     assert set(found["domain"].domain_discrete) == {"here", "there"}
     assert list(found["tasks"].domain_discrete) == ["a, b"]
     events = EventAccumulator(str(tmp_path / "here" / "invert" / "hparams")).Reload()

@@ -440,7 +440,23 @@ def test_options_of_the_trainer_that_change_what_is_learned_are_part_of_the_iden
 def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told: str) -> None:
     plain, module = InversionModule(str(tiny)), InversionModule(str(tiny), modes=modes)  # type: ignore[arg-type]
     assert module.variant == plain.variant + told
-    assert (module.method == plain.method) == (modes == 1)
+    assert module.method == plain.method == "FTL-IGM"
+    assert (plain.form, module.form) == ("", "" if modes == 1 else "with modes")
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"knots": 2}, ("FTL-IGM", "over time")),
+        ({"modes": 2, "knots": 2}, ("FTL-IGM", "with modes over time")),
+        ({"adapter": 2}, ("FTL-IGM", "with adapter")),
+        ({"adapter": 2, "knots": 2}, ("FTL-IGM", "over time with adapter")),
+        ({"adapter": 2, "adapter_scope": "all"}, ("LoRA fine-tuning", "")),
+    ],
+)
+def test_a_method_and_its_form_are_told_apart(tiny: Path, settings: dict[str, Any], told: tuple[str, str]) -> None:
+    module = InversionModule(str(tiny), **settings)
+    assert (module.method, module.form) == told
 
 
 @pytest.mark.parametrize("samples", [2, 8])

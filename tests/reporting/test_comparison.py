@@ -7,6 +7,7 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.domains.paper import Compared
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
@@ -14,6 +15,7 @@ from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
+from ftl_lightning.reporting.tables import tables
 from tests.conftest import ROOT
 
 DOMAIN = load_domain("object_rearrangement")
@@ -95,6 +97,34 @@ def test_a_method_of_ones_own_stands_beside_the_others(results: Path) -> None:
     assert list(cells.columns[2:-2]) == ["FTL-IGM", "BC", "CVAE", "language", "mine"]
     assert cells.iloc[0]["lead"] == "-0.20 against mine, undecided (2 pairs)"
     assert "mine" in comparison_table(DOMAIN, rows).cells["method"].tolist()
+
+
+def test_a_form_of_a_method_of_ones_own_is_a_column_of_its_own(results: Path) -> None:
+    mine = [row("MY-METHOD", task, value, form=form) for form, value in (("", 0.1), ("with prompts", 1.0)) for task in "ab"]
+    append_rows(results / "comparison.csv", mine)
+    append_rows(results / "own.csv", mine)
+    rows = read_study(results, "comparison")
+    cells = overview(rows).cells
+    assert list(cells.columns[5:-2]) == ["language", "MY-METHOD", "MY-METHOD with prompts"]
+    assert cells.iloc[0][["MY-METHOD", "MY-METHOD with prompts"]].tolist() == ["0.10 ± 0.00", "1.00 ± 0.00"]
+    assert cells.iloc[0]["lead"] == "-0.20 against MY-METHOD with prompts, undecided (2 pairs)"
+    told = comparison_table(DOMAIN, rows).cells.set_index("method")["measured"]
+    assert told[["MY-METHOD", "MY-METHOD with prompts"]].tolist() == ["0.10", "1.00"]
+    accuracy = next(table.cells for table in tables(DOMAIN, read_study(results)) if table.name == "accuracy")
+    assert {"MY-METHOD (free)", "MY-METHOD with prompts (free)"} < set(accuracy.columns)
+    legend = comparison_bars(DOMAIN, rows).axes[0].get_legend_handles_labels()[1]
+    assert {"MY-METHOD", "MY-METHOD with prompts"} < set(legend)
+
+
+def test_a_form_of_ours_is_no_baseline_and_others_are_compared_with_the_domains_own(results: Path) -> None:
+    append_rows(results / "comparison.csv", [row("FTL-IGM", task, 1.0, form="with modes") for task in "ab"])
+    rows = read_study(results, "comparison")
+    line = overview(rows).cells.iloc[0]
+    assert line["FTL-IGM with modes"] == "1.00 ± 0.00"  # the paper has no number of it
+    assert line["lead"] == "+0.30 against BC, undecided (2 pairs)"
+    by_modes = replace(DOMAIN, ours=Compared("FTL-IGM", "with modes"))
+    told = comparison_table(by_modes, rows).cells.set_index("method")["ours is better by"]
+    assert told[["FTL-IGM", "FTL-IGM with modes", "BC"]].tolist() == ["-", "-", "+0.50"]
 
 
 def test_the_overview_says_who_is_ahead_by_the_paired_test(results: Path) -> None:

@@ -1,5 +1,6 @@
 """The file of accuracy over coverage, and its figure."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,13 +11,14 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import Row, append_rows
 from ftl_lightning.reporting.figures import frontier
-from ftl_lightning.reporting.frontier import read_frontier, write_frontier
+from ftl_lightning.reporting.frontier import frontier_table, read_frontier, write_frontier
 
 DOMAIN = load_domain("object_rearrangement")
 
 
 def row(method: str, temperature: float | None, accuracy: float, coverage: float | None, **changes: object) -> dict[str, object]:
-    what = {"domain": DOMAIN.name, "suite": "validation", "setting": "new concept", "task": "t", "variant": "", "seed": 0, "n": 9}
+    what = {"domain": DOMAIN.name, "suite": "validation", "setting": "new concept", "task": "t", "seed": 0, "n": 9}
+    what |= {"form": "", "variant": ""}
     values = {"method": method, "temperature": temperature, "accuracy": accuracy, "novelty": None, "coverage": coverage}
     return {**what, **values, **changes}
 
@@ -41,6 +43,17 @@ def test_measurements_are_added_and_the_same_are_replaced(tmp_path: Path) -> Non
     assert found.loc[found["method"] == "BC", "accuracy"].tolist() == [0.8, 0.7]
     assert found["novelty"].isna().all()
     assert found.loc[found["method"] == "FTL-IGM", "temperature"].tolist() == [1.0, 0.1, 0.1]
+
+
+def test_a_file_from_before_forms_is_read_and_added_to(tmp_path: Path) -> None:
+    path = tmp_path / "frontier.json"
+    older = [row("FTL-IGM with modes", 0.1, 0.5, 1.0), row("FTL-IGM", 0.1, 0.4, 1.5)]
+    path.write_text(json.dumps({"rows": [{name: cell for name, cell in told.items() if name != "form"} for told in older]}))
+    write_frontier(path, [row("FTL-IGM", 0.1, 0.75, 1.0, form="with modes")])
+    found = read_frontier(path)
+    assert found[["method", "form", "accuracy"]].to_numpy().tolist() == [["FTL-IGM", "", 0.4], ["FTL-IGM", "with modes", 0.75]]
+    cells = frontier_table(DOMAIN, found).cells
+    assert cells["method"].tolist() == ["FTL-IGM", "FTL-IGM with modes"]
 
 
 def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:

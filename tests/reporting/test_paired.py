@@ -1,13 +1,14 @@
 import pandas as pd
 import pytest
 
+from ftl_lightning.domains.paper import Compared
 from ftl_lightning.reporting.paired import Lead, episodes, holm, leads, least_certain, sign_flip
 
 
 def measured(**methods: list[list[float]]) -> pd.DataFrame:
     """Values by method, task and seed."""
     return pd.DataFrame(
-        {"method": method, "task": f"task {task}", "seed": seed, "value": value}
+        {"method": method, "form": "", "task": f"task {task}", "seed": seed, "value": value}
         for method, tasks in methods.items()
         for task, seeds in enumerate(tasks)
         for seed, value in enumerate(seeds)
@@ -15,7 +16,7 @@ def measured(**methods: list[list[float]]) -> pd.DataFrame:
 
 
 def one(**methods: list[list[float]]) -> Lead:
-    (found,) = leads(measured(**methods), "ours", ["BC"])
+    (found,) = leads(measured(**methods), Compared("ours"), [Compared("BC")])
     return found
 
 
@@ -73,10 +74,10 @@ def test_whole_tasks_are_flipped_where_they_are_enough_so_that_seeds_are_not_tak
 
 def test_more_baselines_need_more_pairs() -> None:
     rows = measured(ours=[[0.6]] * 7, BC=[[0.5]] * 7, CVAE=[[0.4]] * 7, language=[[0.3]] * 7)
-    assert [lead.p for lead in leads(rows, "ours", ["BC", "CVAE"])] == [4 / 128] * 2
-    assert [lead.p for lead in leads(rows, "ours", ["BC", "CVAE", "language"])] == [6 / 128] * 3
+    assert [lead.p for lead in leads(rows, Compared("ours"), [*map(Compared, ["BC", "CVAE"])])] == [4 / 128] * 2
+    assert [lead.p for lead in leads(rows, Compared("ours"), [*map(Compared, ["BC", "CVAE", "language"])])] == [6 / 128] * 3
     wide = pd.concat((rows, rows[rows["method"] == "BC"].assign(method="fourth")))
-    assert [lead.p for lead in leads(wide, "ours", ["BC", "CVAE", "language", "fourth"])] == [None] * 4
+    assert [lead.p for lead in leads(wide, Compared("ours"), [*map(Compared, ["BC", "CVAE", "language", "fourth"])])] == [None] * 4
 
 
 def test_tasks_weigh_alike_however_many_seeds_each_has() -> None:
@@ -87,9 +88,9 @@ def test_tasks_weigh_alike_however_many_seeds_each_has() -> None:
 
 def test_only_pairs_of_task_and_seed_that_both_have_are_compared() -> None:
     rows = measured(ours=[[0.9, 0.9]], BC=[[0.5]])
-    (found,) = leads(rows, "ours", ["BC", "not measured"])
+    (found,) = leads(rows, Compared("ours"), [*map(Compared, ["BC", "not measured"])])
     assert found.pairs == 1
-    assert leads(rows, "not measured", ["BC"]) == []
+    assert leads(rows, Compared("not measured"), [Compared("BC")]) == []
     assert least_certain([]) is None
 
 
@@ -100,20 +101,20 @@ def test_the_verdict_is_in_words() -> None:
     assert str(one(ours=[[0.6]] * 11, BC=[[0.5]] * 11)) == "+0.10 against BC, ahead (p < .001)"
     assert str(one(ours=[[0.5]] * 6, BC=[[0.5]] * 6)) == "+0.00 against BC, the same in every task and seed"
     assert str(one(ours=[[0.5]], BC=[[0.5]])) == "+0.00 against BC, the same in every task and seed"
-    (fewer,) = leads(measured(ours=[[0.1]] * 6, BC=[[0.2]] * 6), "ours", ["BC"], less=True)
+    (fewer,) = leads(measured(ours=[[0.1]] * 6, BC=[[0.2]] * 6), Compared("ours"), [Compared("BC")], less=True)
     assert str(fewer) == "+0.10 against BC, ahead (p = .032)"  # of crashes fewer are better
 
 
 def test_nothing_is_ahead_by_the_last_digit_of_a_float() -> None:
     assert str(one(ours=[[0.333333]] * 8, BC=[[0.333334]] * 8)) == "+0.00 against BC, the same in every task and seed"
-    assert Lead("BC", 0.1, 30, 0.0499999).verdict == "no difference shown"  # it is shown as .050
-    assert str(Lead("BC", 0.004, 30, 0.01)) == "+0.004 against BC, ahead (p = .010)"
-    assert str(Lead("BC", -0.0004, 30, 1.0)) == "+0.000 against BC, no difference shown (p = 1)"
+    assert Lead(Compared("BC"), 0.1, 30, 0.0499999).verdict == "no difference shown"  # it is shown as .050
+    assert str(Lead(Compared("BC"), 0.004, 30, 0.01)) == "+0.004 against BC, ahead (p = .010)"
+    assert str(Lead(Compared("BC"), -0.0004, 30, 1.0)) == "+0.000 against BC, no difference shown (p = 1)"
 
 
 def test_ahead_is_ahead_of_every_baseline_and_behind_is_behind_one() -> None:
-    ahead, near = Lead("BC", 0.3, 15, 0.001), Lead("CVAE", 0.2, 15, 0.001)
-    noisy, better = Lead("in-context", 0.4, 15, 0.2), Lead("language", -0.1, 15, 0.01)
+    ahead, near = Lead(Compared("BC"), 0.3, 15, 0.001), Lead(Compared("CVAE"), 0.2, 15, 0.001)
+    noisy, better = Lead(Compared("in-context"), 0.4, 15, 0.2), Lead(Compared("language"), -0.1, 15, 0.01)
     assert least_certain([ahead, near]) == near  # the best baseline
     assert least_certain([ahead, noisy, near]) == noisy
     assert least_certain([ahead, noisy, better]) == better

@@ -12,7 +12,7 @@ from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON
 from ftl_lightning.domains.mocap.source import NAME, OBSERVED, POSE, Recorded
 from ftl_lightning.domains.mocap.tasks import NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.mocap.views import VIEWS
-from ftl_lightning.domains.paper import OURS, WITH_KNOTS, WITH_MODES
+from ftl_lightning.domains.paper import OURS, WITH_KNOTS, WITH_MODES, Compared
 from ftl_lightning.domains.tasks import training_suite
 
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
@@ -41,7 +41,7 @@ DOMAIN = Domain(
         "bone error": Metric(deferred(f"{_MEASURES}:bone_error"), less_is_better=True),
         "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
     },
-    ours=f"{OURS}{WITH_MODES}{WITH_KNOTS}",
+    ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS}"),
     references={"frozen frame": _frozen},
     views=VIEWS,
     show=Show(*(deferred(f"{_DRAWING}:{name}") for name in ("picture", "film", "wireframe"))),

@@ -1,11 +1,13 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details')."""
 
-from ftl_lightning.methods.method import Method
+from ftl_lightning.domains.paper import WITH_MODES
+from ftl_lightning.methods.method import Form, Method
 
 METHOD = Method(
     name="BC",
     kind="bc",
     model="ftl_lightning.methods.bc.model:CloningModel",
     pretraining="ftl_lightning.methods.bc.pretraining:CloningPretraining",
+    forms=(Form(WITH_MODES, "modes", 1),),
     configurations="conf/bc",
 )

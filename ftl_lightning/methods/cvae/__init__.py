@@ -1,11 +1,13 @@
 """A conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the concepts it is paired with."""
 
-from ftl_lightning.methods.method import Method
+from ftl_lightning.domains.paper import WITH_MODES
+from ftl_lightning.methods.method import Form, Method
 
 METHOD = Method(
     name="CVAE",
     kind="cvae",
     model="ftl_lightning.methods.cvae.model:VAEModel",
     pretraining="ftl_lightning.methods.cvae.pretraining:VAEPretraining",
+    forms=(Form(WITH_MODES, "modes", 1),),
     configurations="conf/cvae",
 )

@@ -1,6 +1,6 @@
 """Our method (the paper's FTL-IGM): a conditional diffusion model, through which concepts are learned by gradient descent."""
 
-from ftl_lightning.domains.paper import OURS
+from ftl_lightning.domains.paper import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.methods.method import Form, Method
 
 METHOD = Method(
@@ -8,6 +8,6 @@ METHOD = Method(
     kind="diffusion",
     model="ftl_lightning.methods.ftl_igm.model:GenerativeModel",
     pretraining="ftl_lightning.methods.ftl_igm.pretraining:PretrainingModule",
-    forms=(Form("with modes", "modes", 1), Form("over time", "knots", 1), Form("with adapter", "adapter", 0)),
+    forms=(Form(WITH_MODES, "modes", 1), Form(WITH_KNOTS, "knots", 1), Form(WITH_ADAPTER, "adapter", 0)),
     configurations="conf",
 )
