@@ -29,7 +29,7 @@ METHODS = {OURS: "steps", "BC": "bc", "CVAE": "cvae", "in-context": "in_context"
 """What the folder of a method's model is called."""
 ENVIRONMENTS = {"belief": "", "step": "step veto"}
 LANGUAGE_WEIGHT = 1.2
-"""Of a concept that is told in words (conf/method/invert/language.yaml)."""
+"""Of a concept that is told in words (conf/method/language.yaml)."""
 
 
 def concept(few: FewShot, method: str, shown: Demonstrations, name: str, seed: int) -> Composition:

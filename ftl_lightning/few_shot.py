@@ -35,10 +35,10 @@ from ftl_lightning.progress import bar
 from ftl_lightning.ranges import LARGEST_STEP
 from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED, generator
-from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped, shipped_models
+from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped_models
 from ftl_lightning.tensor_file import atomic
 from ftl_lightning.trust import vouching
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import Tuned, settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -120,9 +120,7 @@ class FewShot(Shown):
         with vouching([] if settings is None else Tuned.domains(settings)):
             model = load_model(folder, domain).to(place)
         if settings is None:
-            group = "" if model.kind == DIFFUSION else f"baseline/{model.kind.replace('-', '_')}/"
-            tuned = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
-            settings = tuned if tuned.is_file() else "conf/invert/own.yaml"
+            settings = settings_of(model.config.domain, "" if model.kind == DIFFUSION else model.kind.replace("-", "_"))
         found = cls(model, Tuned.read(settings))
         found.settings = str(settings)
         return found

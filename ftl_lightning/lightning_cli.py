@@ -18,7 +18,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from ftl_lightning import log_folder, trust
-from ftl_lightning.configuration import configurations, expanded, parts, read
+from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.inputs import options
@@ -213,17 +213,17 @@ class _Parser(CommandLine):
 def run(arguments: list[str]) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
     with log_folder.run():
-        _command_line(CommandLine, arguments, run=True)
+        _command_line(CommandLine, arguments[0], arguments, run=True)
 
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
-    return _command_line(_Inversion if verb == "invert" else _Fit, options, run=False)
+    return _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
 
 
-def parse(options: list[str]) -> dict[str, Any]:
+def parse(verb: str, options: list[str]) -> dict[str, Any]:
     """What the options of a verb come to, by key; nothing is built."""
-    found: dict[str, Any] = _command_line(_Parser, options, run=False).config.as_dict()
+    found: dict[str, Any] = _command_line(_Parser, verb, options, run=False).config.as_dict()
     return found
 
 
@@ -231,14 +231,14 @@ PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning
 """Whose classes configurations name."""
 
 
-def _expect_trusted(arguments: list[str]) -> None:
+def _expect_trusted(verb: str, arguments: list[str]) -> None:
     """Let a configuration ask for classes of installed packages alone, and of those that a person vouches for.
 
     Raises:
         UserError: naming file, key and module of another one.
     """
     packages = set(PACKAGES)
-    asked = [(str(path), read(path)) for given in configurations(arguments) for path in parts(given)]
+    asked = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
     for where, keys in (*asked, ("options", dict(options(arguments)))):
         trust.expect_classes(keys, where)
         packages |= trust.allowed(keys)
@@ -246,8 +246,8 @@ def _expect_trusted(arguments: list[str]) -> None:
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
 
 
-def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> CommandLine:
-    _expect_trusted(arguments)
+def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run: bool) -> CommandLine:
+    _expect_trusted(verb, arguments)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
     warnings.filterwarnings("ignore", message=".*module.s. in eval mode at the start of training.*")  # averaged or frozen
@@ -269,7 +269,7 @@ def _command_line(kind: type[CommandLine], arguments: list[str], run: bool) -> C
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(arguments),
+            args=expanded(arguments, verb),
         )
     except OSError as error:
         raise UserError(
