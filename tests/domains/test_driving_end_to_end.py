@@ -22,7 +22,7 @@ from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
 
 FIT = ["--config", str(CONF / "driving.yaml")]
-INVERT = ["--config", str(CONF / "invert" / "driving.yaml")]
+INVERT = ["--config", str(CONF / "driving.yaml")]
 SMALL = [
     "--model.denoiser_args={hidden_dim: 16, depth: 2}",
     "--data.samples_per_concept=6",

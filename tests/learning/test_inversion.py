@@ -454,7 +454,7 @@ def test_modes_learn_from_noised_demonstrations_of_a_number_of_their_own(tiny: P
 
 def test_a_concept_that_is_not_finite_is_not_learned(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--data.suite=validation", "--data.steps=1", "--model.learning_rate=1e30", "--evaluation.samples=1"]
-    arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
     for tolerance in ("null", "0.01"):
         more = [f"--model.tolerance={tolerance}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
         assert main([*arguments, *options, *more]) == 2

@@ -185,8 +185,8 @@ def small(configuration: str, *options: str) -> int:
         ("object_rearrangement.yaml", [DENOISER, "--trainer.check_val_every_n_epoch=2"]),
         ("object_rearrangement.yaml", [DENOISER, "--trainer.val_check_interval=2"]),
         ("object_rearrangement.yaml", [DENOISER, "--trainer.limit_val_batches=0"]),
-        ("baseline/cvae/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
-        ("baseline/bc/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
+        ("cvae/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
+        ("bc/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
     ],
 )
 def test_from_any_checkpoint_it_goes_on_to_the_same_bytes(configuration: str, options: list[str]) -> None:
