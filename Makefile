@@ -20,7 +20,7 @@ minilm: install # the language model behind the shipped tables of embeddings
 
 run: install # pretrain, learn the ten new concepts, evaluate, print our table beside the paper's
 	$(BIN)/python -m ftl_lightning fit --config conf/$(DOMAIN).yaml
-	$(BIN)/python -m ftl_lightning invert --config conf/invert/$(DOMAIN).yaml --model.pretrained $(LOGS)/fit/pretrained
+	$(BIN)/python -m ftl_lightning invert --config conf/$(DOMAIN).yaml --model.pretrained $(LOGS)/fit/pretrained
 	$(BIN)/python -m ftl_lightning report --results $(LOGS) --out $(LOGS)/report
 
 test: install

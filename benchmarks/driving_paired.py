@@ -11,6 +11,8 @@ import json
 from collections.abc import Mapping
 
 import torch
+from ftl_lightning.learning.baselines.in_context import InContextModel
+from ftl_lightning.learning.generative_model import GenerativeModel
 from torch import Tensor
 
 from ftl_lightning import FewShot
@@ -18,8 +20,6 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
-from ftl_lightning.learning.baselines.in_context import InContextModel
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.seeding import DEMONSTRATION_SEED
 from ftl_lightning.tensor_file import write_text
@@ -29,7 +29,7 @@ METHODS = {OURS: "steps", "BC": "bc", "CVAE": "cvae", "in-context": "in_context"
 """What the folder of a method's model is called."""
 ENVIRONMENTS = {"belief": "", "step": "step veto"}
 LANGUAGE_WEIGHT = 1.2
-"""Of a concept that is told in words (conf/method/invert/language.yaml)."""
+"""Of a concept that is told in words (conf/method/language.yaml)."""
 
 
 def concept(few: FewShot, method: str, shown: Demonstrations, name: str, seed: int) -> Composition:

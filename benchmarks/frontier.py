@@ -18,7 +18,6 @@ from typing import Any
 import pandas as pd
 import torch
 
-from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
@@ -31,6 +30,7 @@ from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.lightning_cli import parse
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
 from ftl_lightning.shipped import shipped
@@ -49,25 +49,30 @@ class Form:
     Attributes:
         method: its name in tables, and its form.
         variant: what tells it apart from others of the same method and form; may be empty.
-        config: configuration file of ``invert``, where ``{domain}`` stands for the domain.
+        configs: configuration files of ``invert``, added to one another, where ``{domain}`` stands for the domain.
+    =======
+        method: its name in tables.
+        variant: what tells it apart from others of the same method; may be empty.
+        configs: configuration files of ``invert``, added to one another, where ``{domain}`` stands for the domain.
+    >>>>>>> w-conf
         changes: of the module's arguments, for ours those of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
         tempered: whether the temperature matters.
     """
 
     method: Compared
     variant: str
-    config: str
+    configs: tuple[str, ...]
     changes: Mapping[str, Any] = field(default_factory=dict)
     tempered: bool = True
 
 
 FORMS = {
-    "one": Form(PAPERS_METHOD, "", "conf/invert/{domain}.yaml"),
-    "modes": Form(Compared(OURS, WITH_MODES), "", "conf/invert/{domain}.yaml", {"modes": "auto"}),
-    "BC": Form(Compared("BC"), "", "conf/baseline/bc/invert/{domain}.yaml", tempered=False),
-    "CVAE": Form(Compared("CVAE"), "", "conf/baseline/cvae/invert/{domain}.yaml"),
-    "in-context": Form(Compared("in-context"), "", "conf/baseline/in_context/invert/{domain}.yaml"),
-    "language": Form(Compared("language"), "", "conf/baseline/language/invert/{domain}.yaml"),
+    "one": Form(PAPERS_METHOD, "", ("conf/{domain}.yaml",)),
+    "modes": Form(Compared(OURS, WITH_MODES), "", ("conf/{domain}.yaml",), {"modes": "auto"}),
+    "BC": Form(Compared("BC"), "", ("conf/bc/{domain}.yaml",), tempered=False),
+    "CVAE": Form(Compared("CVAE"), "", ("conf/cvae/{domain}.yaml",)),
+    "in-context": Form(Compared("in-context"), "", ("conf/in_context/{domain}.yaml",)),
+    "language": Form(Compared("language"), "", ("conf/{domain}.yaml", "conf/method/language.yaml")),
 }
 """By name on the command line."""
 
@@ -129,11 +134,11 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
             missing.append(temperature)
     if not missing:
         return
-    config = load(form.config.format(domain=domain.name))
+    config = parse("invert", [f"--config={path.format(domain=domain.name)}" for path in form.configs])
     drawn = InversionData(domain.name, suite, seed=seed).demonstrations
     learned = dict.fromkeys(name for task in tasks for name in task.learned)
     module: Any = adapted(form, config, concatenate([drawn.select(concept) for concept in learned]), seed)
-    sampling = {key: config["evaluation"][key] for key in ("sampler", "steps") if key in config["evaluation"]}
+    sampling = {key: config["evaluation"][key] for key in ("sampler", "steps")}
     for temperature in missing:
         generation = Generation(samples, temperature=temperature or 0.0, seed=seed, **sampling)
         judged = generate(module, tasks, generation)

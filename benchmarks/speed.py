@@ -250,7 +250,7 @@ def main() -> None:
     """Everything, one after another."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pretrained", default=f"pretrained/{DOMAIN}")
-    parser.add_argument("--config", default=f"conf/invert/{DOMAIN}.yaml", help="of invert, whose settings ours learns with")
+    parser.add_argument("--config", default=f"conf/{DOMAIN}.yaml", help="of invert, whose settings ours learns with")
     parser.add_argument("--out", default="results/speed.json")
     parser.add_argument("--steps", type=int, help="of our inversion, at most, in place of the configuration's")
     parser.add_argument("--tolerance", type=float, help="likewise")

@@ -1,6 +1,6 @@
 """Behaviour that nothing was tuned on, through the command line alone: pen strokes, three kinds learned from five each.
 
-For each seed ``fit`` pretrains on eight kinds with ``conf/own.yaml``, ``invert`` learns three with ``conf/invert/own.yaml``,
+For each seed ``fit`` pretrains on eight kinds with ``conf/own.yaml``, ``invert`` learns three with the same,
 and fifty strokes of every kind are drawn. A rule that the method does not know, the nearest of sixty templates of each of eleven
 kinds, says what they are. Reference lines: fresh strokes of the generator, and what the model draws with the empty concept.
 
@@ -44,8 +44,8 @@ def run(seed: int) -> dict[str, dict[str, float]]:
     _write("strokes.npz", TRAINING, PRETRAINING, seed)
     _write("five.npz", NEW, FEW, 1_000_000 + seed)
     common = [f"--seed_everything={seed}", "--trainer.accelerator=cpu"]
-    for verb, file, config in (("fit", "strokes.npz", "conf/own.yaml"), ("invert", "five.npz", "conf/invert/own.yaml")):
-        if ftl_lightning([verb, "--config", str(ROOT / config), f"--data.demonstrations={file}", *common]):
+    for verb, file in (("fit", "strokes.npz"), ("invert", "five.npz")):
+        if ftl_lightning([verb, "--config", str(ROOT / "conf" / "own.yaml"), f"--data.demonstrations={file}", *common]):
             raise SystemExit(f"{verb} failed")
     model = FewShot.from_pretrained(MODEL)
     learned = {kind: model.load(f"logs/own/invert/concepts/{file_name(kind)}.safetensors") for kind in NEW}

@@ -92,7 +92,7 @@ def _dispatch(arguments: list[str]) -> None:
     elif verb == "--version":
         say(__version__)
     elif verb in COMMANDS:
-        inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
+        inputs.check_inputs(verb, arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli
 
         trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs take no other class
@@ -101,11 +101,11 @@ def _dispatch(arguments: list[str]) -> None:
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
         given = _gathered(arguments[1:], SEVERAL[verb]) if verb in SEVERAL else arguments[1:]
-        found = auto_cli(kind or function, args=expanded(given), exit_on_error=False, **options)
+        found = auto_cli(kind or function, args=expanded(given, verb), exit_on_error=False, **options)
         if kind:  # options in a class of their own
             function(found)
     elif verb in TRAINER_VERBS:
-        inputs.check_inputs(arguments[1:], inputs.TRAINER)
+        inputs.check_inputs(verb, arguments[1:], inputs.TRAINER)
         from ftl_lightning.lightning_cli import run
 
         run(arguments)

@@ -1,16 +1,24 @@
-"""Configuration files that build on others.
+"""Configuration files that build on others, and that say what differs between verbs.
 
 A file may have the key ``defaults``, a list of files that are merged in order before its own keys: mappings key by key, of
-everything else, lists too, the later value stands. So an experiment says only what differs::
+everything else, lists too, the later value stands. So an experiment says only what differs. Its keys ``fit`` and ``invert`` are
+sections: what they hold counts for that verb alone and is merged after the file's other keys::
 
-    defaults: [trainer/fit.yaml, domain/fit/agent.yaml, method/fit/bc.yaml]
-    trainer: {max_steps: 6000}
+    defaults: [verb.yaml, domain/agent.yaml, method/bc.yaml]
+    trainer: {logger: {init_args: {name: bc_agent}}}
+    fit:
+      trainer: {max_steps: 6000}
+    invert:
+      model: {init_args: {pretrained: pretrained/baseline/bc/agent}}
 
 Each name is looked for in the folder of the file that has it, then in the folders above, at last in what is shipped with the
-package (:mod:`ftl_lightning.shipped`). Interpolations such as ``${seed_everything}`` are left as they are.
+package (:mod:`ftl_lightning.shipped`); a former name of a shipped file (:mod:`ftl_lightning.renamed`) stands for the file of today.
+Interpolations such as ``${seed_everything}`` are left as they are.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +28,28 @@ from yaml import YAMLError
 
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.limits import expect_readable
+from ftl_lightning.printing import say
 from ftl_lightning.regrouped import regrouped
-from ftl_lightning.shipped import shipped
+from ftl_lightning.renamed import renamed
+from ftl_lightning.shipped import CONFIGURATIONS, shipped
 
 DEFAULTS = "defaults"
+SECTIONS = ("fit", "invert")
+"""Keys of a file whose content counts for one verb alone."""
 _OPTIONS = ("--config", "-c")
+
+
+def section_of(verb: str) -> str | None:
+    """The section that counts for a verb; ``None`` for one whose files have no sections."""
+    return {"fit": "fit", "invert": "invert", "validate": "fit", "test": "fit"}.get(verb)
+
+
+@dataclass(frozen=True)
+class _File:
+    """A file with the section that counts in it: empty for none, ``None`` where there are no sections."""
+
+    path: Path
+    section: str | None
 
 
 def find(path: str | Path) -> Path:
@@ -47,47 +72,85 @@ def _near(path: str | Path) -> str:
     return f"; {parent} holds {', '.join(there)}" if there and folder.resolve() != Path.cwd() else ""
 
 
-def load(path: str | Path) -> dict[str, Any]:
+def load(path: str | Path, verb: str = "") -> dict[str, Any]:
     """The keys of a configuration file and of all that it builds on.
+
+    Args:
+        path: of the file.
+        verb: whose sections count, for ``validate`` and ``test`` those of ``fit``; for another verb, or none, the keys ``fit`` and
+            ``invert`` are keys like others.
 
     Raises:
         UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
     """
     try:
-        found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+        merged = OmegaConf.merge(OmegaConf.create(), *(keys for _, keys in _parts(path, verb)))
+        found = OmegaConf.to_container(merged, resolve=False)
     except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
-    assert isinstance(found, dict)
-    return regrouped({str(key): value for key, value in found.items()}, str(path))
+    return regrouped(_plain(found), str(path))
 
 
-def parts(path: str | Path) -> list[Path]:
-    """The files that :func:`load` merges, in order; the last is the file itself."""
-    return [part for part, _ in _parts(find(path), ())]
+def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]:
+    """What :func:`load` merges, in order: files, each with keys of its own as they stand in it; the last is the file itself.
+
+    Raises:
+        UserError: as :func:`load`.
+    """
+    return [(part, _plain(OmegaConf.to_container(keys, resolve=False))) for part, keys in _parts(path, verb)]
 
 
-def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConfig]]:
-    """Every file with its own keys. ``above`` are the files that led here."""
+def _plain(keys: object) -> dict[str, Any]:
+    assert isinstance(keys, dict)
+    return {str(key): value for key, value in keys.items()}
+
+
+def _parts(path: str | Path, verb: str) -> Iterator[tuple[Path, DictConfig]]:
+    section = section_of(verb)
+    for file in _today(path, section) or [_File(find(path), section)]:
+        yield from _merged(file, ())
+
+
+def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConfig]]:
+    """Every file with keys of its own, those of its section after the others. ``above`` are the files that led here."""
+    path = file.path
     if path.resolve() in (one.resolve() for one in above):
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
-    keys = OmegaConf.create(regrouped(read(path), str(path)))
+    keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
     if not isinstance(names, ListConfig | list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
     for name in names:
-        yield from _parts(_beside(path, name), (*above, path))
-    yield path, keys
+        for below in _beside(file, name):
+            yield from _merged(below, (*above, path))
+    sections = {} if file.section is None else {name: keys.pop(name, None) for name in SECTIONS}
+    yield path, _regrouped(keys, path)
+    for name, own in sections.items():
+        if own is not None and not isinstance(own, DictConfig):
+            raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(own))}")
+    if file.section and (own := sections[file.section]) is not None:
+        yield path, _regrouped(own, path)
 
 
-def _beside(path: Path, name: str) -> Path:
-    """The file that ``defaults`` of a file name."""
+def _regrouped(keys: DictConfig, path: Path) -> DictConfig:
+    """A file's keys as they are called today."""
+    return OmegaConf.create(regrouped(_plain(OmegaConf.to_container(keys, resolve=False)), str(path)))
+
+
+def _beside(file: _File, name: str) -> list[_File]:
+    """The file that ``defaults`` of a file name; of a former name those of today."""
+    path = file.path
     try:
         for folder in path.absolute().parents:
             if (folder / name).is_file():
                 # As the user writes it: relative where the file is.
-                return folder / name if path.is_absolute() else _relative(folder / name)
+                return [_File(folder / name if path.is_absolute() else _relative(folder / name), file.section)]
+            if (today := _today(folder / name, file.section, name)) is not None:
+                return today
         if (own := shipped(name)).is_file():
-            return own
+            return [_File(own, file.section)]
+        if (today := _today(name, file.section)) is not None:
+            return today
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
         told = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({told})") from error
@@ -95,15 +158,30 @@ def _beside(path: Path, name: str) -> Path:
     raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found}")
 
 
-def read(path: Path) -> dict[str, Any]:
-    """The own keys of one configuration file, as they stand in it.
+def _today(path: str | Path, section: str | None, name: str = "") -> list[_File] | None:
+    """The shipped files that stand for a former name of one; ``None`` for another name, or where a file of this name is.
 
-    Raises:
-        UserError: as :func:`load`.
+    A path with folders before the name means the shipped files if it leads to them.
     """
-    found = OmegaConf.to_container(_read(path), resolve=False)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
+    new = renamed(path)
+    if new is None or shipped(path).is_file():
+        return None
+    files = []
+    for file in new.files:
+        here, own = Path(new.root + file), CONFIGURATIONS / file
+        if here.is_file() and own.is_file() and here.samefile(own):
+            files.append(_relative(here) if here.is_absolute() else here)
+        elif new.root == f"{CONFIGURATIONS.name}/" and own.is_file():
+            files.append(own)
+        else:
+            return None
+    _say_once(f"note: {name or path} {new.advice}")
+    return [_File(file, None if section is None else new.section) for file in files]
+
+
+@functools.cache
+def _say_once(text: str) -> None:
+    say(text, error=True)
 
 
 def _relative(path: Path) -> Path:
@@ -140,15 +218,15 @@ def configurations(arguments: Sequence[str]) -> list[str]:
     return [value for _, _, value in _given(arguments)]
 
 
-def expanded(arguments: Sequence[str]) -> list[str]:
-    """A command line with the content of configuration files, as :func:`load` has it, in place of their names.
+def expanded(arguments: Sequence[str], verb: str = "") -> list[str]:
+    """A command line with the content of configuration files, as :func:`load` has it for a verb, in place of their names.
 
     Raises:
         UserError: as :func:`load`.
     """
     result = list(arguments)
     for index, prefix, value in _given(arguments):
-        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value)))
+        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value, verb)))
     return result
 
 

@@ -29,7 +29,6 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.hub import card as model_card
 from ftl_lightning.learning.hub import download, upload
 from ftl_lightning.learning.longer import longer_than_plans
-from ftl_lightning.learning.model_config import DIFFUSION
 from ftl_lightning.learning.model_folder import save_model
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -37,10 +36,10 @@ from ftl_lightning.ranges import LARGEST_STEP
 from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED, generator
-from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped, shipped_models
+from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped_models
 from ftl_lightning.tensor_file import atomic
 from ftl_lightning.trust import vouching
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import Tuned, settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -122,9 +121,7 @@ class FewShot(Shown):
         with vouching([] if settings is None else Tuned.domains(settings)):
             model = load_model(folder, domain).to(place)
         if settings is None:
-            group = "" if model.method.kind == DIFFUSION else f"baseline/{model.method.kind.replace('-', '_')}/"
-            tuned = shipped(f"conf/{group}invert/{model.config.domain}.yaml")
-            settings = tuned if tuned.is_file() else "conf/invert/own.yaml"
+            settings = settings_of(model.config.domain, model.method.configurations)
         found = cls(model, Tuned.read(settings))
         found.settings = str(settings)
         return found

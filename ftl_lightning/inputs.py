@@ -91,11 +91,12 @@ def command_checks(verb: str) -> Mapping[str, Check]:
     return {**_COMMANDS, **_WRITTEN.get(verb, {})}
 
 
-def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
+def check_inputs(verb: str, arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
     """Refuse a command line, its configuration files included, that names input files that are not there or outputs that are none.
 
     Args:
-        arguments: those of a verb, without it.
+        verb: whose sections of configuration files count.
+        arguments: those of the verb, without it.
         checks: by option.
 
     Raises:
@@ -103,7 +104,7 @@ def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
     """
     values: dict[str, Any] = {}
     for path in configurations(arguments):
-        values |= dict(_flat(load(path), ""))
+        values |= dict(_flat(load(path, verb), ""))
     values |= {option.replace(".init_args.", "."): value for option, value in options(arguments)}
     if {"help", "print_config"} & values.keys() or "-h" in arguments:
         return

@@ -18,7 +18,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from ftl_lightning import log_folder, trust
-from ftl_lightning.configuration import configurations, expanded, parts, read
+from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.inputs import options
@@ -232,14 +232,14 @@ PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning
 """Whose classes configurations name."""
 
 
-def _expect_trusted(arguments: list[str]) -> None:
+def _expect_trusted(verb: str, arguments: list[str]) -> None:
     """Let a configuration ask for classes of installed packages alone, and of those that a person vouches for.
 
     Raises:
         UserError: naming file, key and module of another one.
     """
     packages = set(PACKAGES)
-    asked = [(str(path), read(path)) for given in configurations(arguments) for path in parts(given)]
+    asked = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
     for where, keys in (*asked, ("options", dict(options(arguments)))):
         trust.expect_classes(keys, where)
         packages |= trust.allowed(keys)
@@ -248,7 +248,7 @@ def _expect_trusted(arguments: list[str]) -> None:
 
 
 def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run: bool) -> CommandLine:
-    _expect_trusted(arguments)
+    _expect_trusted(verb, arguments)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
     warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
     warnings.filterwarnings("ignore", message=".*module.s. in eval mode at the start of training.*")  # averaged or frozen
@@ -270,7 +270,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(regrouped_arguments(arguments, verb)),
+            args=expanded(regrouped_arguments(arguments, verb), verb),
         )
     except OSError as error:
         raise UserError(

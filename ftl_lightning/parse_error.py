@@ -1,12 +1,12 @@
 """What jsonargparse tells of a mistake in many lines, in one, with the file and line that the mistaken key stands in."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
 
 import yaml
 
-from ftl_lightning.configuration import configurations, parts
+from ftl_lightning.configuration import SECTIONS, configurations, parts, section_of
 from ftl_lightning.errors import LONGEST, short
 from ftl_lightning.inputs import options
 
@@ -58,20 +58,22 @@ def one_line(message: str, arguments: Sequence[str]) -> str:
     given = {key for option, _ in options(arguments) for key in option.split(".")}
     keys = [key.split(".") for key in _KEY.findall(told)]
     if keys and keys[-1][-1] not in given:
-        for path in (part for name in configurations(arguments) for part in reversed(parts(name))):
-            if line := _line(path, keys[-1]):
+        verb = arguments[0]
+        for path in (part for name in configurations(arguments) for part, _ in reversed(parts(name, verb))):
+            if line := _line(path, keys[-1], set(SECTIONS) - {section_of(verb)}):
                 where = f"{path}: line {line}: "
                 return f"{where}{short(plain, max(LONGEST - len(where) - 10, 100))}"
     return f"{short(plain, LONGEST - 30)}; see --help"
 
 
-def _line(path: Path, key: Sequence[str]) -> int | None:
-    """The line of a key, of which at least the end is known, in a YAML file; ``None`` where it does not stand there."""
+def _line(path: Path, key: Sequence[str], out: Set[str]) -> int | None:
+    """The line of a key, of which at least the end is known, in a YAML file outside of some sections; ``None`` without one."""
     try:
         root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
     except (OSError, ValueError, yaml.YAMLError):  # told where it is read
         return None
-    return next((line for names, line in _keys(root, ()) if names[-1] == key[-1] and set(key) <= set(names)), None)
+    found = ((names, line) for names, line in _keys(root, ()) if names[0] not in out)
+    return next((line for names, line in found if names[-1] == key[-1] and set(key) <= set(names)), None)
 
 
 def _keys(node: yaml.Node | None, above: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:

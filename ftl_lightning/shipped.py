@@ -12,6 +12,8 @@ from ftl_lightning.errors import short
 FOLDERS = ("conf", "pretrained")
 """What is shipped."""
 _PACKAGE = Path(__file__).parent
+CONFIGURATIONS = _PACKAGE / "conf"
+"""The configuration files that ship."""
 MODELS = _PACKAGE / "pretrained"
 """The models that ship."""
 

@@ -1,4 +1,4 @@
-"""The settings that go with a pretrained model, from its domain's configuration of ``invert``."""
+"""The settings that go with a pretrained model: those of ``invert`` in its domain's configuration."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -7,6 +7,8 @@ from typing import Self
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.inversion_settings import GROUPS, InversionSettings
+from ftl_lightning.renamed import former_settings
+from ftl_lightning.shipped import shipped
 from ftl_lightning.trust import is_installed, is_vouched
 
 
@@ -35,7 +37,7 @@ class Tuned:
         """
         from ftl_lightning.configuration import load  # OmegaConf, which nothing else here needs
 
-        content = load(path)
+        content = load(path, "invert")
         model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
         options = model.get("init_args") or {}
         learning = {
@@ -65,6 +67,32 @@ class Tuned:
         """
         from ftl_lightning.configuration import load
 
-        data = load(path).get("data") or {}
+        data = load(path, "invert").get("data") or {}
         domain = (data.get("init_args") or {}).get("domain", "")
         return [domain] if ":" in domain and (is_installed(domain.partition(":")[0]) or is_vouched(domain)) else []
+
+
+OWN = "conf/own.yaml"
+"""The settings where a domain has none."""
+
+
+def settings_of(domain: str, folder: str = "conf") -> str:
+    """The configuration file with the settings of ``invert`` that go with a domain's models.
+
+    Args:
+        domain: its name.
+        folder: of the configuration files of the models' method, such as ``conf/in_context``; empty for none.
+
+    Raises:
+        UserError: naming the file, if it cannot be read.
+    """
+    from ftl_lightning.configuration import load
+
+    former = former_settings(domain, folder)
+    if shipped(former).is_file():  # a file of one's own
+        return former
+    path = f"{folder}/{domain}.yaml"
+    if not folder or not shipped(path).is_file():
+        return OWN
+    model = load(path, "invert").get("model") or {}
+    return path if "pretrained" in (model.get("init_args") or {}) else OWN  # else it is for pretraining alone

@@ -70,7 +70,7 @@ def invert(tiny: Path, tmp_path: Path) -> Callable[..., Path]:
     """Run a short inversion through the tiny model; returns its log folder."""
 
     def run(*options: str) -> Path:
-        arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+        arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
         arguments += ["--data.steps=5", "--model.samples=4", "--evaluation.samples=3", "--evaluation.steps=3"]
         arguments += ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", *options]
         assert main(arguments) == 0

@@ -10,6 +10,7 @@ from nbclient import NotebookClient
 from ftl_lightning.ablation import Stage
 from ftl_lightning.cli import main
 from ftl_lightning.configuration import load
+from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from tests.conftest import CONF, ROOT
 
@@ -43,6 +44,15 @@ def test_cells_are_the_product_of_names_and_grid() -> None:
 def test_a_cell_is_named_by_what_its_configuration_does_not_say() -> None:
     stage = Stage("invert", "{method}/{domain}.yaml", {"method": ["bc"], "domain": ["agent"]}, name="flat")
     assert [str(cell) for cell in stage.cells(0)] == ["invert agent, bc, flat, seed 0"]
+
+
+def test_a_stage_may_add_configurations_to_one_another() -> None:
+    stage = Stage("invert", ["{domain}.yaml", "method/language.yaml"], {"domain": ["agent"]})
+    (cell,) = stage.cells(0)
+    assert cell.arguments == ["--config=agent.yaml", "--config=method/language.yaml"]
+    assert str(cell) == "invert agent, language, seed 0"
+    with pytest.raises(UserError, match="config: expected a configuration file or a list of them, found none"):
+        list(Stage("invert", []).cells(0))
 
 
 def test_a_stage_may_run_for_some_seeds_alone() -> None:
@@ -133,7 +143,7 @@ def quick(tiny: Path) -> dict[str, object]:
         "trainer.accelerator": "cpu",
         "trainer.logger.init_args.version": None,
     }
-    return {"verb": "invert", "config": str(CONF / "invert" / "object_rearrangement.yaml"), "options": options}
+    return {"verb": "invert", "config": str(CONF / "object_rearrangement.yaml"), "options": options}
 
 
 def with_options(stage: dict[str, object], **more: object) -> dict[str, object]:
@@ -158,19 +168,20 @@ def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(quick: dict[str, o
 def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
     method = {
         "verb": "invert",
-        "config": f"{CONF}/baseline/{{method}}/invert/driving.yaml",
+        "config": f"{CONF}/{{method}}/driving.yaml",
         "each": {"method": ["bc", "telepathy"]},
         "options": {"model.pretrained": "models/{method}"},
     }
+    Path("pretraining.yaml").write_text("model: {class_path: ftl_lightning.learning.PretrainingModule}")
     wrong = [
         with_options(quick, **{"model.pretrained": "nowhere"}),
         with_options(quick, **{"evaluation.suites": ["paper", "exam"]}),
         with_options(quick, **{"model.tempo": 3}),
         with_options(quick, **{"data.domain": "driving", "evaluation.closed_loop": True}),
-        {"verb": "invert", "config": str(CONF / "agent.yaml")},
+        {"verb": "invert", "config": [str(CONF / "agent.yaml"), "pretraining.yaml"]},
         {
             "verb": "invert",
-            "config": f"{CONF}/baseline/in_context/invert/agent.yaml",
+            "config": f"{CONF}/in_context/agent.yaml",
             "options": {"model.pretrained": f"{ROOT}/pretrained/agent"},
         },
         method,
@@ -184,10 +195,10 @@ def test_what_cannot_run_is_told_before_anything_does(quick: dict[str, object], 
         "(domain object_rearrangement), found exam",
         "tempo",
         "expected a model of driving (diffusion or bc or cvae), found one of object_rearrangement (diffusion)",
-        "agent.yaml: expected the configuration of an adaptation (invert), found that of a pretraining (fit)",
+        "agent.yaml, pretraining.yaml: expected the configuration of an adaptation (invert), found that of a pretraining (fit)",
         "expected a model of agent (in-context), found one of agent (diffusion)",
-        "telepathy/invert/driving.yaml: expected a configuration file, found nothing",
-        "holds bc, cvae, in_context, language",
+        "telepathy/driving.yaml: expected a configuration file, found nothing",
+        "holds ablation, agent.yaml, bc, cvae",
         "models/bc/config.json: expected a pretrained model",
     ):
         assert part in told, part

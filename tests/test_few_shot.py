@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from PIL import Image
 
 import ftl_lightning
@@ -21,7 +22,6 @@ from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot, LearnedConcept, Tuned
-from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.seeding import generator
@@ -61,12 +61,13 @@ def test_a_model_is_found_by_its_name_or_folder_and_brings_its_settings(scenes: 
     assert named.domain.name == "object_rearrangement"
     assert KNOWN in named.training_concepts
     assert not any(parameter.requires_grad for parameter in named.model.parameters())
-    told = load(CONF / "invert" / "object_rearrangement.yaml")
+    told = load(CONF / "agent.yaml", "invert")
     learning, evaluation = told["model"]["init_args"], told["evaluation"]
-    assert scenes.tuned.inversion.components == learning["components"]
-    assert scenes.tuned.inversion.learning_rate == learning["learning_rate"]
-    assert scenes.tuned.sampling.temperature == evaluation["temperature"]
-    assert scenes.tuned.learning_steps == told["data"]["init_args"]["steps"]
+    tuned = FewShot.from_pretrained("agent").tuned
+    assert tuned.inversion.omega == learning["omega"]
+    assert tuned.inversion.tolerance == learning["tolerance"]
+    assert tuned.sampling.temperature == evaluation["temperature"]
+    assert tuned.learning_steps == told["data"]["init_args"]["steps"]
     assert ftl_lightning.FewShot is FewShot
 
 

@@ -27,7 +27,7 @@ SECONDS, MEGABYTES = 2.0, 500
 COMPOSE = "--compose=go to red object"
 SAMPLE = ["sample", "--pretrained=agent", COMPOSE]
 FIT = ["fit", f"--config={CONF / 'object_rearrangement.yaml'}", "--trainer.accelerator=cpu", "--trainer.enable_progress_bar=false"]
-INVERT = ["invert", f"--config={CONF / 'invert' / 'object_rearrangement.yaml'}", "--trainer.enable_progress_bar=false"]
+INVERT = ["invert", f"--config={CONF / 'object_rearrangement.yaml'}", "--trainer.enable_progress_bar=false"]
 HERE = f"--model.pretrained={ROOT / 'pretrained' / 'object_rearrangement'}"
 LONG = "x" * 300
 Told = pytest.CaptureFixture[str]
@@ -127,7 +127,7 @@ def test_what_is_no_honest_file(reader: str, make: Callable[[], None], capsys: T
     [
         ("model/config.json", ["sample", "--pretrained=model", COMPOSE]),
         ("model/model.safetensors", ["sample", "--pretrained=model", COMPOSE]),
-        ("model/config.json", ["invert", f"--config={CONF / 'invert' / 'agent.yaml'}", "--model.pretrained=model"]),
+        ("model/config.json", ["invert", f"--config={CONF / 'agent.yaml'}", "--model.pretrained=model"]),
         ("model/config.json", ["concepts", "model"]),
         ("films/films.json", ["study", "mocap", "--films=films"]),
         ("key.json", ["study-report", "answers.json"]),

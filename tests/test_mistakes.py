@@ -16,7 +16,7 @@ from .conftest import CONF, ROOT, TINY, refused
 
 Told = pytest.CaptureFixture[str]
 FIT = ["fit", f"--config={CONF / 'object_rearrangement.yaml'}", *TINY, "--trainer.max_steps=2"]
-INVERT = ["invert", f"--config={CONF / 'invert' / 'object_rearrangement.yaml'}", "--model.pretrained=object_rearrangement"]
+INVERT = ["invert", f"--config={CONF / 'object_rearrangement.yaml'}", "--model.pretrained=object_rearrangement"]
 PUSH = "go to red object"
 SAMPLE = ["sample", "--pretrained=agent"]
 CHECKPOINT = "trainer.callbacks=[{class_path: lightning.pytorch.callbacks.ModelCheckpoint, init_args: {%s}}]"

@@ -41,7 +41,7 @@ SHADOW = 'from pathlib import Path\n(Path(__file__).parent / "ran").touch()\nrai
 OFFERED = "[ftl_lightning.domains]\nevil = evil:DOMAIN\n[lightning.pytorch.callbacks_factory]\nevil = evil:make\n"
 DOMAIN = "evil:DOMAIN"
 SAMPLE = ["sample", "--pretrained=model", "--compose=merge", "--goal=merge", "--count=1", "--steps=1"]
-FITTED, LEARNED = CONF / "object_rearrangement.yaml", CONF / "invert" / "driving.yaml"
+FITTED, LEARNED = CONF / "object_rearrangement.yaml", CONF / "driving.yaml"
 FIT = ["fit", f"--config={FITTED}", "--trainer.max_steps=1"]
 INVERT = ["invert", f"--config={LEARNED}", "--model.pretrained=model", "--data.steps=1"]
 NOT_IMPORTED = "not imported"
@@ -444,7 +444,7 @@ def test_in_python_the_domain_is_an_argument(monkeypatch: pytest.MonkeyPatch) ->
     again = FewShot.from_pretrained("model", domain=found.domain)
     assert again.domain is found.domain
     # Settings that a person gives may name the domain, where its module is found without the current folder.
-    Path("own.yaml").write_text(f"defaults: [{CONF / 'invert/driving.yaml'}]\ndata: {{init_args: {{domain: 'evil:DOMAIN'}}}}")
+    Path("own.yaml").write_text(f"defaults: [{CONF / 'driving.yaml'}]\ndata: {{init_args: {{domain: 'evil:DOMAIN'}}}}")
     assert FewShot.from_pretrained("model", settings="own.yaml").domain is found.domain
 
 

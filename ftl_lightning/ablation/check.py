@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ftl_lightning.ablation.plan import Cell
-from ftl_lightning.configuration import find
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import pretrained_folder
 from ftl_lightning.trust import expect_module
@@ -41,16 +40,14 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.lightning_cli import parse
     from ftl_lightning.methods.registry import adapts, kinds_for
 
-    find(cell.config)
     config = parse(cell.verb, cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
     if cell.verb == "fit":
         load_encoder(data["encoder"], Path(), data["revision"])
         return
     if "pretrained" not in model or "domain" not in data:
-        raise UserError(
-            f"verb: {cell.config}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)"
-        )
+        files = ", ".join(cell.configs)
+        raise UserError(f"verb: {files}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)")
     if ":" in data["domain"]:
         expect_module(data["domain"], "data.domain")
     domain = load_domain(data["domain"])

@@ -18,7 +18,7 @@ class Stage:
 
     Attributes:
         verb: ``fit`` or ``invert``.
-        config: its configuration file.
+        config: its configuration file, or several that are added to one another in order.
         name: stands in the names of the cells, for stages that differ in their options alone.
         each: names with a list of texts each, which stand in the other values; the stage runs for their product.
         options: that all cells share, by their names on the command line.
@@ -29,13 +29,24 @@ class Stage:
     """
 
     verb: Literal["fit", "invert"]
-    config: str
+    config: str | list[str]
     each: Mapping[str, list[str]] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
     grid: Mapping[str, list[Any]] = field(default_factory=dict)
     done: str = ""
     name: str = ""
     seeds: Sequence[int] = ()
+
+    @property
+    def configs(self) -> list[str]:
+        """Its configuration files.
+
+        Raises:
+            UserError: for none.
+        """
+        if not self.config:
+            raise UserError("config: expected a configuration file or a list of them, found none")
+        return [self.config] if isinstance(self.config, str) else self.config
 
     def cells(self, seed: int) -> Iterator["Cell"]:
         """Every cell for one seed."""
@@ -46,19 +57,20 @@ class Stage:
             for values in itertools.product(*self.grid.values()):
                 options = {**self.options, **dict(zip(self.grid, values, strict=True))}
                 texts_of = {key: _text(value, names) for key, value in options.items()}
-                config = _text(self.config, names)
-                said = [text for text in texts if text != Path(config).stem]
+                configs = tuple(_text(config, names) for config in self.configs)
+                first, *added = (Path(config).stem for config in configs)
+                said = [*added, *(text for text in texts if text not in (first, *added))]
                 varied = [f"{key.rpartition('.')[2]} {texts_of[key]}" for key in self.grid]
-                parts = [f"{self.verb} {Path(config).stem}", *said, _text(self.name, names), *varied, f"seed {seed}"]
-                yield Cell(self.verb, config, texts_of, _text(self.done, names), ", ".join(filter(None, parts)))
+                parts = [f"{self.verb} {first}", *said, _text(self.name, names), *varied, f"seed {seed}"]
+                yield Cell(self.verb, configs, texts_of, _text(self.done, names), ", ".join(filter(None, parts)))
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One run: a verb, its configuration file, options, the file that says that it need not run, and what it is called."""
+    """One run: a verb, its configuration files, options, the file that says that it need not run, and what it is called."""
 
     verb: Literal["fit", "invert"]
-    config: str
+    configs: tuple[str, ...]
     options: Mapping[str, str]
     done: str
     name: str
@@ -66,7 +78,8 @@ class Cell:
     @property
     def arguments(self) -> list[str]:
         """As on the command line, without the verb."""
-        return [f"--config={self.config}", *(f"--{key}={value}" for key, value in self.options.items())]
+        files = [f"--config={config}" for config in self.configs]
+        return [*files, *(f"--{key}={value}" for key, value in self.options.items())]
 
     @property
     def command(self) -> str:

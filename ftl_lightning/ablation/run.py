@@ -147,7 +147,8 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
 def _log(cell: Cell) -> list[str]:
     """The option that names the log folder of a cell after it, unless the plan names it."""
     option = "trainer.logger.init_args.version"
-    logger = load(cell.config).get("trainer", {}).get("logger")
+    trainers = [load(config, cell.verb).get("trainer", {}) for config in cell.configs]
+    logger = next((trainer["logger"] for trainer in reversed(trainers) if "logger" in trainer), None)
     named = cell.options.get(option, "null") != "null" or "trainer.logger" in cell.options or not isinstance(logger, Mapping)
     return [] if named else [f"--{option}={cell.folder}"]
 

@@ -66,7 +66,7 @@ def test_learned_concepts_are_combinations_with_small_weights_that_explain_as_mu
 def test_the_verb_finds_the_model_and_says_what_a_concept_is_made_of(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = [f"--model.pretrained={tiny}", "--data.suite=validation", "--data.steps=2", "--evaluation.samples=2"]
     options += ["--evaluation.steps=2", "--model.output=concepts", "--trainer.enable_progress_bar=false"]
-    assert main(["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), *options]) == 0
+    assert main(["invert", "--config", str(CONF / "object_rearrangement.yaml"), *options]) == 0
     concept = str(next(Path("concepts").iterdir()))
     capsys.readouterr()
     assert main(["explain", "--concept", concept]) == 2

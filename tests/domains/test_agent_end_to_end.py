@@ -14,7 +14,7 @@ from ftl_lightning.domains.agent.scenes import OBSERVED
 from tests.conftest import CONF
 
 FIT = ["--config", str(CONF / "agent.yaml")]
-INVERT = ["--config", str(CONF / "invert" / "agent.yaml")]
+INVERT = ["--config", str(CONF / "agent.yaml")]
 SMALL = [
     "--model.denoiser_args={width: 8, multipliers: [1, 2], initial_encoder: entities}",
     "--data.samples_per_concept=4",

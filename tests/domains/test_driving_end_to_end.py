@@ -6,6 +6,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.composition import Composition
@@ -17,12 +18,11 @@ from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.traffic import SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.evaluation.closed_loop import planner
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
 
 FIT = ["--config", str(CONF / "driving.yaml")]
-INVERT = ["--config", str(CONF / "invert" / "driving.yaml")]
+INVERT = ["--config", str(CONF / "driving.yaml")]
 SMALL = [
     "--model.denoiser_args={hidden_dim: 16, depth: 2}",
     "--data.samples_per_concept=6",

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +21,6 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule, PretrainingModule
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.trainer import Trainer
 

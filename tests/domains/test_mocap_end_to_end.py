@@ -52,7 +52,7 @@ def test_concepts_are_learned_judged_and_filmed_from_a_folder(config: str, tmp_p
     quick = ["--data.steps=2", "--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.figures=2", "--seed_everything=3"]
     arguments = [f"--data.root={folder(tmp_path / 'recordings')}", f"--model.pretrained={SHIPPED}", "--data.suite=validation"]
     suites = ["--evaluation.suites=[validation]", "--trainer.enable_progress_bar=false"]
-    assert main(["invert", f"--config={CONF / 'invert' / config}", *arguments, *quick, *suites]) == 0
+    assert main(["invert", f"--config={CONF / config}", *arguments, *quick, *suites]) == 0
     rows = read_rows("logs/mocap/invert/results.csv")
     assert {"frozen frame", "demonstrations replayed"} < set(rows["method"])
     assert {"accuracy", "rise", "bone error", "jerk"} < set(rows["metric"])

@@ -133,7 +133,7 @@ def told_by(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 def test_demonstrations_of_states_alone_on_the_command_line(shipped: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez("states.npz", states=np.zeros((2, 5, 4)))
-    config = Path(__file__).parents[2] / "conf" / "invert" / "object_rearrangement.yaml"
+    config = Path(__file__).parents[2] / "conf" / "object_rearrangement.yaml"
     options = ["--config", str(config), f"--model.pretrained={shipped}", f"--data.domain={NAME}"]
     told = told_by(capsys, "invert", *options, "--data.demonstrations=states.npz")
     assert "states.npz: key 'observed/image': expected uint8 images of shape (3, 64, 64) each, found none" in told

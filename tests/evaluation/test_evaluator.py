@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 from lightning.pytorch import LightningDataModule
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -21,7 +22,6 @@ from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import COLUMNS, Row, append_rows, label, labels, read_rows
 from ftl_lightning.evaluation.rows import configuration
-from ftl_lightning.learning.generative_model import GenerativeModel
 
 
 class Trained:

@@ -5,6 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from ftl_lightning.learning.baselines.additive import added
+from ftl_lightning.learning.baselines.cloning import CloningConfig, CloningModel, ParallelMLP
+from ftl_lightning.learning.baselines.in_context import InContextConfig, InContextModel
+from ftl_lightning.learning.baselines.language import LanguageAdaptation
+from ftl_lightning.learning.baselines.transitions import StepConfig, unroll
+from ftl_lightning.learning.baselines.vae import VAEConfig, VAEModel
 from torch import nn
 
 from ftl_lightning.cli import main
@@ -17,12 +23,6 @@ from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.learning.baselines.additive import added
-from ftl_lightning.learning.baselines.cloning import CloningConfig, CloningModel, ParallelMLP
-from ftl_lightning.learning.baselines.in_context import InContextConfig, InContextModel
-from ftl_lightning.learning.baselines.language import LanguageAdaptation
-from ftl_lightning.learning.baselines.transitions import StepConfig, unroll
-from ftl_lightning.learning.baselines.vae import VAEConfig, VAEModel
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.seeding import generator
@@ -168,7 +168,7 @@ SMALL = {
     "in_context": ["--model.width=16", "--model.layers=1", "--model.heads=2"],
 }
 QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--evaluation.samples=2", "--evaluation.figures=0"]
-FITS = sorted(path for path in (CONF / "baseline").glob("*/*.yaml") if path.parent.name != "language")
+FITS = sorted(path for method in SMALL for path in (CONF / method).glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", FITS, ids=lambda path: f"{path.parent.name}-{path.stem}")
@@ -192,9 +192,8 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
         demonstrations = ["--data.demonstrations=drives.safetensors"]
     adapt = [*demonstrations, *recorded, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
     executed = [] if domain == "object_rearrangement" else ["--evaluation.closed_loop=false"]
-    config = path.parent / "invert" / path.name
     assert (
-        main(["invert", "--config", str(config), *adapt, *executed, "--model.output=concepts", "--evaluation.results=r.csv"]) == 0
+        main(["invert", "--config", str(path), *adapt, *executed, "--model.output=concepts", "--evaluation.results=r.csv"]) == 0
     )
     learned = Concept.load(next(Path("concepts").iterdir()))
     assert learned.origin.pretrained == model.hash
@@ -206,13 +205,13 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
 
 
 def test_a_baselines_window_must_hold_a_transition(capsys: pytest.CaptureFixture[str]) -> None:
-    config = str(CONF / "baseline" / "bc" / "driving.yaml")
+    config = str(CONF / "bc" / "driving.yaml")
     assert main(["fit", "--config", config, *TINY["driving"], *QUIET, "--data.horizon=5"]) == 2
     assert "data.horizon: expected 2 (states that a transition spans), found 5" in capsys.readouterr().err
 
 
 def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = str(CONF / "baseline" / "in_context" / "invert" / "agent.yaml")
+    config = str(CONF / "in_context" / "agent.yaml")
     assert main(["invert", "--config", config, f"--model.pretrained={tiny}"]) == 2
     assert "expected a model of kind in-context, found diffusion" in capsys.readouterr().err
 
@@ -221,15 +220,17 @@ def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pyte
 def test_a_method_whose_concepts_are_demonstrations_asks_for_one_of_each(
     method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = str(CONF / "baseline" / method / "mocap.yaml")
+    config = str(CONF / method / "mocap.yaml")
     options = [f"--data.root={folder(tmp_path / 'few')}", "--trainer.max_steps=1", *QUIET]
     assert main(["fit", "--config", config, *options]) == 2
     assert "expected a demonstration of each of 82 training concepts, found none of 78, such as" in capsys.readouterr().err
 
 
 def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    fit, adapt = (str(CONF / "baseline" / "in_context" / part) for part in ("driving.yaml", "invert/driving.yaml"))
-    assert main(["invert", "--config", fit, *QUIET]) == 2
+    config = str(CONF / "in_context" / "driving.yaml")
+    method = "ftl_lightning.learning.baselines"
+    Path("fit.yaml").write_text(f"model: {{class_path: {method}.in_context.InContextPretraining}}")
+    assert main(["invert", "--config", config, "--config=fit.yaml", *QUIET]) == 2
     assert "expected a module that adapts a pretrained model, found InContextPretraining" in capsys.readouterr().err
     made = [
         f"--model.pretrained={ROOT / 'pretrained' / 'baseline' / 'in_context' / 'driving'}",
@@ -237,10 +238,14 @@ def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     ]
     drives = load_domain("driving").source(None).split("train", 2, 0).select("merge")
     drives.save("drives.safetensors")
-    assert main(["fit", "--config", adapt, *made, *QUIET]) == 2
+    Path("adapt.yaml").write_text(
+        f"model: {{class_path: {method}.prompting.InContextAdaptation}}\n"
+        "data: {class_path: ftl_lightning.domains.data.InversionData, init_args: {domain: driving}}"
+    )
+    assert main(["fit", "--config", config, "--config=adapt.yaml", *made, *QUIET]) == 2
     assert "expected invert (model.class_path: InContextAdaptation learns nothing), found fit" in capsys.readouterr().err
     replace(drives, observed=drives.initial_states.observed, per_step=()).save("drives.safetensors")
-    assert main(["invert", "--config", adapt, *made, *QUIET]) == 2
+    assert main(["invert", "--config", config, *made, *QUIET]) == 2
     assert "key 'per_step': expected every feature to be observed at each time" in capsys.readouterr().err
 
 
@@ -260,7 +265,7 @@ def test_prompts_can_hide_the_road() -> None:
     assert torch.allclose(shown[..., 4], hidden[..., 4], atol=1e-5)  # the speed stays
 
 
-LANGUAGE = str(CONF / "baseline" / "language" / "invert" / "agent.yaml")
+LANGUAGE = [f"--config={CONF / 'agent.yaml'}", f"--config={CONF / 'method' / 'language.yaml'}"]
 
 
 def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[str]) -> None:
@@ -277,7 +282,7 @@ def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[s
         "--model.output=c",
         "--evaluation.results=r.csv",
     ]
-    assert main(["invert", "--config", LANGUAGE, *options]) == 0
+    assert main(["invert", *LANGUAGE, *options]) == 0
     model = load_model(ROOT / "pretrained" / "agent")
     assert set(read_rows("r.csv").query("role == 'method'")["method"]) == {"language"}
     for path in Path("c").iterdir():

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
@@ -17,7 +18,6 @@ from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import explained, invert
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.pretrained import load_model
@@ -470,7 +470,7 @@ def test_modes_learn_from_noised_demonstrations_of_a_number_of_their_own(tiny: P
 
 def test_a_concept_that_is_not_finite_is_not_learned(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--data.suite=validation", "--data.steps=1", "--model.learning_rate=1e30", "--evaluation.samples=1"]
-    arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
     for tolerance in ("null", "0.01"):
         more = [f"--model.tolerance={tolerance}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
         assert main([*arguments, *options, *more]) == 2

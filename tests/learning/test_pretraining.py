@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from ftl_lightning.learning.generative_model import GenerativeModel
 from safetensors.torch import load_file
 
 from ftl_lightning.cli import main
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
-from ftl_lightning.learning.generative_model import GenerativeModel
 from tests.conftest import CONF, ROOT, TINY
 
 FIT = ["fit", "--config", str(CONF / "object_rearrangement.yaml"), *TINY, "--evaluation.samples=2", "--evaluation.figures=0"]
@@ -185,8 +185,8 @@ def small(configuration: str, *options: str) -> int:
         ("object_rearrangement.yaml", [DENOISER, "--trainer.check_val_every_n_epoch=2"]),
         ("object_rearrangement.yaml", [DENOISER, "--trainer.val_check_interval=2"]),
         ("object_rearrangement.yaml", [DENOISER, "--trainer.limit_val_batches=0"]),
-        ("baseline/cvae/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
-        ("baseline/bc/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
+        ("cvae/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
+        ("bc/object_rearrangement.yaml", ["--model.hidden_dim=32"]),
     ],
 )
 def test_from_any_checkpoint_it_goes_on_to_the_same_bytes(configuration: str, options: list[str]) -> None:

@@ -17,7 +17,7 @@ from tests.strokes import TRAINING, strokes
 
 OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop")
 FITS = [Path(f"{domain}.yaml") for domain in OURS] + sorted(
-    path.relative_to(CONF) for path in (CONF / "baseline").glob("*/*.yaml") if path.parent.name != "language"
+    path.relative_to(CONF) for method in ("bc", "cvae", "in_context") for path in (CONF / method).glob("*.yaml")
 )
 FEW = ["--data.samples_per_concept=2", "--data.validation_per_concept=1"]
 DATA = {
@@ -63,7 +63,7 @@ def test_every_shipped_configuration_goes_on_to_the_same_bytes(path: Path, tmp_p
         states = np.concatenate([strokes(kind, 4, 0) for kind in TRAINING])
         np.savez("strokes.npz", states=states, concepts=np.repeat(TRAINING, 4))
         options += ["--data.demonstrations=strokes.npz"]
-    if path == Path("baseline/bc/object_rearrangement.yaml"):
+    if path == Path("bc/object_rearrangement.yaml"):
         options += ["--model.members=2"]
     fit = ["fit", "--config", str(CONF / path), *options]
     assert main([*fit, *OFTEN, "--model.output=unbroken"]) == 0
@@ -76,7 +76,7 @@ def test_every_shipped_configuration_goes_on_to_the_same_bytes(path: Path, tmp_p
 
 @pytest.mark.parametrize("options", [[], ["--model.adapter=2", "--model.tolerance=null"], ["--model.modes=each"]], ids=str)
 def test_learning_that_is_interrupted_goes_on_to_the_same_bytes(options: list[str], tiny: Path) -> None:
-    invert = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}", *options]
+    invert = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}", *options]
     invert += ["--data.suite=validation", "--data.steps=7", "--trainer.accelerator=cpu", "--trainer.enable_progress_bar=false"]
     invert += ["--evaluation.suites=[validation]", "--evaluation.samples=2", "--evaluation.figures=0"]
     often = ["--trainer.callbacks.init_args.train_time_interval=null", "--trainer.callbacks.init_args.every_n_train_steps=3"]
