@@ -60,7 +60,7 @@ class Stage:
                 configs = tuple(_text(config, names) for config in self.configs)
                 first, *added = (Path(config).stem for config in configs)
                 said = [*added, *(text for text in texts if text not in (first, *added))]
-                varied = [f"{key.rpartition('.')[2]} {texts_of[key]}" for key in self.grid]
+                varied = [f"{key.partition('.')[2]} {texts_of[key]}" for key in self.grid]
                 parts = [f"{self.verb} {first}", *said, _text(self.name, names), *varied, f"seed {seed}"]
                 yield Cell(self.verb, configs, texts_of, _text(self.done, names), ", ".join(filter(None, parts)))
 
