@@ -13,7 +13,7 @@ from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, ob
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.simulation import advance, restore, save
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
-from ftl_lightning.domains.driving.traffic import OBSERVED, SCENARIO, SCENE, STEP, TRAFFIC, origin, scene
+from ftl_lightning.domains.driving.traffic import NAMES, OBSERVED, SCENARIO, SCENE, STEP, TRAFFIC, decision_seconds, origin, scene
 from ftl_lightning.errors import UserError
 
 PAPER = ("highway", "exit", "merge", "intersection", "roundabout")
@@ -30,6 +30,12 @@ def start(name: str, seed: int = 0, fast: bool = True) -> object:
 
 
 # Scenarios
+
+
+def test_scenarios_are_known_without_the_simulator() -> None:
+    assert tuple(SCENARIOS) == NAMES
+    for name, found in SCENARIOS.items():
+        assert decision_seconds(name) == 1 / (found.environment.default_config() | found.config)["policy_frequency"]
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
