@@ -48,7 +48,7 @@ class Judged:
         return cls(task, states, domain.measure(task.goal, states, starts), starts)
 
     def executed(self, rollout: Rollout, domain: Domain, environment: str = "") -> Self:
-        """This behaviour with its episodes, judged by the task's goal; one whose plan was not finite is no success.
+        """Behaviour with its episodes, judged by the task's goal; one whose plan was not finite is no success.
 
         Args:
             rollout: the episodes.
@@ -63,7 +63,7 @@ class Judged:
         return replace(self, rollout=rollout, outcomes=outcomes)
 
     def compared(self, diversity: Mapping[str, float]) -> Self:
-        """This behaviour with its novelty and coverage."""
+        """Behaviour with its novelty and coverage."""
         return replace(self, diversity=diversity)
 
     @property
@@ -115,7 +115,7 @@ def standard_error(values: Sequence[float]) -> float:
 
 
 def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environment: str = "") -> list[Judged]:
-    """Behaviour of some tasks with its episodes, which run all side by side; in the domain's own environment or one of its others."""
+    """Behaviour of some tasks with its episodes, which all run side by side, in the domain's own environment or another."""
     assert domain.closed_loop is not None
     starts = join([behaviour.starts for behaviour in judged if behaviour.starts is not None])
     counts = [len(behaviour.states) for behaviour in judged]
