@@ -142,7 +142,7 @@ class Real:
         return self.added(Judged.of(self.task, self._windows(behaviour), starts, self.domain))
 
     def added(self, judged: Judged) -> Judged:
-        """The same behaviour with its novelty and coverage."""
+        """Behaviour with its novelty and coverage."""
         return judged.compared(self.values(judged.states))
 
 

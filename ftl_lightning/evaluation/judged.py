@@ -48,7 +48,7 @@ class Judged:
         return cls(task, states, domain.measure(task.goal, states, starts), starts)
 
     def executed(self, rollout: Rollout, domain: Domain, environment: str = "") -> Self:
-        """The same with its episodes, judged by the task's goal; one whose plan was not finite is no success.
+        """Behaviour with its episodes, judged by the task's goal; one whose plan was not finite is no success.
 
         Args:
             rollout: the episodes.
@@ -63,7 +63,7 @@ class Judged:
         return replace(self, rollout=rollout, outcomes=outcomes)
 
     def compared(self, diversity: Mapping[str, float]) -> Self:
-        """The same with novelty and coverage."""
+        """Behaviour with its novelty and coverage."""
         return replace(self, diversity=diversity)
 
     @property

@@ -27,7 +27,7 @@ class Row:
     Attributes:
         domain, setting, task: what was evaluated.
         method: the method's name, for example ``'FTL-IGM'`` or ``'BC'``, or a reference line's.
-        form: of the method, see :class:`~ftl_lightning.domains.paper.Method`, for example ``'with modes'``; empty for the paper's.
+        form: of the method, see :class:`~ftl_lightning.domains.paper.Compared`, for example ``'with modes'``; empty for the paper's.
         variant: what tells settings of one method and form apart, for example ``'entities, free'``; may be empty.
         role: :data:`METHOD` or :data:`REFERENCE`.
         K: number of concept components; 0 where nothing was learned.
@@ -73,7 +73,8 @@ _BEFORE_FORMS = [name for name in COLUMNS if name != "form"]
 _BEFORE_VARIANTS = [name for name in _BEFORE_FORMS if name not in ("variant", "role")]
 """The columns of older files, see :func:`upgraded`."""
 _IN_BRACKETS = r"\((?P<variant>.*)\)"
-_ENDING = f"(?P<form>{'|'.join(' '.join(some) for count in (1, 2, 3) for some in itertools.combinations(FORMS, count))})"
+_JOINED = (" ".join(forms) for count in range(1, len(FORMS) + 1) for forms in itertools.combinations(FORMS, count))
+_ENDING = f"(?P<form>{'|'.join(_JOINED)})"
 """What names in older files end with."""
 _SUBJECT = ["domain", "setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
 _KEY = [*_SUBJECT, "n", "config_hash"]
@@ -89,7 +90,10 @@ def append_rows(path: str | Path, rows: list[Row]) -> None:
 
 
 def add_rows(path: str | Path, table: pd.DataFrame) -> None:
-    """Add rows of a table, as :func:`append_rows` does. Processes that add to the same file wait for one another."""
+    """Add rows of a table by :data:`COLUMNS`; the same measurements are replaced. Whole or not at all.
+
+    Processes that add to the same file wait for one another.
+    """
     path = Path(path)
     with alone(path.parent):
         if path.is_file():
@@ -136,17 +140,17 @@ def label(method: str, form: str = "", variant: str = "") -> str:
 
 def labels(rows: pd.DataFrame) -> pd.Series:
     """:func:`label` of each row."""
-    told = zip(rows["method"], rows["form"], rows["variant"], strict=True)
-    return pd.Series([label(*names) for names in told], rows.index, dtype=str)
+    names = zip(rows["method"], rows["form"], rows["variant"], strict=True)
+    return pd.Series([label(*row_names) for row_names in names], rows.index, dtype=str)
 
 
 def replaced(rows: pd.DataFrame) -> int:
-    """How many rows :func:`latest` leaves out because others about the same were measured later, however configured."""
+    """How many rows :func:`latest` leaves out: the same subject was measured again later, in another configuration."""
     return len(rows) - len(latest(rows))
 
 
 def latest(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of rows about the same that differ only in how they were configured, the one that was measured last."""
+    """Of rows that differ only in the number of samples and in how they were configured, the one that was measured last."""
     return rows.drop_duplicates(_SUBJECT, keep="last")
 
 
@@ -182,8 +186,8 @@ def _read(file: Path) -> pd.DataFrame:
     if not isinstance(table.index, pd.RangeIndex):
         raise UserError(f"expected {len(table.columns)} cells in each row, found more in some; it is damaged")
     if list(table.columns) not in (COLUMNS, _BEFORE_FORMS, _BEFORE_VARIANTS):
-        told = short(", ".join(map(str, table.columns)), 80)
-        raise UserError(f"expected the columns {short(', '.join(COLUMNS), 140)}, found {told}")
+        columns = short(", ".join(map(str, table.columns)), 80)
+        raise UserError(f"expected the columns {short(', '.join(COLUMNS), 140)}, found {columns}")
     if (bad := _bad_cell(table)) is not None:
         row, column, expected = bad
         cell = _table(file, str).fillna("").iloc[row][column]

@@ -83,9 +83,9 @@ def _mean(rows: Sequence[Row], metric: str, error: bool = True) -> str:
 def _samples(rows: Sequence[Row]) -> str:
     """Of each task, and of how many tasks."""
     counts = sorted({row.n for row in rows})
-    each = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    samples = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     tasks = len({row.task for row in rows})
-    return f"{tasks}x{each}" if tasks > 1 else each
+    return f"{tasks}x{samples}" if tasks > 1 else samples
 
 
 def literal(text: str, style: str = "") -> Text:

@@ -22,8 +22,7 @@ def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
     settings = list(dict.fromkeys(rows["setting"]))
     lines = []
     for variant in dict.fromkeys(rows["variant"]):
-        own = rows[rows["variant"] == variant]
-        numbers = [summarise(own[own["setting"] == setting]) for setting in settings]
+        numbers = [summarise(select(rows, variant=variant, setting=setting)) for setting in settings]
         lines.append([variant, *(MISSING if number is None else str(number) for number in numbers)])
     caption = (
         f"{domain.name}: {metric} of ours, and with one change to the paper's form taken away at a time. "

@@ -70,17 +70,18 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
     lines = []
     for setting in settings(domain, rows):
         for metric in shown or metrics(domain):
-            own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
-            numbers = [(method, summarise(of_method(own, method))) for method in methods(rows)]
-            numbers += [(Compared(name), summarise(select(around, method=name))) for name in sorted(set(around["method"]))]
+            method_rows, reference_rows = (select(table, setting=setting, metric=metric) for table in (rows, references))
+            names = sorted(set(reference_rows["method"]))
+            numbers = [(method, summarise(of_method(method_rows, method))) for method in methods(rows)]
+            numbers += [(Compared(name), summarise(select(reference_rows, method=name))) for name in names]
             tested = {
                 lead.baseline: [signed(lead.difference), lead.shown]
-                for lead in leads(own, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
+                for lead in leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
             }
             for method, number in numbers:
                 if number:
-                    told = beside(number, lookup(domain, setting, metric, method=method))
-                    lines.append([setting, metric, label(*method), *told, *tested.get(method, [MISSING, MISSING])])
+                    cells = beside(number, lookup(domain, setting, metric, method=method))
+                    lines.append([setting, metric, label(*method), *cells, *tested.get(method, [MISSING, MISSING])])
     caption = f"{domain.name}: all methods{_learned_from(rows)}"
     return make_table(
         domain, "comparison", caption, lines, ["setting", "metric", "method", *BESIDE, "ours is better by", "ours is"]
@@ -98,10 +99,10 @@ def _learned_from(rows: pd.DataFrame) -> str:
 BESIDE = ("measured", "standard error over tasks", "spread over seeds", "paper", "difference")
 
 
-def beside(number: Number, theirs: Published | None) -> list[str]:
+def beside(number: Number, papers: Published | None) -> list[str]:
     """The columns :data:`BESIDE`."""
     error, spread = (MISSING if value is None else f"{value:.2f}" for value in (number.error, number.spread))
-    return [f"{number.mean:.2f}", error, spread, paper(theirs), difference_to(theirs, number)]
+    return [f"{number.mean:.2f}", error, spread, paper(papers), difference_to(papers, number)]
 
 
 def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
@@ -112,23 +113,23 @@ def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
 
 def overview(results: pd.DataFrame) -> Table:
     """All domains on one screen: ours and the baselines, the paper's numbers in brackets."""
-    names = methods(results)
+    columns = methods(results)
     lines = []
     for domain in _domains(results):
         rows, references = compared(domain, results), reference_lines(domain, results)
         for setting in settings(domain, rows):
             for metric in metrics(domain):
                 if not select(rows, setting=setting, metric=metric).empty:
-                    lines.append(_line(domain, rows, references, setting, metric, names))
+                    lines.append(_line(domain, rows, references, setting, metric, columns))
     return _overview(results, lines)
 
 
 def short_overview(results: pd.DataFrame) -> Table:
     """The overview in at most :data:`LINES` lines: of each domain in turn what says most."""
-    names = methods(results)
+    columns = methods(results)
     lines = {
         domain.name: [
-            _line(domain, rows, reference_lines(domain, results), setting, metric, names)
+            _line(domain, rows, reference_lines(domain, results), setting, metric, columns)
             for setting, metric in headlines(domain, rows)
         ]
         for domain in _domains(results)
@@ -153,24 +154,24 @@ def _domains(results: pd.DataFrame) -> list[Domain]:
 
 
 def _line(
-    domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, names: Sequence[Compared]
+    domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, columns: Sequence[Compared]
 ) -> list[str]:
-    own, around = (select(found, setting=setting, metric=metric) for found in (rows, references))
-    cells = [_cell(domain, own, method, setting, metric) for method in names]
-    lead = least_certain(leads(own, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric)))
-    alike = _alike(domain, of_method(select(rows, setting=setting), domain.ours)) if metric == domain.headline else {}
-    return [domain.name, f"{setting}, {metric}", *cells, MISSING if lead is None else str(lead), _around(around, alike)]
+    method_rows, reference_rows = (select(table, setting=setting, metric=metric) for table in (rows, references))
+    cells = [_cell(domain, method_rows, method, setting, metric) for method in columns]
+    lead = least_certain(leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric)))
+    agreeing = _agreeing(domain, of_method(select(rows, setting=setting), domain.ours)) if metric == domain.headline else {}
+    return [domain.name, f"{setting}, {metric}", *cells, MISSING if lead is None else str(lead), _means(reference_rows, agreeing)]
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> str:
-    number, theirs = summarise(of_method(rows, method)), lookup(domain, setting, metric, method=method)
+    number, papers = summarise(of_method(rows, method)), lookup(domain, setting, metric, method=method)
     if number is None:
         return MISSING
     error = "" if number.error is None else f" ± {number.error:.2f}"
-    return f"{number.mean:.2f}{error}" + ("" if theirs is None else f" [{theirs.value:.2f}]")
+    return f"{number.mean:.2f}{error}" + ("" if papers is None else f" [{papers.value:.2f}]")
 
 
-def _alike(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
+def _agreeing(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
     """Of reference policies whose episodes nearly all end as ours do: in how many."""
     counted = {policy: against(ours, policy) for policy in policies(domain)}
     return {
@@ -180,7 +181,8 @@ def _alike(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
     }
 
 
-def _around(rows: pd.DataFrame, alike: Mapping[str, str]) -> str:
-    means = rows.groupby("method")["value"].mean().sort_values()
-    named = [(str(method), f"{method} {mean:.2f}") for method, mean in means.items()]
-    return ", ".join(shown + (f" ({alike[method]})" if method in alike else "") for method, shown in named) or MISSING
+def _means(references: pd.DataFrame, agreeing: Mapping[str, str]) -> str:
+    """The mean of each reference line, the least first."""
+    means = references.groupby("method")["value"].mean().sort_values()
+    named = [(str(name), f"{name} {mean:.2f}") for name, mean in means.items()]
+    return ", ".join(text + (f" ({agreeing[name]})" if name in agreeing else "") for name, text in named) or MISSING

@@ -60,9 +60,9 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
         return None if figure_text(label) in axes.get_legend_handles_labels()[1] else figure_text(label)
 
     for place, setting in enumerate(shown):
-        found = lookup(domain, setting, metric)
-        if found:
-            axes.bar(place, found.value, width, yerr=found.error, color=PAPER_COLOUR, capsize=2, label=once("paper"))
+        papers = lookup(domain, setting, metric)
+        if papers:
+            axes.bar(place, papers.value, width, yerr=papers.error, color=PAPER_COLOUR, capsize=2, label=once("paper"))
         for index, label in enumerate(learned, start=1):
             number = summarise(select(ours, setting=setting, label=label))
             if number:
@@ -99,24 +99,24 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3), 3.4), layout="constrained")
     axes = figure.subplots()
     for index, method in enumerate(names):
-        own, colour = of_method(rows, method), colours[method]
+        method_rows, colour = of_method(rows, method), colours[method]
         for place, setting in enumerate(shown):
             where = place + (index - (len(names) - 1) / 2) * width
             label = None if place else figure_text(method_label(*method))
-            if number := summarise(own[own["setting"] == setting]):
+            if number := summarise(select(method_rows, setting=setting)):
                 axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=label)
-            elif label and not own.empty:
+            elif label and not method_rows.empty:
                 axes.bar(where, 0, width, color=colour, label=label)
-            if found := lookup(domain, setting, metric, method=method):
+            if papers := lookup(domain, setting, metric, method=method):
                 named = "the paper's" not in axes.get_legend_handles_labels()[1]
-                axes.plot(where, found.value, "D", color="black", markersize=4, label="the paper's" if named else None)
+                axes.plot(where, papers.value, "D", color="black", markersize=4, label="the paper's" if named else None)
     references = reference_lines(domain, results)
     references = references[references["metric"] == metric]
     for index, policy in enumerate(sorted(set(references["method"]))):
-        own = references[references["method"] == policy]
-        for place in (place for place, setting in enumerate(shown) if setting in set(own["setting"])):
+        policy_rows = select(references, method=policy)
+        for place in (place for place, setting in enumerate(shown) if setting in set(policy_rows["setting"])):
             label = None if figure_text(policy) in axes.get_legend_handles_labels()[1] else figure_text(policy)
-            mean = own.loc[own["setting"] == shown[place], "value"].mean()
+            mean = select(policy_rows, setting=shown[place])["value"].mean()
             span, line = (place - 0.45, place + 0.45), LINES[index % len(LINES)]
             axes.hlines(mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
     axes.set_xticks(range(len(shown)), [*map(figure_text, shown)])
@@ -136,9 +136,9 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
     for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
         rows = points(domain, results, axis)
         for colour, setting in zip(COLOURS, dict.fromkeys(rows["setting"]), strict=False):
-            own = rows[rows["setting"] == setting]
-            counts = sorted(set(own[axis]))
-            numbers = [summarise(own[own[axis] == count]) for count in counts]
+            setting_rows = select(rows, setting=setting)
+            counts = sorted(set(setting_rows[axis]))
+            numbers = [summarise(select(setting_rows, **{axis: count})) for count in counts]
             means = [number.mean for number in numbers if number]
             errors = [number.error or 0.0 for number in numbers if number]
             axes.errorbar(counts, means, errors, marker="o", capsize=2, color=colour, label=figure_text(setting))
@@ -167,25 +167,27 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(_width(3.6 * max(len(shown), 1) + 2.2), 3.6), layout="constrained")
     panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     lines = labelled(rows[~rows["method"].isin(list(REFERENCE_MARKS))])
-    forms = list(dict.fromkeys(lines["label"]))
     for axes, panel in zip(panels, shown, strict=False):
-        own = rows[rows["panel"] == panel]
-        for colour, form in zip(itertools.cycle(COLOURS), forms, strict=False):
-            each = lines[(lines["panel"] == panel) & (lines["label"] == form)]
-            means = each.groupby("temperature", dropna=False)[["coverage", "accuracy"]].mean().sort_index()
+        for colour, label in zip(itertools.cycle(COLOURS), dict.fromkeys(lines["label"]), strict=False):
+            means = (
+                select(lines, panel=panel, label=label)
+                .groupby("temperature", dropna=False)[["coverage", "accuracy"]]
+                .mean()
+                .sort_index()
+            )
             if means.empty:
                 continue
-            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(form))
+            axes.plot(means["coverage"], means["accuracy"], color=colour, linewidth=1, label=figure_text(label))
             strengths = [1 - 0.75 * place / len(means) for place in range(len(means))]
             axes.scatter(means["coverage"], means["accuracy"], color=colour, alpha=strengths, s=22)
         for method, mark in REFERENCE_MARKS.items():
-            mean = own.loc[own["method"] == method, ["coverage", "accuracy"]].mean()
+            mean = select(rows, panel=panel, method=method)[["coverage", "accuracy"]].mean()
             if mean.notna().all():
                 axes.plot(mean["coverage"], mean["accuracy"], mark, color="black", markersize=8, label=method)
         axes.set(xlabel="coverage (less is better)", ylim=(-0.05, 1.05), title=figure_text(panel))
     panels[0].set_ylabel(figure_text(domain.main_metric))
-    found = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(list(found.values()), list(found), fontsize=8, loc="outside right upper")
+    handles = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(handles.values()), list(handles), fontsize=8, loc="outside right upper")
     tempered = lines[lines["method"] != NOISY]
     figure.suptitle(figure_text(f"{domain.name}: temperature from {_range(tempered)}"), fontsize=10)
     return figure
@@ -199,10 +201,9 @@ def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
     """
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axes = figure.subplots()
-    for colour, (name, own) in zip(COLOURS, curves.items(), strict=False):
-        axes.plot(
-            [one.seconds for one in own], [one.accuracy for one in own], "o-", color=colour, markersize=4, label=figure_text(name)
-        )
+    for colour, (name, curve) in zip(COLOURS, curves.items(), strict=False):
+        seconds, accuracy = ([getattr(point, axis) for point in curve] for axis in ("seconds", "accuracy"))
+        axes.plot(seconds, accuracy, "o-", color=colour, markersize=4, label=figure_text(name))
     axes.axhline(reached(curves), color=PAPER_COLOUR, linestyle="dotted")
     axes.set(xscale="log", xlabel="seconds of learning", ylabel="accuracy", ylim=(-0.05, 1.05))
     figure.legend(fontsize=8, loc="outside upper center", ncols=len(curves))
@@ -230,11 +231,11 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
 
     training = model.config.training_concepts
     learned = [
-        (f"{concept.origin.name} [{part.replace('component ', '')}]", own)
+        (f"{concept.origin.name} [{part.replace('component ', '')}]", embedding)
         for concept in concepts
-        for part, (_, own) in concept.parts().items()
+        for part, (_, embedding) in concept.parts().items()
     ]
-    embeddings = torch.cat((model.training_embeddings.cpu(), *(own[None] for _, own in learned)))
+    embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for _, embedding in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)
     places = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
     figure = Figure(figsize=(9, 6), layout="constrained")

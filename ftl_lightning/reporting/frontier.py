@@ -17,7 +17,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import PAPERS_METHOD
 from ftl_lightning.evaluation.results import label, split_forms
 from ftl_lightning.reporting.listed import read_listed
-from ftl_lightning.reporting.tables import MISSING, Table, make_table, of_method
+from ftl_lightning.reporting.tables import MISSING, Table, make_table, of_method, select
 from ftl_lightning.tensor_file import write_text
 
 FRONTIER = "frontier.json"
@@ -96,12 +96,11 @@ def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
     """
     lines = []
     rows = rows[rows["domain"] == domain.name].dropna(subset=["coverage"])
-    for (suite, setting), own in rows.groupby(["suite", "setting"], sort=False):
-        ours = of_method(own, PAPERS_METHOD)
-        reference = ours[ours["temperature"] == 1.0]["coverage"].mean()
-        for method, each in own.groupby(["method", "form"], sort=False):
-            equal = accuracy_at(each, reference)
-            means = each.groupby("temperature", dropna=False)[["accuracy", "novelty", "coverage"]].mean().reset_index()
+    for (suite, setting), setting_rows in rows.groupby(["suite", "setting"], sort=False):
+        covered = select(of_method(setting_rows, PAPERS_METHOD), temperature=1.0)["coverage"].mean()
+        for method, method_rows in setting_rows.groupby(["method", "form"], sort=False):
+            equal = accuracy_at(method_rows, covered)
+            means = method_rows.groupby("temperature", dropna=False)[["accuracy", "novelty", "coverage"]].mean().reset_index()
             for values in means.to_numpy():
                 numbers = [*(f"{value:.2f}" for value in values[1:]), "" if equal is None else f"{equal:.2f}"]
                 cells = [suite, setting, label(*map(str, method)), f"{values[0]:g}", *numbers]

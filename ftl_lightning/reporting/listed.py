@@ -29,8 +29,8 @@ def read_listed(path: Path, key: str, kind: Callable[..., T], expected: str) -> 
             raise UserError(f"key {key!r}: expected a list, found {shown(rows)}")
         return [built(kind, _told(row), f"{key}[{number}]") for number, row in enumerate(rows)]
     except UserError as error:
-        told = str(error).removeprefix(f"{path}: ")
-        raise UserError(f"{path}: expected {expected}, found something else ({told})") from error
+        reason = str(error).removeprefix(f"{path}: ")
+        raise UserError(f"{path}: expected {expected}, found something else ({reason})") from error
 
 
 def _told(row: object) -> object:

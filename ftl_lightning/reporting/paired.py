@@ -140,22 +140,22 @@ def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], les
         Compared(*map(str, named)): measured.groupby(["task", "seed"])["value"].mean() * (-1 if less else 1)
         for named, measured in rows.groupby(["method", "form"])
     }
-    found = {
+    compared = {
         baseline: differences
         for baseline in baselines
         if {ours, baseline} <= set(values) and not (differences := (values[ours] - values[baseline]).dropna()).empty
     }
-    parts = {name: _parts(differences, len(found)) for name, differences in found.items()}
+    parts = {baseline: _parts(differences, len(compared)) for baseline, differences in compared.items()}
     corrected = dict(zip(parts, holm([sign_flip(flipped) for flipped in parts.values()]), strict=True))
     return [
         Lead(
-            name,
+            baseline,
             difference=float(differences.groupby("task").mean().mean()),
             pairs=len(differences),
-            p=corrected[name] if reachable(len(parts[name]), len(found)) else None,
+            p=corrected[baseline] if reachable(len(parts[baseline]), len(compared)) else None,
             same=bool((differences.abs() <= ROUNDING).all()),
         )
-        for name, differences in found.items()
+        for baseline, differences in compared.items()
     ]
 
 
@@ -166,12 +166,12 @@ def _parts(differences: pd.Series, tests: int) -> list[float]:
     return list(parts.groupby("task").sum() if reachable(by_task.ngroups, tests) else parts)
 
 
-def least_certain(found: Sequence[Lead]) -> Lead | None:
-    """The one that a single verdict is about: *ahead* is ahead of every baseline, *behind* is behind at least one.
+def least_certain(compared: Sequence[Lead]) -> Lead | None:
+    """The lead that a single verdict is about: *ahead* is ahead of every baseline, *behind* is behind at least one.
 
     Of those with the same verdict it is the best baseline's. ``None`` for none.
     """
-    return min(found, key=lambda lead: ({BEHIND: 0, AHEAD: 2}.get(lead.verdict, 1), lead.difference), default=None)
+    return min(compared, key=lambda lead: ({BEHIND: 0, AHEAD: 2}.get(lead.verdict, 1), lead.difference), default=None)
 
 
 def episodes(won: int, lost: int, count: int) -> str:

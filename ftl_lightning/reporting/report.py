@@ -56,23 +56,23 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
     everything, headline = [], []
     for name in sorted(set(rows["domain"])):
         domain = domain_of(name, rows)
-        found = _ablations(domain, ablations, out / name)
-        headline += found[:1]
+        domain_tables = _ablations(domain, ablations, out / name)
+        headline += domain_tables[:1]
         if name in set(comparison["domain"]):
-            found.append(_written(comparison_table(domain, comparison), out / name))
+            domain_tables.append(_written(comparison_table(domain, comparison), out / name))
             for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
                 _save(comparison_bars(domain, comparison, metric), out / name / f"comparison_{_file(metric)}.png")
         elif any(method.name != OURS for method in methods(compared(domain, ablations))):
-            found.append(_written(comparison_table(domain, ablations), out / name))
+            domain_tables.append(_written(comparison_table(domain, ablations), out / name))
         if name in set(curves["domain"]):
-            found.append(_written(curves_table(domain, curves), out / name))
+            domain_tables.append(_written(curves_table(domain, curves), out / name))
             _save(growth(domain, curves), out / name / "curves.png")
         if name in set(changes["domain"]):
-            found.append(_written(changes_table(domain, changes), out / name))
+            domain_tables.append(_written(changes_table(domain, changes), out / name))
         if name in set(measured["domain"]):
             _save(frontier(domain, measured), out / name / "frontier.png")
-            found.append(_written(frontier_table(domain, measured), out / name))
-        everything += found
+            domain_tables.append(_written(frontier_table(domain, measured), out / name))
+        everything += domain_tables
     if curve_by_name := read_speed(results):
         _save(learning_time(curve_by_name), out / "speed.png")
     if not comparison.empty:
@@ -91,9 +91,9 @@ def _expect_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
     """
     if (count := len({name for rows in studies for name in rows["domain"]})) > MOST_DOMAINS:
         raise UserError(f"{results}: expected at most {MOST_DOMAINS} domains, found {count}; report fewer files at a time")
-    for domain, own in (found for rows in studies for found in rows.groupby("domain")):
-        ours = of_method(own, PAPERS_METHOD)
-        cells = own["setting"].nunique() * len(own.groupby(["method", "form", "variant"]))
+    for domain, domain_rows in (named for rows in studies for named in rows.groupby("domain")):
+        ours = of_method(domain_rows, PAPERS_METHOD)
+        cells = domain_rows["setting"].nunique() * len(domain_rows.groupby(["method", "form", "variant"]))
         cells += ours["setting"].nunique() * ours["variant"].nunique() * ours["K"].nunique() * ours["omega"].nunique()
         if cells > MOST_CELLS:
             raise UserError(
@@ -104,11 +104,11 @@ def _expect_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
 
 def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
     """Tables and figures of our method in all its forms."""
-    found = [_written(table, folder) for table in tables(domain, rows)]
+    written = [_written(table, folder) for table in tables(domain, rows)]
     measured = set(select(rows, domain=domain.name, role=METHOD)["metric"])
     for metric in sorted(measured & set(metrics(domain))):
         _save(accuracy_bars(domain, rows, metric), folder / f"{_file(metric)}.png")
-    return found
+    return written
 
 
 def _written(table: Table, folder: Path) -> Table:

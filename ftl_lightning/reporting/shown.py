@@ -34,8 +34,8 @@ def domain_of(name: str, rows: pd.DataFrame) -> Domain:
     try:
         return domain_of_file(name)
     except UserError:
-        own = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
-        metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(own) if metric not in (NOVELTY, COVERAGE)}
+        measured = rows.loc[(rows["domain"] == name) & ~rows["metric"].str.startswith((CLOSED, WON, LOST)), "metric"]
+        metrics = {metric: Metric(_unknown) for metric in dict.fromkeys(measured) if metric not in (NOVELTY, COVERAGE)}
         concepts = Concepts(training=(), suites={}, descriptions=(), reads=lambda text: False)
         return Domain(name, Plans(0, (), ()), concepts, _unknown, metrics=metrics, headline=next(iter(metrics), EXECUTED))
 
@@ -79,7 +79,7 @@ def judges_plans(domain: Domain) -> bool:
 def metrics(domain: Domain) -> tuple[str, ...]:
     """What the methods are compared by: the main metric, success in closed loop, the headline, and the paper's."""
     executed = [EXECUTED] if domain.closed_loop else []
-    names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(one.metric for one in published(domain))))
+    names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(number.metric for number in published(domain))))
     return tuple(name for name in names if name)
 
 
@@ -141,7 +141,8 @@ def lookup(
 
 def paper_tasks(domain: Domain, setting: str) -> list[str]:
     """Tasks of a setting of which the paper's main figures show a number of their own."""
-    return [one.task for one in published(domain) if one.setting == setting and one.task and one.omega == papers_omega(domain)]
+    numbers = [number for number in published(domain) if number.setting == setting and number.omega == papers_omega(domain)]
+    return [number.task for number in numbers if number.task]
 
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
@@ -150,14 +151,14 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
     Without a paper the main metric of each setting.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
-    every = settings(domain, rows)
+    measured_settings = settings(domain, rows)
     numbers = {
-        (one.setting, one.metric)
-        for one in published(domain)
-        if not one.task and (one.method != OURS or (one.components, one.omega) == (2, papers_omega(domain)))
+        (number.setting, number.metric)
+        for number in published(domain)
+        if not number.task and (number.method != OURS or (number.components, number.omega) == (2, papers_omega(domain)))
     }
     if not numbers:
-        return [(setting, domain.main_metric) for setting in every if (setting, domain.main_metric) in measured]
-    reported = [(setting, metric) for setting in every for metric in metrics(domain) if (setting, metric) in numbers]
+        return [(setting, domain.main_metric) for setting in measured_settings if (setting, domain.main_metric) in measured]
+    reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
     executed = [(setting, domain.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
-    return [one for one in dict.fromkeys((*reported, *executed)) if one in measured]
+    return [headline for headline in dict.fromkeys((*reported, *executed)) if headline in measured]

@@ -44,9 +44,9 @@ def read_speed(path: str | Path) -> dict[str, list[Measured]]:
     """
     path = Path(path)
     path = path / SPEED if path.is_dir() else path
-    found: dict[str, list[Measured]] = {}
+    curves: dict[str, list[Measured]] = {}
     if not path.is_file() or path.suffix != ".json":
-        return found
+        return curves
     for measured in read_listed(path, "curves", Measured, "curves of steps, seconds and accuracy"):
-        found.setdefault(measured.curve, []).append(measured)
-    return found
+        curves.setdefault(measured.curve, []).append(measured)
+    return curves

@@ -116,16 +116,16 @@ def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:
     return select(rows, method=method.name, form=method.form)
 
 
-def paper(found: Published | None) -> str:
+def paper(papers: Published | None) -> str:
     """The paper's number with its standard error."""
-    if found is None:
+    if papers is None:
         return MISSING
-    return f"{found.value:.2f}" + ("" if found.error is None else f" ± {found.error:.2f}")
+    return f"{papers.value:.2f}" + ("" if papers.error is None else f" ± {papers.error:.2f}")
 
 
-def difference_to(found: Published | None, number: Number | None) -> str:
+def difference_to(papers: Published | None, number: Number | None) -> str:
     """Ours less the paper's."""
-    return MISSING if found is None or number is None else f"{number.mean - found.value:+.2f}"
+    return MISSING if papers is None or number is None else f"{number.mean - papers.value:+.2f}"
 
 
 PAPERS = ("paper", "difference")
@@ -147,10 +147,10 @@ def _cell(rows: pd.DataFrame) -> tuple[str, Number | None]:
     return str(number) + "".join(marks), number
 
 
-def _beside(found: Published | None, measured: Sequence[pd.DataFrame]) -> list[str]:
+def _beside(papers: Published | None, measured: Sequence[pd.DataFrame]) -> list[str]:
     """The paper's number, and each of ours with its difference from it."""
     cells = map(_cell, measured)
-    return [paper(found), *(text for shown, number in cells for text in (shown, difference_to(found, number)))]
+    return [paper(papers), *(text for shown, number in cells for text in (shown, difference_to(papers, number)))]
 
 
 def _beside_head(methods: Sequence[str]) -> list[str]:
@@ -167,13 +167,13 @@ def labelled(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(label=labels(rows))
 
 
-def form(components: int, omega: str) -> str:
-    """How concepts were learned, in words."""
+def weighting(components: int, omega: str) -> str:
+    """The number of components and how they are weighted, in words."""
     weights = "learned weights" if omega == LEARNED else f"fixed omega {omega}"
     return f"K = {components}, {weights}" if components else weights
 
 
-def _forms(rows: pd.DataFrame) -> list[tuple[int, str]]:
+def _weightings(rows: pd.DataFrame) -> list[tuple[int, str]]:
     """K and guidance weight of each row."""
     return list(zip(map(int, rows["K"]), map(str, rows["omega"]), strict=True))
 
@@ -191,31 +191,32 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
     """
     rows = rows[rows["role"] == METHOD]
     usual = (USUAL_K, omega)
-    chosen = []
-    for _, own in rows.groupby(["label", "setting"], sort=False):
-        measured = Counter(_forms(own))
+    parts = []
+    for _, setting_rows in rows.groupby(["label", "setting"], sort=False):
+        measured = Counter(_weightings(setting_rows))
         components, weight = usual if usual in measured else measured.most_common(1)[0][0]
-        chosen.append(select(own, K=components, omega=weight))
-    found = pd.concat(chosen).loc[lambda some: rows.index.intersection(some.index)] if chosen else rows
-    ours = found["method"] == OURS
-    forms = set(_forms(found[ours]))
-    common = usual if usual in forms or not forms else next(iter(forms)) if len(forms) == 1 else None
+        parts.append(select(setting_rows, K=components, omega=weight))
+    selected = rows.loc[rows.index.intersection(pd.concat(parts).index)] if parts else rows
+    is_ours = selected["method"] == OURS
+    weightings = set(_weightings(selected[is_ours]))
+    common = usual if usual in weightings or not weightings else next(iter(weightings)) if len(weightings) == 1 else None
     marks = [
-        f" ({form(k, w)})" if own and (k, w) != common else "" for own, k, w in zip(ours, found["K"], found["omega"], strict=True)
+        f" ({weighting(*row_weighting)})" if ours and row_weighting != common else ""
+        for ours, row_weighting in zip(is_ours, _weightings(selected), strict=True)
     ]
-    return found.assign(mark=marks), "K and weights in brackets" if common is None else form(*common)
+    return selected.assign(mark=marks), "K and weights in brackets" if common is None else weighting(*common)
 
 
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
     """Every table of a domain for which there are results."""
-    every = labelled(latest(select(results, domain=domain.name)))
+    domain_rows = labelled(latest(select(results, domain=domain.name)))
     metric = domain.main_metric
-    rows = select(every, metric=metric)
+    rows = select(domain_rows, metric=metric)
     candidates = (
         *(() if metric == EXECUTED else (_accuracy(domain, rows, metric, "accuracy"),)),
-        _accuracy(domain, select(every, metric=EXECUTED), EXECUTED, "closed_loop"),
-        _outcomes(domain, every),
-        _paired(domain, every),
+        _accuracy(domain, select(domain_rows, metric=EXECUTED), EXECUTED, "closed_loop"),
+        _outcomes(domain, domain_rows),
+        _paired(domain, domain_rows),
         _count(domain, rows, metric),
         _omega(domain, rows, metric),
         _components(domain, rows, metric),
@@ -225,44 +226,47 @@ def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
 
 def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> Table:
     """The bars of the paper's main figure, with trivial policies and the oracle beside them."""
-    learned, references = _columns(rows)
-    ours, how = main_rows(rows, main_omega(domain))
+    learned_labels, reference_labels = _columns(rows)
+    selected, how = main_rows(rows, main_omega(domain))
     lines = []
-    for setting in settings(domain, ours):
+    for setting in settings(domain, selected):
         for task in ("", *paper_tasks(domain, setting)):
-            one = {"setting": setting} | ({"task": task} if task else {})
-            own = select(ours, **one)
-            if own.empty:
+            subject = {"setting": setting} | ({"task": task} if task else {})
+            task_rows = select(selected, **subject)
+            if task_rows.empty:
                 continue
             line = [f"- {task}" if task else setting]
-            line += _beside(lookup(domain, setting, metric, task), [select(own, label=label) for label in learned])
-            line += [_cell(select(rows, role=REFERENCE, label=label, **one))[0] for label in references]
+            line += _beside(lookup(domain, setting, metric, task), [select(task_rows, label=label) for label in learned_labels])
+            line += [_cell(select(rows, role=REFERENCE, label=label, **subject))[0] for label in reference_labels]
             lines.append(line)
-    other = "" if main_omega(domain) == papers_omega(domain) else f" (the paper's: {papers_omega(domain)})"
-    caption = f"{domain.name}: {metric}, {how}{other}. Mean ± standard error over tasks (spread over seeds)"
-    return make_table(domain, name, caption, lines, ["setting", *_beside_head(learned), *references])
+    papers_weight = "" if main_omega(domain) == papers_omega(domain) else f" (the paper's: {papers_omega(domain)})"
+    caption = f"{domain.name}: {metric}, {how}{papers_weight}. Mean ± standard error over tasks (spread over seeds)"
+    return make_table(domain, name, caption, lines, ["setting", *_beside_head(learned_labels), *reference_labels])
 
 
-def _outcomes(domain: Domain, every: pd.DataFrame) -> Table:
+def _outcomes(domain: Domain, rows: pd.DataFrame) -> Table:
     """All that happened in closed loop, by setting."""
-    executed = every[every["metric"].str.startswith(CLOSED)]
-    ours, how = main_rows(executed, main_omega(domain))
-    learned, references = _columns(executed)
+    executed = rows[rows["metric"].str.startswith(CLOSED)]
+    selected, how = main_rows(executed, main_omega(domain))
+    learned_labels, reference_labels = _columns(executed)
     lines = [
         [
             setting,
             metric.removeprefix(f"{CLOSED} "),
             *_beside(
                 lookup(domain, setting, metric),
-                [select(ours, setting=setting, metric=metric, label=label) for label in learned],
+                [select(selected, setting=setting, metric=metric, label=label) for label in learned_labels],
             ),
-            *(_cell(select(executed, setting=setting, metric=metric, role=REFERENCE, label=label))[0] for label in references),
+            *(
+                _cell(select(executed, setting=setting, metric=metric, role=REFERENCE, label=label))[0]
+                for label in reference_labels
+            ),
         ]
-        for setting in settings(domain, ours)
-        for metric in dict.fromkeys(select(ours, setting=setting)["metric"])
+        for setting in settings(domain, selected)
+        for metric in dict.fromkeys(select(selected, setting=setting)["metric"])
     ]
     caption = f"{domain.name}: what happened in closed loop, {how}"
-    return make_table(domain, "outcomes", caption, lines, ["setting", "", *_beside_head(learned), *references])
+    return make_table(domain, "outcomes", caption, lines, ["setting", "", *_beside_head(learned_labels), *reference_labels])
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
@@ -271,7 +275,7 @@ def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
     Raises:
         UserError: for rows that no episodes can have.
     """
-    won, lost = (select(ours, metric=f"{what}{policy}") for what in (WON, LOST))
+    won, lost = (select(ours, metric=f"{begin}{policy}") for begin in (WON, LOST))
     if won.empty:
         return None
     gains, losses = (round(float((rows["value"] * rows["n"]).clip(-1, LARGEST_WHOLE).sum())) for rows in (won, lost))
@@ -284,14 +288,14 @@ def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
     return gains, losses, count
 
 
-def _paired(domain: Domain, every: pd.DataFrame) -> Table:
+def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
     """Our successes less those of reference policies from the same starts, over all seeds, in each environment."""
-    ours, _ = main_rows(every, main_omega(domain))
-    learned, _ = _columns(ours[ours["metric"].str.startswith(WON)])
+    selected, _ = main_rows(rows, main_omega(domain))
+    learned_labels, _ = _columns(selected[selected["metric"].str.startswith(WON)])
     lines, elsewhere = [], ""
-    for setting in settings(domain, ours):
+    for setting in settings(domain, selected):
         for place, name in itertools.product(environments(domain), policies(domain)):
-            counted = [against(select(ours, setting=setting, label=label), f"{name}{place}") for label in learned]
+            counted = [against(select(selected, setting=setting, label=label), f"{name}{place}") for label in learned_labels]
             line = [MISSING if counts is None else episodes(*counts) for counts in counted]
             if set(line) - {MISSING}:
                 lines.append([setting, f"{name}{place}", *line])
@@ -301,7 +305,7 @@ def _paired(domain: Domain, every: pd.DataFrame) -> Table:
         f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
         f"(of these learned concepts: the episodes of a seed share one){elsewhere}"
     )
-    return make_table(domain, "paired", caption, lines, ["setting", "compared with", *learned])
+    return make_table(domain, "paired", caption, lines, ["setting", "compared with", *learned_labels])
 
 
 def _grid(
@@ -312,58 +316,58 @@ def _grid(
     lines: Sequence[tuple[str, str, Published | None, pd.DataFrame]],
     heads: tuple[str, str],
 ) -> Table:
-    learned, _ = _columns(rows)
+    learned_labels, _ = _columns(rows)
     cells = [
-        [first, second, *_beside(theirs, [select(ours, label=label) for label in learned])]
-        for first, second, theirs, ours in lines
-        if not ours.empty
+        [first, second, *_beside(papers, [select(line_rows, label=label) for label in learned_labels])]
+        for first, second, papers, line_rows in lines
+        if not line_rows.empty
     ]
-    return make_table(domain, name, caption, cells, [*heads, *_beside_head(learned)])
+    return make_table(domain, name, caption, cells, [*heads, *_beside_head(learned_labels)])
 
 
 def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The ablation on the number of learned concepts, with learned weights."""
-    own = select(of_method(rows, PAPERS_METHOD), omega=LEARNED)
+    ours = select(of_method(rows, PAPERS_METHOD), omega=LEARNED)
     lines = [
         (
             setting,
             str(count),
             lookup(domain, setting, metric, components=count, omega=LEARNED),
-            select(own, setting=setting, K=count),
+            select(ours, setting=setting, K=count),
         )
-        for setting in learned_settings(domain, own)
-        for count in sorted(set(own.loc[own["K"] > 0, "K"]))
+        for setting in learned_settings(domain, ours)
+        for count in sorted(set(ours.loc[ours["K"] > 0, "K"]))
     ]
     caption = f"{domain.name}: number of learned concepts K, with learned weights"
-    return _grid(domain, "concept_count", caption, own, lines, ("setting", "K"))
+    return _grid(domain, "concept_count", caption, ours, lines, ("setting", "K"))
 
 
 def _omega(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """The effect of the guidance weight, K = 2, or the K that was measured most."""
-    own = of_method(rows, PAPERS_METHOD)
-    counts = Counter(components for components, _ in _forms(own) if components)
+    ours = of_method(rows, PAPERS_METHOD)
+    counts = Counter(components for components, _ in _weightings(ours) if components)
     count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
-    own = select(own, K=count)
+    ours = select(ours, K=count)
     lines = [
-        (setting, omega, lookup(domain, setting, metric, components=count, omega=omega), select(own, setting=setting, omega=omega))
-        for setting in learned_settings(domain, own)
-        for omega in sorted(set(own["omega"]))
+        (setting, omega, lookup(domain, setting, metric, components=count, omega=omega), select(ours, setting=setting, omega=omega))
+        for setting in learned_settings(domain, ours)
+        for omega in sorted(set(ours["omega"]))
     ]
-    return _grid(domain, "omega", f"{domain.name}: guidance weight omega, K = {count}", own, lines, ("setting", "omega"))
+    return _grid(domain, "omega", f"{domain.name}: guidance weight omega, K = {count}", ours, lines, ("setting", "omega"))
 
 
 def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     """What each learned component generates alone, with learned weights, or as it was measured most."""
     tasks = component_tasks(domain)
-    own, how = main_rows(rows[rows["setting"].isin({task.setting for task in tasks})], LEARNED)
+    selected, how = main_rows(rows[rows["setting"].isin({task.setting for task in tasks})], LEARNED)
     lines = [
         (
             task.name,
             task.setting,
             lookup(domain, task.setting, metric, task.name, omega=LEARNED),
-            select(own, setting=task.setting, task=task.name),
+            select(selected, setting=task.setting, task=task.name),
         )
         for task in tasks
     ]
     caption = f"{domain.name}: {metric} of what each learned component generates alone, {how.removeprefix(f'K = {USUAL_K}, ')}"
-    return _grid(domain, "components", caption, own, lines, ("concept", "generated from"))
+    return _grid(domain, "components", caption, selected, lines, ("concept", "generated from"))
