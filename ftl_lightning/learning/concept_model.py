@@ -122,7 +122,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Generate behaviour of several compositions in one batch.
 
         Args:
-            compositions: ``(K, n)`` each; K may differ between them.
+            compositions: ``(K, ...)`` each; K may differ between them.
             count: samples of each.
             sampling: sampler, steps and temperature.
             generators: of the noise, one for each composition, so that its samples do not depend on what is sampled beside it.
@@ -142,7 +142,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             states: ``(run * sample, window, state)`` in the domain's units.
             observed: features ``(run * sample, *shape)`` by name.
-            composition: ``(run, K, n)``.
+            composition: ``(run, K, ...)``.
             draws: of :meth:`draws`.
             loss: whose squared error a diffusion model minimises.
 
@@ -211,8 +211,7 @@ class ConceptModel(Shown, nn.Module, ABC):
                     f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(found)!r}; learn it again"
                 )
         with about(path):
-            if concept.embeddings.shape[1] != concept.knots * self.config.concept_dim:
-                found = concept.embeddings.shape[1] // concept.knots
+            if (found := concept.embeddings.shape[2]) != self.config.concept_dim:
                 raise UserError(f"key 'embeddings': expected {self.config.concept_dim} numbers each, found {found}")
             if concept.knots > 1 and not self.over_time:
                 raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")

@@ -49,9 +49,9 @@ class LanguageAdaptation(Adaptation):
             raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {found!r}")
 
     def _embedding(self, goal: str) -> Tensor:
-        """``(1, n)`` of a task's description."""
+        """``(1, 1, n)`` of a task's description."""
         assert isinstance(self.model, GenerativeModel)
-        return self.model.standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))
+        return self.model.standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))[None]
 
     def learned(self) -> dict[str, Concept]:
         weights = torch.tensor([self._omega])

@@ -29,5 +29,7 @@ class InContextAdaptation(Adaptation):
         assert isinstance(self.model, InContextModel)
         for name in self.concepts:
             prompts = self.model.prompts(self.demonstrations.select(name))
-            found[name] = Concept(prompts, torch.ones(len(prompts)), origin(self.model, self.demonstrations, name, "fixed", 0.0))
+            found[name] = Concept(
+                prompts[:, None], torch.ones(len(prompts)), origin(self.model, self.demonstrations, name, "fixed", 0.0)
+            )
         return found
