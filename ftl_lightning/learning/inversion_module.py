@@ -148,6 +148,7 @@ class InversionModule(Adaptation):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module, model, concepts or kind of weights."""
         check_signature(self, checkpoint, self._signature())
+        with_knots(checkpoint, self.inversion.embeddings.shape)
         check_parameters(checkpoint["state_dict"], self, OWN)
         self._found, self._from = {}, checkpoint["global_step"]
 
@@ -171,3 +172,18 @@ class InversionModule(Adaptation):
     def training_weight(self, task: EvaluationTask) -> float:
         omega = self.hparams["training_omega"] if task.learned else None
         return super().training_weight(task) if omega is None else omega
+
+
+def with_knots(checkpoint: dict[str, Any], shape: torch.Size) -> None:
+    """Give embeddings of a checkpoint the shape ``(run, K, knots, n)`` where an older version wrote ``(run, K, knots * n)``: the
+    parameter, what the rule of stopping keeps of it, and the state of its optimiser, which is that of the first parameter.
+    """
+    flat = (*shape[:2], shape[2] * shape[3])
+    held = dict.fromkeys((f"{OWN}embeddings", f"{OWN}stopping.embeddings", f"{OWN}stopping._sums"), checkpoint["state_dict"])
+    for optimizer in checkpoint.get("optimizer_states", ()):
+        match optimizer:
+            case {"state": {0: dict() as moments}}:
+                held |= dict.fromkeys(("exp_avg", "exp_avg_sq"), moments)
+    for name, tensors in held.items():
+        if isinstance(value := tensors.get(name), Tensor) and value.shape == flat:
+            tensors[name] = value.reshape(shape)

@@ -318,7 +318,7 @@ def test_the_training_concepts_are_learned(fitted: Path) -> None:
         def composition(self, task: object) -> object:
             from ftl_lightning.concepts.composition import Composition
 
-            return Composition(model.concept(task.goal)[None], torch.ones(1))  # type: ignore[attr-defined]
+            return Composition(model.concept(task.goal)[None, None], torch.ones(1))  # type: ignore[attr-defined]
 
     judged = Evaluator(samples=8, sampler="ddim", steps=10).evaluate(Known())  # type: ignore[arg-type]
     assert [one.task.goal for one in judged] == ["go right", "go up"]
