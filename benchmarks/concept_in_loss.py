@@ -24,7 +24,7 @@ TIMESTEPS = (20, 50, 70, 80, 90, 95, 99)
 
 def together(concept: torch.Tensor) -> Composition:
     """A single concept of weight 1, as one run."""
-    return Composition(concept[None, None], concept.new_ones(1, 1))
+    return Composition(concept[None, None, None], concept.new_ones(1, 1))
 
 
 @torch.no_grad()

@@ -13,7 +13,8 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
-from ftl_lightning.concepts.composition import Composition, composed_epsilon
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.diffusion import TemporalUNet
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.domains.registry import load_domain
@@ -36,7 +37,7 @@ def milliseconds(horizon: int, components: int, width: int, concepts: int) -> tu
     batch = concepts * SAMPLES
     x, s0 = torch.randn(batch, horizon, states), torch.randn(batch, sizes.vector_dim)
     t = torch.randint(100, (batch,))
-    embeddings = torch.randn(concepts, components, n, requires_grad=True)
+    embeddings = torch.randn(concepts, components, 1, n, requires_grad=True)
     weights = torch.ones(concepts, components)
 
     composition = Composition(embeddings, weights)

@@ -58,8 +58,8 @@ def told_concepts(few: FewShot, name: str, shown: Demonstrations, seed: int, cha
     text = load_encoder("table", DOMAIN.concepts.table, "main")([name])
     return {
         "ours": few.learn(shown, name=name, seed=seed, **changes),
-        "language": Composition(model.standardise(text), torch.tensor([1.2])),
-        "empty concept": Composition(model.empty[None], torch.zeros(1)),
+        "language": Composition(model.standardise(text)[None], torch.tensor([1.2])),
+        "empty concept": Composition(model.empty[None, None], torch.zeros(1)),
     }
 
 

@@ -37,11 +37,11 @@ def concept(few: FewShot, method: str, shown: Demonstrations, name: str, seed: i
     model = few.model
     if isinstance(model, InContextModel):
         prompts = model.prompts(shown)
-        return Composition(prompts, torch.ones(len(prompts)))
+        return Composition(prompts[:, None], torch.ones(len(prompts)))
     if method == "language":
         assert isinstance(model, GenerativeModel)
         text = load_encoder("table", DOMAIN.concepts.table, "main")([name])
-        return Composition(model.standardise(text), torch.tensor([LANGUAGE_WEIGHT]))
+        return Composition(model.standardise(text)[None], torch.tensor([LANGUAGE_WEIGHT]))
     return few.learn(shown, name=name, seed=seed)
 
 

@@ -33,8 +33,9 @@ import yaml
 from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.concepts.adapter import LowRank, adaptable
-from ftl_lightning.concepts.composition import Composition, Modes
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.configuration import load
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import Sampling
@@ -263,12 +264,12 @@ class Fuzz:
         n, config = self.model.config.concept_dim, self.model.config
         origin = Origin("go", config.domain, config.encoder, self.model.hash, "0" * 16, 5, "fixed", 0.1)
         weight, (outputs, inputs) = next(iter(adaptable(self.model.denoiser).items()))
-        embeddings, modes = torch.randn(2, n), Modes(torch.randn(3, 2, n), torch.ones(3, 2))
+        embeddings, modes = torch.randn(2, 1, n), Modes(torch.randn(3, 2, 1, n), torch.ones(3, 2))
         adapter = LowRank({weight: (torch.zeros(outputs, 2), torch.zeros(2, inputs))})
         self.concepts = [
             self._bytes(Concept(embeddings, torch.ones(2), origin, **options).save)
             for options in ({}, {"modes": modes}, {"adapter": adapter})
-        ] + [self._bytes(Concept(torch.randn(2, 3 * n), torch.ones(2), origin, knots=3).save)]
+        ] + [self._bytes(Concept(torch.randn(2, 3, n), torch.ones(2), origin).save)]
         self.arrays = {
             "states": np.random.default_rng(0).normal(size=(3, 6, 2)).astype(np.float32),
             "lengths": np.array([6, 5, 4]),
@@ -366,7 +367,7 @@ class Fuzz:
 def _sampled(model: ConceptModel, concept: Concept | None = None) -> None:
     """Draw a sample from a model."""
     observed = {name: torch.zeros(1, *feature.shape) for name, feature in model.domain.observed.items()}
-    composition = Composition(model.training_embeddings[:1], torch.ones(1)) if concept is None else concept.composition
+    composition = Composition(model.training_embeddings[:1, None], torch.ones(1)) if concept is None else concept.composition
     model.sample([composition], 1, Sampling("ddim", 1), [generator("cpu", 0)], observed)
 
 

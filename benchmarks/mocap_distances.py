@@ -72,7 +72,7 @@ def generated(model: ConceptModel, composition: Composition, starts: Tensor, see
 
 def said(model: ConceptModel, *texts: str) -> Composition:
     """Training concepts; of none, whatever the model generates."""
-    embeddings = torch.stack([model.concept(text) for text in texts]) if texts else model.empty[None]
+    embeddings = torch.stack([model.concept(text) for text in texts])[:, None] if texts else model.empty[None, None]
     return Composition(embeddings, torch.full((len(embeddings),), GUIDANCE if texts else 0.0))
 
 

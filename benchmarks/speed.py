@@ -26,7 +26,8 @@ import torch
 from ftl_lightning.learning.generative_model import GenerativeModel
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition, composed_epsilon
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.diffusion.samplers import Sampling, ddpm
 from ftl_lightning.diffusion.schedule import denoising_loss
@@ -66,10 +67,10 @@ def timed(work: Callable[[], Result]) -> tuple[Result, float]:
 
 def branch_by_branch(model: GenerativeModel, x: Tensor, t: Tensor, concepts: Tensor, weights: Tensor) -> Tensor:
     """Eq. 2 as the published code evaluates it: one call of the network for each branch."""
-    empty: Tensor = model.denoiser(x, t, model.empty[None], torch.zeros_like(t))
+    empty: Tensor = model.denoiser(x, t, model.empty[None, None], torch.zeros_like(t))
     total = empty
     for concept, weight in zip(concepts, weights, strict=True):
-        total = total + weight * (model.denoiser(x, t, concept[None], torch.zeros_like(t)) - empty)
+        total = total + weight * (model.denoiser(x, t, concept[None, None], torch.zeros_like(t)) - empty)
     return total
 
 
@@ -108,7 +109,7 @@ def published(model: GenerativeModel, demonstrations: Tensor, steps: int, draw: 
             loss = denoising_loss(lambda x, t: branch_by_branch(model, x, t, concepts, weights), clean, noise, t, model.alpha_bar)
             (loss.mean() / ACCUMULATED).backward()
         optimiser.step()
-    return Composition(concepts.detach(), weights)
+    return Composition(concepts.detach()[:, None], weights)
 
 
 def published_together(
@@ -125,7 +126,7 @@ def published_together(
     """
     states = [model.normalization.encode(own) for own in demonstrations]
     starts = [torch.randn(K, model.config.concept_dim, generator=draw) for draw in draws]
-    concepts = torch.stack(starts).requires_grad_()
+    concepts = torch.stack(starts)[:, :, None].requires_grad_()
     weights = torch.full((len(starts), K), OMEGA)
     together = Composition(concepts, weights)
     optimiser = torch.optim.Adam([concepts], lr=2e-4)
@@ -224,7 +225,7 @@ def sampling(model: GenerativeModel, singles: int = 3) -> tuple[float, float]:
 
     single = timed(torch.no_grad()(one_at_a_time))[1] / singles * 500
     draws = [generator("cpu", task) for task in range(10)]
-    return single, timed(lambda: model.sample([Composition(concepts, weights)] * 10, 50, SAMPLING, draws))[1]
+    return single, timed(lambda: model.sample([Composition(concepts[:, None], weights)] * 10, 50, SAMPLING, draws))[1]
 
 
 def ratios(curves: Mapping[str, Sequence[Measured]]) -> dict[str, Any]:

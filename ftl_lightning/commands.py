@@ -238,7 +238,7 @@ def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates |
 
 def _start_task(options: SampleOptions, domain: "Domain") -> str:
     """The task whose initial states are drawn; empty where nothing names one that the domain reads."""
-    from ftl_lightning.concepts.composition import parse_composition
+    from ftl_lightning.composition_text import parse_composition
     from ftl_lightning.concepts.concept import Concept
 
     learned = (Concept.load(options.concept).origin.name,) if options.concept and not options.goal else ()
@@ -291,7 +291,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         say(f"alone it generates from {how}: {len(learned.modes)} modes; {composed}")
     parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
     if len(learned.weights) > 1:
-        whole = learned.at_knots(learned.weights @ learned.embeddings)
+        whole = learned.at_knots(learned.weighted_sum)
         parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]
     for name, embedding in parts:
         say(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")

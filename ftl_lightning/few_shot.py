@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from ftl_lightning.arguments import changed, device_named, expect_path, expect_text, expect_whole
 from ftl_lightning.arrays import Start, demonstrations_of, expect_of_domain, scenes_of, starts_of
 from ftl_lightning.batches import sampled
-from ftl_lightning.concepts.composition import Composition, Part, parse_composition, space_of
+from ftl_lightning.composition_text import Part, parse_composition
+from ftl_lightning.concepts.composition import Composition, space_of
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import Explanation, explain
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -63,7 +64,7 @@ class LearnedConcept(Composition):
     def explain(self, nearest: int = 3) -> Explanation:
         """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""
         expect_whole("nearest", nearest, 1)
-        embedding = (self.concept.weights @ self.concept.embeddings).unflatten(0, (self.knots, -1)).mean(dim=0)
+        embedding = self.concept.weighted_sum.mean(dim=0)
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
 
     def save(self, path: str | Path) -> None:
@@ -167,7 +168,7 @@ class FewShot(Shown):
         Raises:
             UserError: for a text that is none.
         """
-        return Composition(self.model.concept(text)[None], torch.ones(1, device=self.device), space=self._space)
+        return Composition(self.model.concept(text)[None, None], torch.ones(1, device=self.device), space=self._space)
 
     def load(self, path: str | Path) -> LearnedConcept:
         """A learned concept from its file.
@@ -219,10 +220,10 @@ class FewShot(Shown):
             raise UserError(
                 f"{call}: expected a concept of this model, {self._space}, found one of {concept.space}; learn it with this model"
             )
-        width = self.model.config.concept_dim * concept.knots
-        if concept.embeddings.dim() != 2 or concept.embeddings.shape[1] != width:
+        n = self.model.config.concept_dim
+        if concept.embeddings.dim() != 3 or concept.embeddings.shape[2] != n:
             raise UserError(
-                f"{call}: expected a concept of this model, {self._space}, with embeddings (K, {width}), "
+                f"{call}: expected a concept of this model, {self._space}, with embeddings (K, knots, {n}), "
                 f"found {tuple(concept.embeddings.shape)}"
             )
         return concept if concept.weights.device == self.device else concept.to(self.device)

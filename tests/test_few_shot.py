@@ -132,7 +132,7 @@ def test_a_concept_is_learned_from_arrays_as_it_is_from_a_file(scenes: FewShot, 
 
 def test_a_setting_can_be_another(scenes: FewShot, shown: Demonstrations, capsys: pytest.CaptureFixture[str]) -> None:
     found = scenes.learn(shown, steps=2, progress=True, components=3, omega="learned")
-    assert found.embeddings.shape == (3, 384)
+    assert found.embeddings.shape == (3, 1, 384)
     assert found.concept.origin.weights == "learned"
     assert scenes.learn(shown.states, name="mine", steps=1).concept.origin.name == "mine"
     for changes, message in (
@@ -421,7 +421,7 @@ def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
 def test_a_concept_with_modes_is_learned_kept_and_told_of(scenes: FewShot, shown: Demonstrations) -> None:
     learned = scenes.learn(shown, steps=3, modes="each")
     assert learned.modes is not None
-    assert learned.modes.embeddings.shape == (5, 2, 384)
+    assert learned.modes.embeddings.shape == (5, 2, 1, 384)
     assert repr(learned).startswith(f"LearnedConcept('{NEW}', K = 2, 5 modes, loss 0.")
     mixed = replace(learned.concept, modes=replace(learned.modes, mixed=True))
     mixed.save("mixed.safetensors")

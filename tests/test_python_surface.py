@@ -12,9 +12,10 @@ import pytest
 import torch
 
 import ftl_lightning
-from ftl_lightning.concepts.composition import Composition, Modes
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import explain
+from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.agent.scenes import OBSERVED
@@ -94,7 +95,7 @@ def test_every_name_that_is_listed_is_a_model_that_loads() -> None:
         (lambda of: of.learned.concept, ["Concept('square diagonal to triangle', K = 2, 5 modes, loss ", "from 5 demonstrations"]),
         (lambda of: of.learned.modes, ["Modes(5 modes, K = 2)"]),
         (lambda of: of.agent[GOAL] + 0.8 * of.agent[GOAL], [f"Composition(K = 2, weights 1.00, 0.80, of {SPACES['agent']})"]),
-        (lambda of: Composition(torch.zeros(9, 2), torch.ones(9), knots=2), ["K = 9, 2 knots", "1.00, ..., of any model"]),
+        (lambda of: Composition(torch.zeros(9, 2, 1), torch.ones(9)), ["K = 9, 2 knots", "1.00, ..., of any model"]),
         (lambda of: of.starts, ["InitialStates(world (3, 52), scenes (3, 52))"]),
         (lambda of: of.plans, ["Demonstrations('object_rearrangement', states (4, 1, 21))"]),
         (
@@ -198,8 +199,8 @@ def test_a_bar_changes_no_plan(things: Things, capsys: pytest.CaptureFixture[str
 
 
 def test_a_sample_with_modes_and_columns_is_drawn_whole() -> None:
-    modes = Modes(torch.randn(3, 2, 4), torch.rand(3, 2))
-    own = Composition(torch.randn(2, 4), torch.ones(2), modes=modes).on((1,), 5)
+    modes = Modes(torch.randn(3, 2, 1, 4), torch.rand(3, 2))
+    own = Composition(torch.randn(2, 1, 4), torch.ones(2), modes=modes).on((1,), 5)
     found = own.drawn(generator("cpu", 0))
     assert found.columns is not None
     assert found.columns.shape == (2, 5)
@@ -253,8 +254,8 @@ WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
     ),
     "two models' difference": (lambda of: of.learned - of.agent[GOAL], "compose: expected concepts of one model"),
     "numbers of another size": (
-        lambda of: of.scenes.sample(Composition(torch.ones(1, 5), torch.ones(1))),
-        "with embeddings (K, 384), found (1, 5)",
+        lambda of: of.scenes.sample(Composition(torch.ones(1, 1, 5), torch.ones(1))),
+        "with embeddings (K, knots, 384), found (1, 1, 5)",
     ),
     "another's plans": (
         lambda of: of.agent.evaluate(of.plans, GOAL),
@@ -442,7 +443,7 @@ def test_numpys_numbers_are_as_good_as_pythons(things: Things) -> None:
     plain = scenes.sample(0.5 * scenes[SCENE], 3, seed=2, **QUICK, temperature=0.5).states
     numpys = {"sampler": "ddim", "steps": np.int64(3), "temperature": np.float32(0.5)}
     assert torch.equal(plain, scenes.sample(np.float64(0.5) * scenes[SCENE], np.int64(3), seed=np.int64(2), **numpys).states)
-    assert scenes.learn(things.five, steps=np.int64(1), components=np.int64(3)).embeddings.shape == (3, 384)
+    assert scenes.learn(things.five, steps=np.int64(1), components=np.int64(3)).embeddings.shape == (3, 1, 384)
 
 
 # Longer demonstrations

@@ -7,7 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition, Context, batched, composed_epsilon
+from ftl_lightning.concepts.branches import Context
+from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.diffusion import MLPDenoiser
 from ftl_lightning.diffusion.samplers import Sampling
@@ -20,8 +22,7 @@ from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.methods.method import Method
 
 METHOD = Method("flow matching", kind="flow", model="ftl_flow:FlowModel", pretraining="ftl_flow:FlowPretraining")
-Velocity = Callable[[Tensor, Tensor], Tensor]
-"""``(x (batch, horizon, state), t (batch,)) -> velocity`` like x."""
+Velocity = Callable[[Tensor, Tensor], Tensor]  # (x (batch, horizon, state), t (batch,)) -> like x
 TIMES = 1000
 """Times from noise (0) to behaviour, as the network's embedding of time reads them."""
 
@@ -94,6 +95,6 @@ class FlowPretraining(Pretraining[FlowModel]):
         states, observed = model.perturbed(batch.states, batch.observed, draw)
         t, noise = model.draws(len(states), 1, draw)
         empty = model.training & (torch.rand(len(t), generator=draw, device=t.device) < self.hparams["condition_dropout"])
-        index, concepts = torch.where(empty, 0, batch.concepts + 1), torch.cat((model.empty[None], model.training_embeddings))
+        index, concepts = torch.where(empty, 0, batch.concepts + 1), torch.cat((model.empty[None], model.training_embeddings))[:, None]
         context = model.network.observe(model.vector(observed))
         return model.errors(lambda x, t: model.network(x, t, concepts, index, context), model.encode(states, observed), t, noise)

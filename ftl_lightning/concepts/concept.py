@@ -1,6 +1,6 @@
 """A learned concept and its file."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Self
@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.concepts.adapter import LowRank
-from ftl_lightning.concepts.composition import Composition, Modes, space_of
+from ftl_lightning.concepts.composition import Composition, space_of
+from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST_FACTOR
 from ftl_lightning.representation import Shown, counted, numbers
@@ -22,6 +23,8 @@ VERSIONS = (FORMAT, 2, 3)
 first form that can hold it."""
 AXES = {2: "mode component n", 3: "mode component knot n"}
 """What the dimensions of the modes' embeddings are in each form; those of a concept lack the first."""
+EMBEDDINGS = ("embeddings", "mode_embeddings")
+"""Names of the tensors that have an axis of knots, but in files of the first two forms, whose concepts have one knot."""
 ADAPTER = "adapter/"
 """Names of an adapter's tensors begin so."""
 
@@ -56,12 +59,12 @@ class Concept(Shown):
     """K embeddings and their guidance weights.
 
     Attributes:
-        embeddings: ``(K, knots * n)`` float32 in the concept space of the pretrained model.
+        embeddings: ``(K, knots, n)`` float32 in the concept space of the pretrained model: of each component one, which is the
+            paper's form, or several at even times of the plan.
         weights: ``(K,)`` float32, omega.
         origin: where it comes from.
         modes: several sets of embeddings, which samples are generated from where the concept stands alone; ``None`` for the paper's
             form. Composing uses ``embeddings``, unless the concept has several knots.
-        knots: embeddings of a component, one after another, at even times of the plan; 1 is the paper's form.
         adapter: what it changes of the denoiser; ``None`` for the paper's form.
 
     Raises:
@@ -72,25 +75,16 @@ class Concept(Shown):
     weights: Tensor
     origin: Origin
     modes: Modes | None = None
-    knots: int = 1
     adapter: LowRank | None = None
 
     def __post_init__(self) -> None:
-        count, width = (*self.embeddings.shape, 0, 0)[:2]
-        if self.embeddings.dim() != 2 or not count or not width or width % self.knots:
-            expected = "(K, n)" if self.knots == 1 else f"(K, {self.knots} n)"
-            raise UserError(f"key 'embeddings': expected shape {expected}, found {tuple(self.embeddings.shape)}")
-        shapes = {"embeddings": (self.embeddings, (count, width)), "weights": (self.weights, (count,))}
-        if (modes := self.modes) is not None:
-            number = len(modes.embeddings) if modes.embeddings.dim() else 0
-            shapes |= {
-                "mode_embeddings": (modes.embeddings, (max(number, 1), count, width)),
-                "mode_weights": (modes.weights, (max(number, 1), count)),
-            }
-        for name, (values, shape) in shapes.items():
-            if values.shape != shape or values.dtype != torch.float32:
-                told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
-                raise UserError(f"key {name!r}: expected float32 of shape {shape}, found {told}")
+        modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
+        _expect_shapes({"embeddings": self.embeddings, "weights": self.weights, **modes}, ("K", "knots", "n"))
+
+    @property
+    def knots(self) -> int:
+        """Embeddings of a component, at even times of the plan; 1 is the paper's form."""
+        return self.embeddings.shape[1]
 
     def _words(self) -> Iterator[str]:
         yield repr(self.origin.name)
@@ -110,10 +104,10 @@ class Concept(Shown):
     def composition(self) -> Composition:
         """What it is generated from, alone or composed with others."""
         space = space_of(self.origin.domain, self.origin.pretrained)
-        whole = Composition(self.embeddings, self.weights, modes=self.modes, knots=self.knots, space=space)
+        plain = Composition(self.embeddings, self.weights, modes=self.modes, space=space)
         if self.adapter is None:
-            return whole
-        return replace(whole, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
+            return plain
+        return replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
 
     def component(self, number: int) -> Composition:
         """One of its components alone, by its number from 1."""
@@ -126,8 +120,8 @@ class Concept(Shown):
         """
         sets = {"": (self.weights, self.embeddings)}
         if self.modes is not None:
-            each = zip(self.modes.weights, self.modes.embeddings, strict=True)
-            sets |= {f"mode {number}, ": own for number, own in enumerate(each, start=1)}
+            modes = zip(self.modes.weights, self.modes.embeddings, strict=True)
+            sets |= {f"mode {number}, ": mode for number, mode in enumerate(modes, start=1)}
         return {
             f"{name}component {number}{knot}": (weight, embedding)
             for name, (weights, embeddings) in sets.items()
@@ -135,10 +129,14 @@ class Concept(Shown):
             for knot, embedding in self.at_knots(component).items()
         }
 
+    @property
+    def weighted_sum(self) -> Tensor:
+        """Its components added up by their weights ``(knots, n)``."""
+        return (self.weights @ self.embeddings.flatten(1)).unflatten(0, self.embeddings.shape[1:])
+
     def at_knots(self, component: Tensor) -> dict[str, Tensor]:
-        """The embeddings ``(n,)`` of a component ``(knots * n,)`` by the end of a name: empty of a single one, else ', knot 3'."""
-        each = component.unflatten(0, (self.knots, -1))
-        return {"" if self.knots == 1 else f", knot {knot}": own for knot, own in enumerate(each, start=1)}
+        """The embeddings ``(n,)`` of a component ``(knots, n)`` by the end of a name: empty of a single one, else ', knot 3'."""
+        return {"" if self.knots == 1 else f", knot {knot}": embedding for knot, embedding in enumerate(component, start=1)}
 
     def expect_finite(self, where: str) -> None:
         """Refuse a concept of numbers that are none or too large, or of such a loss.
@@ -177,9 +175,10 @@ class Concept(Shown):
         if form in AXES:
             header |= {"axes": AXES[form]}
         if form == 3:
-            each = {name: values.unflatten(-1, (self.knots, -1)) for name, values in tensors.items() if "embeddings" in name}
-            tensors |= each | {f"{ADAPTER}{name}": own for name, own in (self.adapter.tensors() if self.adapter else {}).items()}
-        save_tensors(path, KIND, {name: own.contiguous() for name, own in tensors.items()}, header, form)
+            tensors |= {f"{ADAPTER}{name}": factor for name, factor in (self.adapter.tensors() if self.adapter else {}).items()}
+        else:
+            tensors |= {name: values.flatten(-2) for name, values in tensors.items() if name in EMBEDDINGS}
+        save_tensors(path, KIND, {name: values.contiguous() for name, values in tensors.items()}, header, form)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -199,28 +198,43 @@ class Concept(Shown):
                 raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
             if form in AXES and header["axes"] != AXES[form]:
                 raise UserError(f"key 'axes': expected {AXES[form]!r}, found {shown(header['axes'])}; a newer version may read it")
-            knots, adapter = 1, None
-            own = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
-            if unknown := set(tensors) - set(names) - ({f"{ADAPTER}{name}" for name in own} if form == 3 else set()):
+            factors = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
+            if unknown := set(tensors) - set(names) - ({f"{ADAPTER}{name}" for name in factors} if form == 3 else set()):
                 raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
-            if form == 3:
-                axes = {name: 4 if name.startswith("mode_") else 3 for name in names if "embeddings" in name}
-                knots = max((*tensors["embeddings"].shape, 0, 0)[1], 1)
-                for name, dimensions in axes.items():
-                    if (found := tensors[name].shape) != () and (len(found) != dimensions or found[-2] != knots):
-                        expected = ("mode, " if dimensions == 4 else "") + f"component, {knots} knots, n"
-                        raise UserError(f"key {name!r}: expected shape ({expected}), found {tuple(found)}")
-                tensors |= {name: tensors[name].flatten(-2) for name in axes if tensors[name].dim()}
-                everywhere = expect_type(header.get("everywhere", False), bool, "everywhere")
-                adapter = LowRank.from_tensors(own, everywhere) if own else None
+            _expect_shapes({name: tensors[name] for name in names}, ("K", "knots", "n") if form == 3 else ("K", "n"))
+            if form != 3:  # one knot, which has no axis
+                tensors |= {name: tensors[name].unsqueeze(-2) for name in names if name in EMBEDDINGS}
+            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere") if form == 3 else False
+            adapter = LowRank.from_tensors(factors, everywhere) if factors else None
             mixed = expect_type(header["mixed"], bool, "mixed") if several else False
             modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed) if several else None
             origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
-            learned = cls(tensors["embeddings"], tensors["weights"], origin, modes, knots, adapter)
-            if header.get("components", len(learned.weights)) != len(learned.weights):
-                raise UserError(f"key 'components': expected {len(learned.weights)}, found {shown(header['components'])}")
-            learned.expect_finite("content")
-            return learned
+            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter)
+            if header.get("components", len(concept.weights)) != len(concept.weights):
+                raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
+            concept.expect_finite("content")
+            return concept
+
+
+def _expect_shapes(tensors: Mapping[str, Tensor], axes: Sequence[str]) -> None:
+    """Refuse a concept's tensors whose shapes or types are not those of one.
+
+    Args:
+        tensors: ``embeddings``, ``weights`` and, with modes, ``mode_embeddings`` and ``mode_weights``.
+        axes: names of the embeddings' axes, the components' first.
+
+    Raises:
+        UserError: naming the first.
+    """
+    shape = tuple(tensors["embeddings"].shape)
+    if len(shape) != len(axes) or not all(shape):
+        raise UserError(f"key 'embeddings': expected shape ({', '.join(axes)}), found {shape}")
+    modes = max((*tensors.get("mode_embeddings", torch.empty(0)).shape, 0)[0], 1)
+    expected = {"embeddings": shape, "weights": shape[:1], "mode_embeddings": (modes, *shape), "mode_weights": (modes, shape[0])}
+    for name, values in tensors.items():
+        if values.shape != expected[name] or values.dtype != torch.float32:
+            told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
+            raise UserError(f"key {name!r}: expected float32 of shape {expected[name]}, found {told}")
 
 
 def load_concepts(paths: Iterable[str | Path]) -> list[Concept]:

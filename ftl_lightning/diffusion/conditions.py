@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.concepts.composition import Context
+from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.errors import UserError
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.concepts.composition import Context
+from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
@@ -77,10 +77,12 @@ class MLPDenoiser(nn.Module):
         Args:
             x: noisy plan ``(batch, horizon, state)``, normalised.
             t: ``(batch,)`` int64.
-            concepts: ``(concept, n)``, the different concepts in the batch, in the model's concept space.
+            concepts: ``(concept, 1, n)``, the different concepts in the batch, in the model's concept space: of one knot, as a
+                plan of this network has no times.
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
             context: what :meth:`observe` read.
         """
+        concepts = concepts.flatten(1)
         by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(2 * len(self.layers), dim=-1)
         by_concept = self.concept_film(self.concept(concepts)).chunk(2 * len(self.layers), dim=-1)
         hidden = x.flatten(1)

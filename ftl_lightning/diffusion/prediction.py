@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import Context
+from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
 from ftl_lightning.errors import UserError
 
@@ -49,7 +49,7 @@ class Prediction(nn.Module):
         return (vector[:, self.state_columns], *context)
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
-        """Estimated noise, as :data:`ftl_lightning.concepts.composition.Denoiser` says."""
+        """Estimated noise, as :data:`ftl_lightning.concepts.branches.Denoiser` says."""
         alpha_bar = self.alpha_bar[t][:, None, None]
         start, context = (context[0], context[1:]) if self.kind == "displacement" else (None, context)
         out: Tensor = self.net(x, t, concepts, index, context)

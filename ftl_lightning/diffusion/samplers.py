@@ -1,7 +1,7 @@
 """Samplers: free functions of one signature over a noise estimate.
 
 ``epsilon(x, t)`` takes ``x (batch, horizon, state)`` and ``t (batch,)`` int64 and returns the estimated noise; usually it is
-the composed one (:func:`ftl_lightning.concepts.composition.composed_epsilon`). ``alpha_bar (T,)`` is the schedule of
+the composed one (:func:`ftl_lightning.concepts.guidance.composed_epsilon`). ``alpha_bar (T,)`` is the schedule of
 pretraining. ``steps <= T`` are spread evenly over it. ``temperature`` is the paper's alpha: the variance of the first noise and
 of every noise added later is scaled by it. ``noise()`` draws standard normal noise ``(batch, horizon, state)`` and alone decides
 the result.

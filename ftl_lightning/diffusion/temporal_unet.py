@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.concepts.composition import Context
+from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
@@ -133,7 +133,7 @@ class TemporalUNet(nn.Module):
         if clock % 2:
             raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
         self.smooth = smooth
-        self.width, self.broadcast, self.concept_dim = width, broadcast and sizes.vector_dim > 0, sizes.concept_dim
+        self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
         rates = 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
         # The device is said: transformers replaces linspace by one that overlooks where a model is built.
         angle = torch.linspace(0, math.pi, sizes.horizon, device=rates.device) * rates
@@ -169,17 +169,16 @@ class TemporalUNet(nn.Module):
         Args:
             x: noisy plan ``(batch, horizon, state)``, normalised.
             t: ``(batch,)`` int64.
-            concepts: ``(concept, knots * n)``, the different concepts in the batch, in the model's concept space. What a concept
+            concepts: ``(concept, knots, n)``, the different concepts in the batch, in the model's concept space. What a concept
                 adds to a layer is computed at each knot and linear between them.
             index: ``(batch,)`` int64, each sample's row of ``concepts``.
             context: what :meth:`observe` read.
         """
-        each = concepts.unflatten(-1, (-1, self.concept_dim))  # (concept, knot, n)
-        knots, times = each.shape[1], x.shape[1]
-        parts = [self.time(sinusoidal_embedding(t, self.width))[:, None].expand(-1, knots, -1), self.concept(each)[index]]
+        knots, times = concepts.shape[1], x.shape[1]
+        parts = [self.time(sinusoidal_embedding(t, self.width))[:, None].expand(-1, knots, -1), self.concept(concepts)[index]]
         if self.initial is not None:
             every = context if knots == 1 else tuple(part.repeat_interleave(knots, dim=0) for part in context)
-            parts.append(self.initial.attend(every, each[index].flatten(0, 1)).unflatten(0, (-1, knots)))
+            parts.append(self.initial.attend(every, concepts[index].flatten(0, 1)).unflatten(0, (-1, knots)))
         condition = functional.mish(torch.cat(parts, dim=-1))
         inputs = [x.transpose(1, 2), self.clock.expand(len(x), -1, -1)]
         if self.broadcast:

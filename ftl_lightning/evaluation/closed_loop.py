@@ -176,7 +176,7 @@ def sampled_plans(
 
     Args:
         model: the model.
-        compositions: of each episode, ``(K, n)``.
+        compositions: of each episode, ``(K, ...)``.
         sampling: sampler, steps and temperature.
         generators: of each episode's noise, and of its mode, which it keeps to its end.
     """

@@ -27,7 +27,7 @@ class Row:
     Attributes:
         domain, setting, task: what was evaluated.
         method: the method's name, for example ``'FTL-IGM'`` or ``'BC'``, or a reference line's.
-        form: of the method, see :class:`~ftl_lightning.domains.paper.Compared`, for example ``'with modes'``; empty for the paper's.
+        form: of the method, see :class:`~ftl_lightning.domains.paper.Compared`; empty for the paper's.
         variant: what tells settings of one method and form apart, for example ``'entities, free'``; may be empty.
         role: :data:`METHOD` or :data:`REFERENCE`.
         K: number of concept components; 0 where nothing was learned.

@@ -159,7 +159,7 @@ class Adaptation(pl.LightningModule, ABC):
             found = self._found.get(task.learned[0])
             return None if found is None else found.composition.to(self.device)
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
-        embeddings = [self.model.concept(text)[None] for text in (*task.texts, *task.without)]
+        embeddings = [self.model.concept(text)[None, None] for text in (*task.texts, *task.without)]
         parts = [Composition(text, text.new_tensor([weight])) for text, weight in zip(embeddings, weights, strict=True)]
         names = [*task.texts, *task.without, *task.learned]
         for name in task.learned:

@@ -32,7 +32,7 @@ class AdditiveModel(ConceptModel):
 
 
 def added(composition: Composition) -> Tensor:
-    """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, n)``.
+    """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, 1, n)``.
 
     Raises:
         UserError: for a concept whose weight is on some columns alone: one sum acts on all of them.
@@ -40,4 +40,4 @@ def added(composition: Composition) -> Tensor:
     if composition.columns is not None:
         raise UserError("compose: expected concepts without '@' for a model that adds them up, found groups of columns")
     rows = zip(composition.weights, composition.embeddings, strict=True)
-    return torch.stack([weights @ embeddings for weights, embeddings in rows])
+    return torch.stack([weights @ embeddings.flatten(1) for weights, embeddings in rows])

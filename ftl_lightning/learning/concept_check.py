@@ -25,8 +25,7 @@ def expect_concept(model: ConceptModel, concept: Concept, path: str | Path) -> N
                 f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(found)!r}; learn it again"
             )
     with about(path):
-        if concept.embeddings.shape[1] != concept.knots * model.config.concept_dim:
-            width = concept.embeddings.shape[1] // concept.knots
+        if (width := concept.embeddings.shape[2]) != model.config.concept_dim:
             raise UserError(f"key 'embeddings': expected {model.config.concept_dim} numbers each, found {width}")
         if concept.knots > 1 and not model.over_time:
             raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")

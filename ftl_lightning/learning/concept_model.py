@@ -95,7 +95,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Generate behaviour of several compositions in one batch.
 
         Args:
-            compositions: ``(K, n)`` each; K may differ between them.
+            compositions: ``(K, ...)`` each; K may differ between them.
             count: samples of each.
             sampling: sampler, steps and temperature.
             generators: of the noise, one for each composition, so that its samples do not depend on what is sampled beside it.
@@ -115,7 +115,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         Args:
             states: ``(run * sample, window, state)`` in the domain's units.
             observed: features ``(run * sample, *shape)`` by name.
-            composition: ``(run, K, n)``.
+            composition: ``(run, K, ...)``.
             draws: of :meth:`draws`.
             loss: whose squared error a diffusion model minimises.
 

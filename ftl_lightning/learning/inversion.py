@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from torch.optim.adam import adam
 
 from ftl_lightning.concepts.adapter import LowRank
-from ftl_lightning.concepts.composition import Composition, Modes
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.errors import UserError
@@ -48,7 +49,7 @@ class _Run:
 class Inversion(nn.Module):
     """K embeddings and their weights for every concept of some demonstrations, all in one batch.
 
-    Its only parameters are ``embeddings (run, K, knots * n)`` and, unless omega is fixed, ``weights (run, K)``; with an adapter,
+    Its only parameters are ``embeddings (run, K, knots, n)`` and, unless omega is fixed, ``weights (run, K)``; with an adapter,
     its factors for each run too. A run is a concept, or a mode of one, and a restart. The model is frozen and no part of it.
 
     Args:
@@ -80,10 +81,8 @@ class Inversion(nn.Module):
         shape = (settings.budget.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
         starts = [torch.randn(shape, generator=draw) for draw in draws]
-        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.budget.restarts]]).repeat(
-            1, 1, settings.embeddings.knots
-        )
-        self.embeddings = nn.Parameter(settings.embeddings.initial_spread * start)
+        start = torch.cat([starts[run.concept] for run in self.runs[:: settings.budget.restarts]])[:, :, None]
+        self.embeddings = nn.Parameter(settings.embeddings.initial_spread * start.repeat(1, 1, settings.embeddings.knots, 1))
         runs = (len(start), settings.components)
         if settings.omega == "learned":
             self.weights = nn.Parameter(torch.full(runs, float(settings.weights.initial)))
@@ -117,12 +116,11 @@ class Inversion(nn.Module):
         return self._model[0]
 
     def parametrised(self, embeddings: Tensor) -> Tensor:
-        """Embeddings ``(run, K, knots * n)`` after their part off the span is scaled."""
+        """Embeddings ``(run, K, knots, n)`` after their part off the span is scaled."""
         if self.settings.embeddings.off_span == 1:
             return embeddings
-        each = embeddings.unflatten(-1, (self.settings.embeddings.knots, -1))
-        inside = each @ self.basis.T @ self.basis
-        return (inside + self.settings.embeddings.off_span * (each - inside)).flatten(-2)
+        inside = embeddings @ self.basis.T @ self.basis
+        return inside + self.settings.embeddings.off_span * (embeddings - inside)
 
     def adapter(self, run: int) -> LowRank | None:
         """A run's adapter; ``None`` where there are none."""
@@ -139,7 +137,7 @@ class Inversion(nn.Module):
         Args:
             samples: noised demonstrations of each run, evenly spread over its own.
             draw: of noise, timesteps and windows.
-            embeddings: of every run ``(run, K, knots * n)``.
+            embeddings: of every run ``(run, K, knots, n)``.
             weights: of every run ``(run, K)``.
             chosen: which runs ``(run,)`` of bool; ``None`` for all.
         """
@@ -156,7 +154,7 @@ class Inversion(nn.Module):
         starts = self.demonstrations.starts(rows, share, plans.exponent(window), window, plans.at_rest)
         states, observed = self.demonstrations.windows(rows, starts, window)
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
-        composition = Composition(self.parametrised(embeddings), weights, knots=self.settings.embeddings.knots)
+        composition = Composition(self.parametrised(embeddings), weights)
         if self.factors:
             own = torch.arange(len(self.runs), device=device) if chosen is None else chosen.nonzero()[:, 0]
             adapters = tuple(adapter for run in own.tolist() if (adapter := self.adapter(run)))
@@ -246,7 +244,6 @@ class Inversion(nn.Module):
                 weights[whole].cpu(),
                 origin(self.model, self.demonstrations, name, kind, losses[whole].item()),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
-                self.settings.embeddings.knots,
                 adapter.copied() if (adapter := self.adapter(whole)) else None,
             )
             found[name].expect_finite(f"inversion: concept {name!r}")

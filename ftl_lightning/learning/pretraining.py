@@ -267,7 +267,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         """What generates a task, or ``None`` if it needs a learned concept."""
         if task.learned:
             return None
-        embeddings = torch.stack([self.model.concept(text) for text in (*task.texts, *task.without)])
+        embeddings = torch.stack([self.model.concept(text)[None] for text in (*task.texts, *task.without)])
         weights = [self.guidance] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
         return Composition(embeddings, embeddings.new_tensor(weights))
 

@@ -18,7 +18,7 @@ class Stopping(nn.Module):
     kept is in buffers, so that checkpoints resume exactly.
 
     Args:
-        embeddings: where runs start ``(run, K, n)``.
+        embeddings: where runs start ``(run, K, knots, n)``.
         weights: likewise ``(run, K)``.
         tolerance: a run stops when :data:`IDLE` rounds one after another gained less than this share of its whole gain.
 

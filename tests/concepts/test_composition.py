@@ -1,13 +1,13 @@
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.concepts.composition import Composition, Context, Denoiser, Part, batched, composed_epsilon, parse_composition
+from ftl_lightning.concepts.branches import Context, Denoiser
+from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion import MLPDenoiser
 from ftl_lightning.diffusion.denoiser import Sizes
-from ftl_lightning.errors import UserError
 
 torch.manual_seed(0)
 SIZES = Sizes(horizon=2, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})
@@ -20,7 +20,7 @@ def inputs(count: int, seed: int, batch: int = 3) -> dict[str, torch.Tensor]:
     return {
         "x": torch.randn((batch, 2, 3), generator=draw),
         "t": torch.randint(100, (batch,), generator=draw),
-        "concepts": torch.randn((batch, count, 4), generator=draw),
+        "concepts": torch.randn((batch, count, 1, 4), generator=draw),
         "weights": torch.randn((batch, count), generator=draw),
         "place": torch.randn((batch, 5), generator=draw),
     }
@@ -55,7 +55,7 @@ def test_one_component_of_weight_one_is_the_conditional_prediction(seed: int) ->
 @given(seed=seeds, count=st.integers(0, 4))
 def test_zero_weights_are_the_empty_prediction(seed: int, count: int) -> None:
     of = inputs(count, seed) | {"weights": torch.zeros(3, count)}
-    assert close(composed(of), plain(of, EMPTY.expand(3, -1)))
+    assert close(composed(of), plain(of, EMPTY.expand(3, 1, -1)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -70,7 +70,7 @@ def test_the_order_of_components_does_not_matter(seed: int, order: list[int]) ->
 @given(seed=seeds, count=st.integers(1, 3))
 def test_one_batched_call_equals_the_formula_branch_by_branch(seed: int, count: int) -> None:
     of = inputs(count, seed)
-    empty = plain(of, EMPTY.expand(3, -1))
+    empty = plain(of, EMPTY.expand(3, 1, -1))
     expected = empty.clone()
     for k in range(count):
         expected += of["weights"][:, k, None, None] * (plain(of, of["concepts"][:, k]) - empty)
@@ -103,29 +103,16 @@ def test_the_empty_branch_is_evaluated_without_gradient_and_the_rest_in_one_call
     assert calls == [(9, False)]
 
 
-def test_compositions_in_words() -> None:
-    assert parse_composition("") == []
-    assert parse_composition("a right of b:1.2 + c above d") == [Part("a right of b", 1.2), Part("c above d")]
-    assert parse_composition("a right of b:1.2 + c above d:-0.5") == [Part("a right of b", 1.2), Part("c above d", -0.5)]
-    assert parse_composition("walk@legs,trunk:0.8 + a.safetensors@arms") == [
-        Part("walk", 0.8, ("legs", "trunk")),
-        Part("a.safetensors", 1.0, ("arms",)),
-    ]
-    for wrong in ("a:heavy", "a:nan", "a:inf", ":1", "a + "):
-        with pytest.raises(UserError, match="expected 'concept:weight"):
-            parse_composition(wrong)
-
-
 def drawn(count: int, seed: int) -> Composition:
     draw = torch.Generator().manual_seed(seed)
-    return Composition(torch.randn(count, 4, generator=draw), torch.randn(count, generator=draw))
+    return Composition(torch.randn(count, 1, 4, generator=draw), torch.randn(count, generator=draw))
 
 
 def score(composition: Composition, of: dict[str, torch.Tensor]) -> torch.Tensor:
-    """What a composition ``(K, 4)`` adds to the noise of the empty concept, of every sample."""
+    """What a composition ``(K, 1, 4)`` adds to the noise of the empty concept, of every sample."""
     together, _ = batched([composition], 1, [torch.Generator()])
     everywhere = of | {"concepts": together.embeddings, "weights": together.weights}
-    return composed(everywhere) - plain(of, EMPTY.expand(len(of["x"]), -1))
+    return composed(everywhere) - plain(of, EMPTY.expand(len(of["x"]), 1, -1))
 
 
 @settings(max_examples=20, deadline=None)
@@ -154,12 +141,12 @@ def test_sums_and_multiples_leave_their_parts_as_they_were() -> None:
     one, other = drawn(2, 0), drawn(1, 1)
     before = one.weights.clone()
     both = 2 * one + other
-    assert both.embeddings.shape == (3, 4)
+    assert both.embeddings.shape == (3, 1, 4)
     assert torch.equal(both.weights, torch.cat((2 * before, other.weights)))
     assert torch.equal(one.weights, before)
     assert torch.equal((one + other).embeddings, torch.cat((one.embeddings, other.embeddings)))
-    runs = Composition(torch.zeros(5, 2, 4), torch.ones(5, 2))  # leading dimensions are kept
-    assert (runs + runs).embeddings.shape == (5, 4, 4)
+    runs = Composition(torch.zeros(5, 2, 1, 4), torch.ones(5, 2))  # leading dimensions are kept
+    assert (runs + runs).embeddings.shape == (5, 4, 1, 4)
     assert (3 * runs).weights.shape == (5, 2)
     assert both.to(torch.device("cpu")).weights.device.type == "cpu"
 
@@ -168,7 +155,7 @@ def test_compositions_of_different_lengths_in_one_batch_are_those_alone() -> Non
     parts = [drawn(count, count) for count in (1, 3, 0, 2)]
     together, own = batched(parts, 2, [torch.Generator()] * 4)
     assert own.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert together.embeddings.shape == (4, 3, 4)
+    assert together.embeddings.shape == (4, 3, 1, 4)
     of = inputs(1, 5, batch=8)
     whole = composed(of | {"concepts": together.embeddings, "weights": together.weights})
     for number, part in enumerate(parts):

@@ -8,8 +8,8 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from ftl_lightning.concepts.composition import Modes
 from ftl_lightning.concepts.concept import AXES, KIND, Concept, Origin
+from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import save_tensors
 from tests.conftest import ROOT
@@ -19,10 +19,10 @@ ORIGIN = Origin("new", "object_rearrangement", "e", "p", "d", 5, "fixed", 0.15)
 
 
 def concept(modes: int = 3, mixed: bool = False) -> Concept:
-    """K = 2, n = 4."""
+    """K = 2, one knot, n = 4."""
     draw = torch.Generator().manual_seed(0)
-    several = Modes(torch.randn(modes, 2, 4, generator=draw), torch.rand(modes, 2, generator=draw), mixed) if modes else None
-    return Concept(torch.randn(2, 4, generator=draw), torch.tensor([1.2, 0.6]), ORIGIN, several)
+    several = Modes(torch.randn(modes, 2, 1, 4, generator=draw), torch.rand(modes, 2, generator=draw), mixed) if modes else None
+    return Concept(torch.randn(2, 1, 4, generator=draw), torch.tensor([1.2, 0.6]), ORIGIN, several)
 
 
 def header(path: str) -> dict[str, object]:
@@ -72,8 +72,8 @@ def written(form: int, without: str = "", **changes: object) -> str:
     """A file whose header differs from that of a concept with modes."""
     own = concept()
     assert own.modes is not None
-    tensors = {"embeddings": own.embeddings, "weights": own.weights}
-    tensors |= {"mode_embeddings": own.modes.embeddings, "mode_weights": own.modes.weights}
+    tensors = {"embeddings": own.embeddings[:, 0], "weights": own.weights}
+    tensors |= {"mode_embeddings": own.modes.embeddings[:, :, 0], "mode_weights": own.modes.weights}
     told = {**ORIGIN.__dict__, "axes": AXES[2], "mixed": False, **changes}
     kept = {name: tensor for name, tensor in tensors.items() if name != without}
     save_tensors("c.safetensors", KIND, kept, {key: value for key, value in told.items() if key != without}, form)
@@ -107,5 +107,5 @@ def test_parts_are_the_components_and_those_of_every_mode_by_name() -> None:
     assert list(own.parts()) == names
     weight, embedding = own.parts()["mode 2, component 1"]
     assert weight == pytest.approx(float(own.modes.weights[1, 0]))
-    assert torch.equal(embedding, own.modes.embeddings[1, 0])
+    assert torch.equal(embedding, own.modes.embeddings[1, 0, 0])
     assert list(replace(own, modes=None).parts()) == names[:2]

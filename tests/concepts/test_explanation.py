@@ -49,7 +49,9 @@ def test_learned_concepts_are_combinations_with_small_weights_that_explain_as_mu
     names, training = model.config.training_concepts, model.training_embeddings
     basis = torch.linalg.svd(training.double(), full_matrices=False).Vh[: len(training) - 1]
     embeddings = [
-        row for path in (ROOT / "results" / "concepts" / domain).rglob("*.safetensors") for row in Concept.load(path).embeddings
+        row
+        for path in (ROOT / "results" / "concepts" / domain).rglob("*.safetensors")
+        for row in Concept.load(path).embeddings[:, 0]
     ]
     assert embeddings
     for embedding in embeddings:

@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.concepts.adapter import LowRank, adaptable
-from ftl_lightning.concepts.composition import Composition, Modes, batched, composed_epsilon
+from ftl_lightning.concepts.composition import Composition, batched
 from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.concepts.guidance import composed_epsilon
+from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.demonstrations.normalization import Normalization
@@ -68,60 +70,60 @@ def adapted(own: Composition, change: LowRank) -> Composition:
 
 
 def test_a_concept_said_alike_at_every_knot_is_the_one_that_does_not_vary(network: TemporalUNet) -> None:
-    still = Composition(normal(2, 4), torch.tensor([1.2, 0.6]))
-    said = Composition(still.embeddings.repeat(1, 5), still.weights, knots=5)
+    still = Composition(normal(2, 1, 4), torch.tensor([1.2, 0.6]))
+    said = Composition(still.embeddings.repeat(1, 5, 1), still.weights)
     assert torch.allclose(noise(network, still), noise(network, said), atol=1e-5)
 
 
 def test_what_knots_say_is_linear_between_them_and_their_order_matters(network: TemporalUNet) -> None:
     values = over_time(torch.tensor([[[0.0], [1.0], [3.0]]]), 5)
     assert torch.allclose(values, torch.tensor([[[0.0, 0.5, 1.0, 2.0, 3.0]]]))
-    moving = Composition(normal(1, 8), torch.ones(1), knots=2)
-    turned = replace(moving, embeddings=moving.embeddings.unflatten(1, (2, 4)).flip(1).flatten(1))
+    moving = Composition(normal(1, 2, 4), torch.ones(1))
+    turned = replace(moving, embeddings=moving.embeddings.flip(1))
     assert (noise(network, moving) - noise(network, turned)).abs().max() > 0.01
 
 
 def test_concepts_of_one_knot_compose_with_those_of_several_and_others_are_refused(network: TemporalUNet) -> None:
-    still, moving = Composition(normal(1, 4), torch.ones(1)), Composition(normal(1, 12, seed=1), torch.ones(1), knots=3)
+    still, moving = Composition(normal(1, 1, 4), torch.ones(1)), Composition(normal(1, 3, 4, seed=1), torch.ones(1))
     both = still + moving
     assert both.knots == 3
-    assert torch.equal(both.embeddings[0], still.embeddings[0].repeat(3))
-    other = noise(network, Composition(still.embeddings.repeat(1, 3), still.weights, knots=3) + moving)
+    assert torch.equal(both.embeddings[0], still.embeddings[0].repeat(3, 1))
+    other = noise(network, Composition(still.embeddings.repeat(1, 3, 1), still.weights) + moving)
     assert torch.equal(noise(network, both), other)
-    four = Composition(normal(1, 16), torch.ones(1), knots=4)
+    four = Composition(normal(1, 4, 4), torch.ones(1))
     with pytest.raises(UserError, match="expected concepts of one number of knots \\(or of one knot\\), found 3 and 4"):
         moving + four
     together, own = batched([still, moving], 2, [torch.Generator(), torch.Generator()])
-    assert together.embeddings.shape == (2, 1, 12)
+    assert together.embeddings.shape == (2, 1, 3, 4)
     assert own.tolist() == [0, 0, 1, 1]
 
 
 def test_modes_stay_in_compositions_of_concepts_that_vary_over_time(network: TemporalUNet) -> None:
     def several(count: int, knots: int, seed: int) -> Composition:
-        modes = Modes(normal(count, 1, 4 * knots, seed=seed), torch.ones(count, 1))
-        return Composition(normal(1, 4 * knots), torch.ones(1), modes=modes, knots=knots)
+        modes = Modes(normal(count, 1, knots, 4, seed=seed), torch.ones(count, 1))
+        return Composition(normal(1, knots, 4), torch.ones(1), modes=modes)
 
-    still, walk = Composition(normal(1, 4, seed=5), torch.tensor([0.8])), several(3, 1, 6)
+    still, walk = Composition(normal(1, 1, 4, seed=5), torch.tensor([0.8])), several(3, 1, 6)
     assert (walk + still).modes is None
     wave, kick = several(2, 3, 7), several(3, 3, 8)
     both = (wave.on((0,), 3) + still.on((1, 2), 3)) * 0.5
     assert both.modes is not None
     assert wave.modes is not None
-    assert both.modes.embeddings.shape == (2, 2, 12)
+    assert both.modes.embeddings.shape == (2, 2, 3, 4)
     assert torch.equal(both.modes.embeddings[1, 0], wave.modes.embeddings[1, 0])
-    assert torch.equal(both.modes.embeddings[1, 1], still.embeddings[0].repeat(3))
+    assert torch.equal(both.modes.embeddings[1, 1], still.embeddings[0].repeat(3, 1))
     assert torch.allclose(both.modes.weights, torch.tensor([[0.5, 0.4]]).expand(2, 2))
     pairs = (wave + kick + walk).modes
     assert pairs is not None
-    assert pairs.embeddings.shape == (6, 3, 12)
+    assert pairs.embeddings.shape == (6, 3, 3, 4)
     assert len(torch.unique(pairs.embeddings[:, :2].flatten(1), dim=0)) == 6
     together, own = batched([both], 8, [torch.Generator().manual_seed(0)])
-    assert together.embeddings.shape == (2, 2, 12)
+    assert together.embeddings.shape == (2, 2, 3, 4)
     assert set(own.tolist()) == {0, 1}
 
 
 def test_a_weight_on_some_columns_changes_those_alone(network: TemporalUNet) -> None:
-    walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
+    walk, wave = Composition(normal(1, 1, 4), torch.tensor([0.8])), Composition(normal(2, 1, 4, seed=1), torch.tensor([1.2, 0.5]))
     nothing = noise(network, 0.0 * walk)
     both = noise(network, walk.on((0, 2), 3) + wave.on((1,), 3))
     assert torch.allclose(both[..., [0, 2]], noise(network, walk)[..., [0, 2]], atol=1e-5)
@@ -132,13 +134,13 @@ def test_a_weight_on_some_columns_changes_those_alone(network: TemporalUNet) -> 
 
 
 def test_an_adapter_that_adds_nothing_changes_nothing(network: TemporalUNet) -> None:
-    own = Composition(normal(2, 4), torch.tensor([1.2, 0.6]))
+    own = Composition(normal(2, 1, 4), torch.tensor([1.2, 0.6]))
     assert torch.allclose(noise(network, own), noise(network, adapted(own, adapter(network, size=0.0))), atol=1e-5)
 
 
 def test_an_adapter_changes_its_own_branch_and_no_other(network: TemporalUNet) -> None:
-    walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
-    change, nothing = adapter(network), noise(network, Composition(torch.zeros(0, 4), torch.zeros(0)))
+    walk, wave = Composition(normal(1, 1, 4), torch.tensor([0.8])), Composition(normal(2, 1, 4, seed=1), torch.tensor([1.2, 0.5]))
+    change, nothing = adapter(network), noise(network, Composition(torch.zeros(0, 1, 4), torch.zeros(0)))
     waved = noise(network, adapted(wave, change)) - nothing
     assert (waved - (noise(network, wave) - nothing)).abs().max() > 0.01
     expected = nothing + (noise(network, walk) - nothing) + waved
@@ -158,8 +160,18 @@ def test_an_adapter_changes_its_own_branch_and_no_other(network: TemporalUNet) -
     assert torch.allclose(each, alone, atol=1e-4)
 
 
+def test_an_adapter_refuses_a_denoiser_that_is_no_network(network: TemporalUNet) -> None:
+    with pytest.raises(TypeError, match="expected a network, whose weights can be changed, found function"):
+        adapter(network)(lambda x, t, concepts, index, context: x)
+
+
+def test_embeddings_without_an_axis_of_knots_are_refused() -> None:
+    with pytest.raises(UserError, match=r"expected embeddings \(..., K, knots, n\) and weights .*, found \(2, 4\) and \(2,\)"):
+        Composition(normal(2, 4), torch.ones(2))
+
+
 def test_an_adapter_that_changes_everything_is_another_network(network: TemporalUNet) -> None:
-    walk, wave = Composition(normal(1, 4), torch.tensor([0.8])), Composition(normal(2, 4, seed=1), torch.tensor([1.2, 0.5]))
+    walk, wave = Composition(normal(1, 1, 4), torch.tensor([0.8])), Composition(normal(2, 1, 4, seed=1), torch.tensor([1.2, 0.5]))
     change = replace(adapter(network), everywhere=True)
     tuned = copy.deepcopy(network)
     for name in change.factors:
@@ -180,8 +192,8 @@ def test_an_adapter_that_changes_everything_is_another_network(network: Temporal
 @pytest.mark.parametrize("modes", [False, True])
 @pytest.mark.parametrize(("knots", "adapters"), [(3, False), (1, True), (3, True)])
 def test_every_form_comes_back_from_its_file(network: TemporalUNet, knots: int, adapters: bool, modes: bool) -> None:
-    several = Modes(normal(2, 2, 4 * knots), torch.ones(2, 2), mixed=True) if modes else None
-    own = Concept(normal(2, 4 * knots), torch.tensor([1.2, 0.6]), ORIGIN, several, knots, adapter(network) if adapters else None)
+    several = Modes(normal(2, 2, knots, 4), torch.ones(2, 2), mixed=True) if modes else None
+    own = Concept(normal(2, knots, 4), torch.tensor([1.2, 0.6]), ORIGIN, several, adapter(network) if adapters else None)
     own.save("c.safetensors")
     found = Concept.load("c.safetensors")
     assert found.knots == knots

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.concepts.composition import STRETCH, Composition, Modes, batched
+from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.concepts.modes import STRETCH, Modes
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.evaluation.closed_loop import sampled_plans
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -17,18 +18,18 @@ seeds = st.integers(0, 2**31)
 
 
 def modes(count: int = 5, mixed: bool = False, seed: int = 0) -> Modes:
-    """K = 2, n = 3."""
+    """K = 2, one knot, n = 3."""
     draw = torch.Generator().manual_seed(seed)
-    return Modes(torch.randn(count, 2, 3, generator=draw), torch.rand(count, 2, generator=draw), mixed)
+    return Modes(torch.randn(count, 2, 1, 3, generator=draw), torch.rand(count, 2, generator=draw), mixed)
 
 
 def concept(own: Modes) -> Composition:
     """Modes beside embeddings that are none of them."""
-    return Composition(torch.full((2, 3), 9.0), torch.tensor([1.2, 0.6]), modes=own)
+    return Composition(torch.full((2, 1, 3), 9.0), torch.tensor([1.2, 0.6]), modes=own)
 
 
 def samples(own: Modes, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Embeddings ``(count, 2, 3)`` and weights ``(count, 2)`` of every sample."""
+    """Embeddings ``(count, 2, 1, 3)`` and weights ``(count, 2)`` of every sample."""
     embeddings, weights, row = own.draw(count, torch.Generator().manual_seed(seed))
     return embeddings[row], weights[row]
 
@@ -51,18 +52,18 @@ def test_a_mixture_lies_in_the_span_of_the_modes_with_shares_that_sum_to_one(see
     own = modes(count, mixed=True, seed=seed)
     embeddings, weights = samples(own, 40, seed)
     # Unit vectors as modes give the shares themselves.
-    unit = Modes(torch.eye(count)[:, None], torch.ones(count, 1), mixed=True)
-    shares = samples(unit, 40, seed)[0][:, 0]
+    unit = Modes(torch.eye(count)[:, None, None], torch.ones(count, 1), mixed=True)
+    shares = samples(unit, 40, seed)[0][:, 0, 0]
     assert torch.allclose(shares.sum(dim=1), torch.ones(40), atol=1e-5)
     assert shares.min() >= (1 - STRETCH) / count - 1e-6
     assert shares.max() <= STRETCH + (1 - STRETCH) / count + 1e-6
-    assert torch.allclose(embeddings, torch.einsum("sm,mkn->skn", shares, own.embeddings), atol=1e-5)
+    assert torch.allclose(embeddings, torch.einsum("sm,mktn->sktn", shares, own.embeddings), atol=1e-5)
     assert torch.allclose(weights, shares @ own.weights, atol=1e-5)
 
 
 def test_mixtures_vary_about_the_mean_of_the_modes_as_far_as_stretched_even_shares_do() -> None:
-    unit = Modes(torch.eye(5)[:, None], torch.ones(5, 1), mixed=True)
-    shares = samples(unit, 20_000)[0][:, 0]
+    unit = Modes(torch.eye(5)[:, None, None], torch.ones(5, 1), mixed=True)
+    shares = samples(unit, 20_000)[0][:, 0, 0]
     assert torch.allclose(shares.mean(dim=0), torch.full((5,), 0.2), atol=0.01)
     # Of Dirichlet(1) over m the variance of a share is (m - 1) / (m^2 (m + 1)).
     assert torch.allclose(shares.var(dim=0), torch.full((5,), STRETCH**2 * 4 / 150), rtol=0.05)
@@ -70,9 +71,9 @@ def test_mixtures_vary_about_the_mean_of_the_modes_as_far_as_stretched_even_shar
 
 def test_a_mixture_of_equal_modes_is_that_mode() -> None:
     one = modes(1)
-    same = Modes(one.embeddings.expand(4, -1, -1), one.weights.expand(4, -1), mixed=True)
+    same = Modes(one.embeddings.expand(4, -1, -1, -1), one.weights.expand(4, -1), mixed=True)
     embeddings, weights = samples(same, 10)
-    assert torch.allclose(embeddings, one.embeddings.expand(10, -1, -1), atol=1e-5)
+    assert torch.allclose(embeddings, one.embeddings.expand(10, -1, -1, -1), atol=1e-5)
     assert torch.allclose(weights, one.weights.expand(10, -1), atol=1e-5)
 
 
@@ -101,9 +102,9 @@ def test_a_seed_repeats_the_draw_and_another_does_not(mixed: bool) -> None:
 def test_nothing_is_drawn_where_there_are_no_modes() -> None:
     draw = torch.Generator().manual_seed(3)
     before = draw.get_state()
-    own = Composition(torch.zeros(2, 3), torch.ones(2))
+    own = Composition(torch.zeros(2, 1, 3), torch.ones(2))
     rows, row = own.draw(4, draw)
-    assert rows.embeddings.shape == (1, 2, 3)
+    assert rows.embeddings.shape == (1, 2, 1, 3)
     assert row.tolist() == [0, 0, 0, 0]
     assert own.drawn(draw) is own
     assert torch.equal(draw.get_state(), before)
@@ -121,7 +122,7 @@ def test_a_multiple_of_a_concept_multiplies_its_modes_weights_and_keeps_their_em
 
 
 def test_a_sum_is_composed_of_the_centre_and_has_no_modes() -> None:
-    own, other = concept(modes()), Composition(torch.zeros(1, 3), torch.ones(1))
+    own, other = concept(modes()), Composition(torch.zeros(1, 1, 3), torch.ones(1))
     for both in (own + other, own - 0.5 * other, own + own):
         assert both.modes is None
         assert torch.equal(both.embeddings[:2], own.embeddings)
@@ -130,10 +131,10 @@ def test_a_sum_is_composed_of_the_centre_and_has_no_modes() -> None:
 
 
 def test_concepts_with_and_without_modes_are_generated_in_one_batch() -> None:
-    own, plain = concept(modes()), Composition(torch.full((1, 3), 7.0), torch.ones(1))
+    own, plain = concept(modes()), Composition(torch.full((1, 1, 3), 7.0), torch.ones(1))
     draws = [torch.Generator().manual_seed(seed) for seed in range(3)]
     together, rows = batched([plain, own, concept(modes(2, mixed=True))], 4, draws)
-    assert together.embeddings.shape == (1 + 5 + 4, 2, 3)
+    assert together.embeddings.shape == (1 + 5 + 4, 2, 1, 3)
     assert rows[:4].tolist() == [0] * 4
     assert set(rows[4:8].tolist()) <= set(range(1, 6))
     assert rows[8:].tolist() == [6, 7, 8, 9]

@@ -74,7 +74,8 @@ def test_what_is_observed_is_read_once_a_plan(
     denoiser: str, options: dict[str, Any], prediction: str, encoder: str, calls: dict[str, list[int]]
 ) -> None:
     net = model(denoiser, options | {"initial_encoder": encoder}, prediction)
-    compositions = [Composition(net.training_embeddings, torch.ones(2)), Composition(net.training_embeddings[:1], torch.ones(1))]
+    known = net.training_embeddings[:, None]
+    compositions = [Composition(known, torch.ones(2)), Composition(known[:1], torch.ones(1))]
     seen = {OBSERVED: scenes("go to bowl", 6, 0)}
     draws = [generator("cpu", number) for number in range(2)]
     plans = net.sample(compositions, 3, Sampling("ddpm", STEPS, 0.5), draws, seen)
@@ -85,7 +86,7 @@ def test_what_is_observed_is_read_once_a_plan(
 
 def test_learning_reads_it_once_a_step_for_all_branches(calls: dict[str, list[int]]) -> None:
     net = model(*NETWORKS[0][:2])
-    concepts = torch.randn(2, 3, 6, requires_grad=True)
+    concepts = torch.randn(2, 3, 1, 6, requires_grad=True)
     draws = net.draws(4, 1.0, generator("cpu", 0))
     seen = {OBSERVED: scenes("go to bowl", 8, 0)}
     losses = net.losses(torch.zeros(8, 8, 13), seen, Composition(concepts, torch.ones(2, 3)), draws, "epsilon")
@@ -99,7 +100,7 @@ def test_learning_reads_it_once_a_step_for_all_branches(calls: dict[str, list[in
 
 def test_in_closed_loop_it_is_read_once_for_every_plan_that_is_made(calls: dict[str, list[int]]) -> None:
     net = model(*NETWORKS[0][:2])
-    composition = Composition(net.training_embeddings, torch.ones(2))
+    composition = Composition(net.training_embeddings[:, None], torch.ones(2))
     draws = [generator("cpu", number) for number in range(2)]
     make = sampled_plans(net, [composition] * 2, Sampling("ddim", STEPS, 0.5), draws)
     for made in (1, 2):

@@ -171,7 +171,7 @@ def error(model: GenerativeModel, concept: str) -> float:
     """Mean distance in pixels of where new ways end from where the picture says that they should."""
     new = ways(concept, 40, 7)
     observed = {name: torch.from_numpy(new[f"observed/{name}"]) for name in ("view", "place")}
-    composition = Composition(model.concept(concept)[None], torch.ones(1))
+    composition = Composition(model.concept(concept)[None, None], torch.ones(1))
     plans = model.sample([composition], 40, Sampling("ddim", 10, 0.1), [generator("cpu", 0)], observed)[0]
     return float((plans[:, -1] - torch.from_numpy(new["states"][:, -1])).norm(dim=-1).mean())
 
@@ -264,7 +264,7 @@ def test_cloning_looks_once_and_in_context_learning_takes_a_trained_encoder(fitt
     calls: list[int] = []
     plain = ImageEncoder.forward
     monkeypatch.setattr(ImageEncoder, "forward", lambda self, images: calls.append(len(images)) or plain(self, images))  # type: ignore[func-returns-value]
-    composition = Composition(model.concept("to")[None], torch.ones(1))
+    composition = Composition(model.concept("to")[None, None], torch.ones(1))
     assert model.sample([composition], 3, Sampling(), [generator("cpu", 0)], observed).shape == (1, 3, 2, 2)
     assert calls == [3]
 

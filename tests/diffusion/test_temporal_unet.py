@@ -25,7 +25,7 @@ def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
     initial = torch.randn(batch, 10, generator=draw)
     initial[:, [6, 9]] = 0
     t, index = torch.arange(batch), torch.tensor([0, 1, 0])[:batch]
-    return x, t, torch.randn(2, 7, generator=draw), index, initial
+    return x, t, torch.randn(2, 1, 7, generator=draw), index, initial
 
 
 def noise(

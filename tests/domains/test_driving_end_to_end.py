@@ -128,7 +128,7 @@ def test_the_shipped_model_knows_the_training_scenarios() -> None:
         at, when = torch.tensor(rows).T
         now = {name: values[at, when] for name, values in held.observed.items()}
         following = torch.stack([held.states[row, time + 1] for row, time in rows])
-        concept, draw = [Composition(shipped.concept(name)[None], torch.tensor([1.2]))], [generator("cpu", 0)]
+        concept, draw = [Composition(shipped.concept(name)[None, None], torch.tensor([1.2]))], [generator("cpu", 0)]
         plans = shipped.sample(concept, len(rows), Sampling("dpm_solver", 5, 0.0), draw, now)[0]
         kept = now[TRAFFIC][:, :STATE].clone()
         kept[:, 1:3] += kept[:, 3:5]  # decisions are a second apart

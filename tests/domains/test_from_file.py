@@ -320,7 +320,7 @@ def test_the_training_concepts_are_learned(fitted: Path) -> None:
         def composition(self, task: object) -> object:
             from ftl_lightning.concepts.composition import Composition
 
-            return Composition(model.concept(task.goal)[None], torch.ones(1))  # type: ignore[attr-defined]
+            return Composition(model.concept(task.goal)[None, None], torch.ones(1))  # type: ignore[attr-defined]
 
     known: Any = Known()
     tasks = tasks_of(model.domain, ["training"], ())

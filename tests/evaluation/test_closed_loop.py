@@ -178,7 +178,7 @@ def model() -> GenerativeModel:
 def test_episodes_do_not_depend_on_their_neighbours() -> None:
     net = model()
     starts = begin(-2, -1, 0, 1, 2)
-    concepts = [Composition(torch.randn(k, 6, generator=generator("cpu", k)), torch.ones(k)) for k in (1, 2, 1, 2, 1)]
+    concepts = [Composition(torch.randn(k, 1, 6, generator=generator("cpu", k)), torch.ones(k)) for k in (1, 2, 1, 2, 1)]
 
     def run(rows: list[int]) -> Tensor:
         plan = sampled_plans(

@@ -45,7 +45,7 @@ class Trained:
     def composition(self, task: EvaluationTask) -> Composition | None:
         if task.learned:
             return None
-        return Composition(torch.stack([self.model.concept(text) for text in task.texts]), torch.ones(len(task.texts)))
+        return Composition(torch.stack([self.model.concept(text)[None] for text in task.texts]), torch.ones(len(task.texts)))
 
     def concept_embeddings(self) -> dict[str, torch.Tensor]:
         return self.model.named_embeddings()

@@ -54,7 +54,7 @@ def transformer() -> InContextModel:
 def sampled(
     model: ConceptModel, concepts: list[torch.Tensor], initial: torch.Tensor | None, count: int, temperature: float = 0.0
 ) -> torch.Tensor:
-    compositions = [Composition(own, torch.ones(len(own))) for own in concepts]
+    compositions = [Composition(own[:, None], torch.ones(len(own))) for own in concepts]
     draws = [generator("cpu", number) for number in range(len(concepts))]
     seen = None if initial is None else {OBSERVED: initial}
     return model.sample(compositions, count, Sampling("ddpm", 1, temperature), draws, seen)
@@ -287,7 +287,7 @@ def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[s
     assert set(read_rows("r.csv").query("role == 'method'")["method"]) == {"language"}
     for path in Path("c").iterdir():
         concept = Concept.load(path)
-        assert concept.embeddings.shape == (1, model.config.concept_dim)
+        assert concept.embeddings.shape == (1, 1, model.config.concept_dim)
         assert concept.weights.tolist() == [pytest.approx(1.2)]
 
 
@@ -310,6 +310,6 @@ def test_tasks_are_told_in_the_papers_words() -> None:
 
 
 def test_models_that_add_concepts_refuse_weights_on_some_columns() -> None:
-    part = Composition(torch.zeros(1, 1, 3), torch.ones(1, 1)).on((0,), 4)
+    part = Composition(torch.zeros(1, 1, 1, 3), torch.ones(1, 1)).on((0,), 4)
     with pytest.raises(UserError, match="expected concepts without '@' for a model that adds them up"):
         added(part)

@@ -159,7 +159,7 @@ def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
 def test_the_span_form_stays_in_the_span(tiny: Path, off_span: float, inside: bool) -> None:
     module = learn(tiny, off_span=off_span)
     training = module.model.training_embeddings
-    found = module.inversion.parametrised(module.inversion.embeddings).detach().flatten(0, 1)
+    found = module.inversion.parametrised(module.inversion.embeddings).detach().flatten(0, 2)
     solution = torch.linalg.lstsq(training.T.double(), found.T.double()).solution
     outside = (training.T.double() @ solution - found.T).norm() / found.norm()
     assert (outside < 1e-3) == inside
@@ -175,7 +175,7 @@ def test_a_concept_file_names_where_it_comes_from(invert: Callable[..., Path], t
     assert concept.origin.encoder == model.config.encoder
     assert concept.origin.weights == "fixed"
     assert concept.origin.count == 5
-    assert concept.embeddings.shape == (2, 384)
+    assert concept.embeddings.shape == (2, 1, 384)
     assert concept.weights.tolist() == pytest.approx([1.2, 1.2])
 
 
@@ -210,7 +210,7 @@ def test_a_task_is_composed_of_all_that_it_names_with_the_weight_of_each(tiny: P
     found = module.composition(EvaluationTask("s", "g", learned=(first, second), texts=(text,), without=(other,)))
     assert found is not None
     assert found.weights.tolist() == pytest.approx([0.8, WITHOUT_WEIGHT, 1.2, 1.2, 1.2, 1.2])
-    expected = [module.model.concept(text)[None], module.model.concept(other)[None]]
+    expected = [module.model.concept(text)[None, None], module.model.concept(other)[None, None]]
     expected += [module.learned()[name].embeddings for name in (first, second)]
     assert torch.equal(found.embeddings, torch.cat(expected))
     assert module.composition(EvaluationTask("s", "g", learned=(first, "never learned"))) is None

@@ -145,7 +145,7 @@ def test_a_task_of_texts_is_composed_with_the_guidance_weight_and_against_others
     found = module.composition(EvaluationTask("s", "g", texts=(one,), without=(other,)))
     assert found is not None
     assert found.weights.tolist() == [1.5, WITHOUT_WEIGHT]
-    assert torch.equal(found.embeddings, torch.stack([module.model.concept(one), module.model.concept(other)]))
+    assert torch.equal(found.embeddings, torch.stack([module.model.concept(one), module.model.concept(other)])[:, None])
     assert module.composition(EvaluationTask("s", "g", learned=("new",), texts=(one,))) is None
 
 

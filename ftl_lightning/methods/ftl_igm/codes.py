@@ -38,7 +38,7 @@ class Codes:
         expect_count("model.codes.size", self.size, 1, MOST_STEPS)
 
     def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
-        """Concepts ``(batch, knots * n)``.
+        """Concepts ``(batch, knots, n)``.
 
         Args:
             texts: ``(batch, n)``, the empty one where it was removed.
@@ -57,4 +57,4 @@ class Codes:
         told = (torch.rand(count, generator=draw, device=device) < self.share) & ~removed
         alone = told & (torch.rand(count, generator=draw, device=device) < 0.5)
         text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
-        return (text[:, None] + told[:, None, None] * (numbers @ directions)).flatten(1)
+        return text[:, None] + told[:, None, None] * (numbers @ directions)

@@ -9,7 +9,9 @@ from torch import Tensor, nn
 
 from ftl_lightning import diffusion
 from ftl_lightning.concepts.adapter import LowRank, adaptable
-from ftl_lightning.concepts.composition import Composition, Context, batched, composed_epsilon
+from ftl_lightning.concepts.branches import Context
+from ftl_lightning.concepts.composition import Composition, batched
+from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
 from ftl_lightning.diffusion.samplers import Sampling

@@ -118,6 +118,8 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         index = torch.where(removed, 0, batch.concepts + 1)
         if self.codes.share and model.training:
             concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
+        else:
+            concepts = concepts[:, None]  # one knot
         total, power = self.hparams["diffusion_steps"], self.loss.timestep_power
         if power == 1:
             t = torch.randint(total, (count,), generator=draw, device=self.device)

@@ -155,7 +155,7 @@ class InContextModel(ConceptModel):
         """
         if any(one.columns is not None for one in compositions):
             raise UserError("compose: expected concepts without '@' for a model that reads demonstrations, found groups of columns")
-        prompts = batched(compositions, count, generators)[0].embeddings
+        prompts = batched(compositions, count, generators)[0].embeddings.flatten(2)
         temperature = sampling.temperature
         counts = torch.tensor([len(one.weights) for one in compositions], device=self.device)
         given = torch.arange(prompts.shape[1], device=self.device) < counts[:, None]

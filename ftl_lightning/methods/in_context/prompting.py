@@ -34,5 +34,5 @@ def prompt(
     concepts = {}
     for name in dict.fromkeys(demonstrations.concepts):
         prompts = model.prompts(demonstrations.select(name))
-        concepts[name] = Concept(prompts, torch.ones(len(prompts)), origin(model, demonstrations, name, "fixed", 0.0))
+        concepts[name] = Concept(prompts[:, None], torch.ones(len(prompts)), origin(model, demonstrations, name, "fixed", 0.0))
     return concepts

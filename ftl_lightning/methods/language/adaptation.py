@@ -56,8 +56,8 @@ class LanguageAdaptation(Adaptation):
         return METHOD.name
 
     def _embedding(self, goal: str) -> Tensor:
-        """``(1, n)`` of a task's description."""
-        return self._standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))
+        """``(1, 1, n)`` of a task's description."""
+        return self._standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))[None]
 
     def learned(self) -> dict[str, Concept]:
         weights = torch.tensor([self._omega])

@@ -1,0 +1,81 @@
+"""The composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.adapter import adapted_branches
+from ftl_lightning.concepts.branches import Context, Denoiser, Noised, branches
+from ftl_lightning.concepts.composition import Composition
+
+
+def composed_epsilon(
+    denoiser: Denoiser,
+    x: Tensor,
+    t: Tensor,
+    composition: Composition,
+    empty: Tensor,
+    context: Context = (),
+    row: Tensor | None = None,
+) -> Tensor:
+    """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, all branches in one call of the network.
+
+    While learning, the empty branch, which depends on nothing that is learned, is evaluated apart, without gradient. Where a
+    concept has an adapter, the network that evaluates its branch is the one that the adapter makes of the denoiser.
+
+    Args:
+        denoiser: estimates noise for one concept a sample.
+        x: noisy plans ``(batch, horizon, state)``.
+        t: timesteps ``(batch,)``.
+        composition: ``(composition, K, ...)``; K may be 0.
+        empty: the empty concept ``(n,)``.
+        context: of each sample.
+        row: each sample's composition ``(batch,)`` int64; ``None`` for equally many samples of each, one after another.
+
+    Returns:
+        ``(batch, horizon, state)``.
+    """
+    row = _in_turn(composition, x) if row is None else row
+    noised, concepts, index = Noised(x, t, context), *_flat(composition, row)
+    empty, first = empty.repeat(1, composition.knots, 1), torch.zeros_like(row)[None]
+    if composition.adapters:
+        unconditional, conditional = adapted_branches(denoiser, noised, composition, row, empty, concepts, index)
+    elif torch.is_grad_enabled() and len(index):
+        with torch.no_grad():
+            unconditional = branches(denoiser, noised, empty, first)[0]
+        conditional = branches(denoiser, noised, concepts, index)
+    else:
+        every = branches(denoiser, noised, torch.cat((empty, concepts)), torch.cat((first, index + 1)))
+        unconditional, conditional = every[0], every[1:]
+    return unconditional + weighted_sum(composition, row, conditional - unconditional)
+
+
+def weighted_sum(composition: Composition, row: Tensor, differences: Tensor) -> Tensor:
+    """``sum_k w_k differences_k``, where a weight may differ between the columns of a state.
+
+    Args:
+        composition: ``(composition, K, ...)``.
+        row: each sample's composition ``(batch,)``.
+        differences: ``(K, batch, horizon, state)``.
+
+    Returns:
+        ``(batch, horizon, state)``.
+    """
+    if composition.columns is None:
+        return torch.einsum("bk,kbhs->bhs", composition.weights[row], differences)
+    by_column = composition.weights[..., None] * composition.columns
+    return torch.einsum("bks,kbhs->bhs", by_column[row], differences)
+
+
+def _in_turn(composition: Composition, x: Tensor) -> Tensor:
+    """Rows ``(batch,)`` of equally many samples of each composition, one composition after another."""
+    count = len(composition.weights)
+    return torch.arange(count, device=x.device).repeat_interleave(len(x) // count)
+
+
+def _flat(composition: Composition, row: Tensor) -> tuple[Tensor, Tensor]:
+    """The concepts of all compositions ``(composition * K, knots, n)``, and where among them those of each sample are
+    ``(K, batch)``.
+    """
+    components = composition.weights.shape[1]
+    index = components * row + torch.arange(components, device=row.device)[:, None]
+    return composition.embeddings.flatten(0, 1), index

@@ -1,0 +1,72 @@
+"""Modes of a concept: several sets of embeddings, for behaviours that are right in different ways."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.representation import Shown, counted
+
+STRETCH = 1.5
+"""Mixtures of modes lie so much farther from the modes' mean than convex combinations: these alone vary less than the modes do."""
+
+
+@dataclass(frozen=True, repr=False)
+class Modes(Shown):
+    """Several sets of embeddings of one concept: behaviours that are right in different ways.
+
+    Attributes:
+        embeddings: ``(mode, K, knots, n)``.
+        weights: ``(mode, K)``, omega.
+        mixed: whether a sample is generated from a random mixture of the modes, which suits concepts of which one set of embeddings
+            says enough, or from one mode, drawn at random.
+    """
+
+    embeddings: Tensor
+    weights: Tensor
+    mixed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def _words(self) -> Iterator[str]:
+        yield counted(len(self), "mode")
+        yield f"K = {self.weights.shape[-1]}"
+        if self.mixed:
+            yield "mixed"
+
+    def __mul__(self, factor: float) -> "Modes":
+        return replace(self, weights=factor * self.weights)
+
+    def to(self, device: torch.device) -> "Modes":
+        """The same on a device."""
+        return replace(self, embeddings=self.embeddings.to(device), weights=self.weights.to(device))
+
+    def with_each(self, other: "Modes") -> "Modes":
+        """The sum of two concepts: each of these modes with each of the other's, the other's changing first; mixed where either
+        is.
+        """
+
+        def paired(own: Tensor, others: Tensor) -> Tensor:
+            outer = own.repeat_interleave(len(others), dim=0)
+            inner = others.repeat(len(own), *(1,) * (others.dim() - 1))
+            return torch.cat((outer, inner), dim=1)
+
+        embeddings, weights = paired(self.embeddings, other.embeddings), paired(self.weights, other.weights)
+        return Modes(embeddings, weights, mixed=self.mixed or other.mixed)
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """What ``count`` samples are generated from: embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and each sample's
+        row ``(count,)``.
+
+        A mixture is ``mean + STRETCH * sum_m share_m (mode_m - mean)``, the shares even on the simplex (Dirichlet(1)).
+        """
+        if not self.mixed:
+            chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)
+            return self.embeddings, self.weights, chosen.to(self.weights.device)
+        even = torch.empty(count, len(self), device=generator.device).exponential_(generator=generator)
+        shares = (even / even.sum(dim=1, keepdim=True)).to(self.weights.device)
+        shares = STRETCH * shares + (1 - STRETCH) / len(self)
+        embeddings = torch.einsum("sm,m...->s...", shares, self.embeddings)
+        return embeddings, shares @ self.weights, torch.arange(count, device=self.weights.device)
