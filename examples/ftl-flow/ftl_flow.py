@@ -95,6 +95,6 @@ class FlowPretraining(Pretraining[FlowModel]):
         states, observed = model.perturbed(batch.states, batch.observed, draw)
         t, noise = model.draws(len(states), 1, draw)
         empty = model.training & (torch.rand(len(t), generator=draw, device=t.device) < self.hparams["condition_dropout"])
-        index, concepts = torch.where(empty, 0, batch.concepts + 1), torch.cat((model.empty[None], model.training_embeddings))[:, None]
-        context = model.network.observe(model.vector(observed))
-        return model.errors(lambda x, t: model.network(x, t, concepts, index, context), model.encode(states, observed), t, noise)
+        concepts = torch.cat((model.empty[None], model.training_embeddings))[:, None]  # of one knot
+        told, context = torch.where(empty, 0, batch.concepts + 1), model.network.observe(model.vector(observed))
+        return model.errors(lambda x, t: model.network(x, t, concepts, told, context), model.encode(states, observed), t, noise)
