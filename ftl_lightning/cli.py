@@ -96,7 +96,7 @@ def _dispatch(arguments: list[str]) -> None:
         from jsonargparse import auto_cli
 
         trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs take no other class
-        commands = importlib.import_module("ftl_lightning.commands")
+        commands = importlib.import_module("ftl_lightning.sampling_command" if verb == "sample" else "ftl_lightning.commands")
         name = verb.replace("-", "_")
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}

@@ -4,19 +4,14 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from ftl_lightning.ablation import Stage
 from ftl_lightning.printing import line, say
 from ftl_lightning.ranges import expect_count, expect_range
 
-if TYPE_CHECKING:
-    from ftl_lightning.demonstrations.features import InitialStates
-    from ftl_lightning.domains.domain import Domain
-
-
-MOST_DEMONSTRATIONS, MOST_SAMPLES, MOST_DRAWN, MOST_WORKERS = 1_000_000, 10_000, 1000, 1000
-"""That one command makes; of samples, which are made in one batch, those that one figure shows too; and of processes."""
+MOST_DEMONSTRATIONS, MOST_WORKERS = 1_000_000, 1000
+"""Demonstrations that one command draws, and processes that draw them."""
 
 
 def generate(
@@ -101,149 +96,6 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
     if found.prepare is None:
         raise UserError(f"domain: expected one whose recordings are prepared, found {domain!r}, which needs nothing of the kind")
     say(found.prepare(Path(root) if root else None, Path(out) if out else None))
-
-
-@dataclass(frozen=True)
-class SampleOptions:
-    """Generate behaviour from a learned concept, composed with training concepts.
-
-    Attributes:
-        pretrained: folder of the pretrained model, or the name of one that ships.
-        concept: file of a learned concept; empty for training concepts alone.
-        compose: what is composed with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9". Training
-            concepts, or files of learned concepts, whose own weights are multiplied. A weight may be left out and is 1 then.
-            With "walk@legs:1" a concept is composed on some groups of a state's columns alone, in domains that name such.
-        count: samples.
-        seed: of the samples.
-        sampler: see ftl_lightning.diffusion.samplers; empty for the one that the settings name.
-        steps: of the sampler; 0 likewise.
-        temperature: the paper's alpha; lower is less diverse and more accurate; null likewise.
-        goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
-            drawn from the seed; without a goal, those of the task that the concept was learned from, or of the first composed text.
-        initial: demonstrations file whose initial states are used instead; one sample of each.
-        out: demonstrations file to write.
-        figure: picture to write, .png or .svg.
-        execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
-            episodes ended.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 likewise.
-        settings: configuration file of invert that says how to sample and how often to plan anew; empty for that of the domain.
-        animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
-    """
-
-    pretrained: str
-    concept: str = ""
-    compose: str = ""
-    count: int = 50
-    seed: int = 0
-    sampler: Literal["", "ddpm", "ddim", "dpm_solver"] = ""
-    steps: int = 0
-    temperature: float | None = None
-    goal: str = ""
-    initial: str = ""
-    out: str = "states.safetensors"
-    figure: str = ""
-    execute: bool = False
-    replan: int = 0
-    animation: str = ""
-    settings: str = ""
-
-    def __post_init__(self) -> None:
-        from ftl_lightning.errors import UserError
-
-        for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
-            if path and Path(path).suffix not in endings:
-                raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
-        expect_range("seed", self.seed, 0)
-        expect_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
-        expect_count("steps", self.steps, 0)
-        expect_count("replan", self.replan, 0)
-
-
-def sample(options: SampleOptions) -> None:
-    """Generate behaviour as the options say; write, judge, draw and execute it."""
-    from dataclasses import replace
-
-    from ftl_lightning.evaluation.animation import captioned, gif
-    from ftl_lightning.few_shot import FewShot
-    from ftl_lightning.tensor_file import atomic
-
-    model = FewShot.from_pretrained(options.pretrained, options.settings or None)
-    text = " + ".join(part for part in (options.compose, options.concept) if part)
-    known = model.compose(text) if text else None  # what is unknown is told before what is missing
-    _check_sample(options, model.domain)
-    composition = model.compose(text) if known is None else known
-    goal, film = options.goal, model.domain.show.film
-    starts = _sample_starts(options, model.domain)
-    plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))
-    told = {**plans.provenance, "concept": options.concept, "compose": options.compose}
-    plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)
-    plans.save(options.out)
-    # Where a domain has no configuration of its own, what invert was told must be told again.
-    say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
-    for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
-        say(f"{name} on '{goal}': {value:.2f}")
-    if options.figure:
-        with atomic(options.figure) as temporary:
-            model.render(plans, goal).savefig(temporary, dpi=110)
-        say(options.figure)
-    if options.execute and starts is not None:
-        done = model.execute(composition, starts, goal, replan=options.replan or None, seed=options.seed, **_sampling(options))
-        for name, value in done.outcomes.items():
-            say(f"closed loop, {name}: {value:.2f}, mean of {len(starts)} episodes")
-        if options.animation:
-            done.save(options.animation)
-    elif options.animation and film:
-        with atomic(options.animation) as temporary:
-            temporary.write_bytes(gif(captioned(film(plans.states[0]), goal or Path(options.concept).stem)))
-    if options.animation:
-        say(options.animation)
-
-
-def _sampling(options: SampleOptions) -> dict[str, Any]:
-    """What differs from the configured way of sampling."""
-    changes: dict[str, Any] = {"sampler": options.sampler} if options.sampler else {}
-    changes |= {"steps": options.steps} if options.steps else {}
-    return changes | ({} if options.temperature is None else {"temperature": options.temperature})
-
-
-def _check_sample(options: SampleOptions, domain: "Domain") -> None:
-    """Refuse what a domain cannot do, before anything is generated."""
-    from ftl_lightning.errors import UserError
-
-    if options.goal:
-        domain.expect_goal(options.goal)
-    if options.animation and options.execute and domain.closed_loop and domain.closed_loop.film is None:
-        raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
-    if options.execute and domain.closed_loop is None:
-        raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
-    if options.execute and domain.closed_loop is not None:
-        domain.closed_loop.expect()
-    if options.animation and not options.execute and domain.show.film is None:
-        raise UserError(f"animation: expected --execute true (plans of {domain.name} are not filmed), found {options.animation!r}")
-    if domain.observed and not (options.initial or _start_task(options, domain)):
-        raise UserError(
-            f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
-        )
-
-
-def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
-    """Initial states of a file's demonstrations or of the goal; ``None`` where behaviour has none."""
-    if options.initial:
-        from ftl_lightning.domains.data import read_demonstrations
-
-        return read_demonstrations(options.initial, domain).initial_states
-    task = _start_task(options, domain)
-    return domain.source(None).starts(task, options.count, options.seed) if domain.observed else None
-
-
-def _start_task(options: SampleOptions, domain: "Domain") -> str:
-    """The task whose initial states are drawn; empty where nothing names one that the domain reads."""
-    from ftl_lightning.composition_text import parse_composition
-    from ftl_lightning.concepts.concept import Concept
-
-    learned = (Concept.load(options.concept).origin.name,) if options.concept and not options.goal else ()
-    named = (options.goal, *learned, *(part.concept for part in parse_composition(options.compose)))
-    return next((text for text in named if text and domain.concepts.reads(text)), "")
 
 
 def concepts(pretrained: str) -> None:

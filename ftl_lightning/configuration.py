@@ -101,7 +101,8 @@ def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]
 
 
 def _plain(keys: object) -> dict[str, Any]:
-    assert isinstance(keys, dict)
+    if not isinstance(keys, dict):
+        raise UserError(f"configuration: expected a mapping of keys, found {short(str(keys))}")
     return {str(key): value for key, value in keys.items()}
 
 

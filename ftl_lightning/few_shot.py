@@ -1,11 +1,12 @@
 """The few-shot learner in Python: load a pretrained model, learn a concept, sample, compose, judge, draw, execute."""
 
 import functools
+import operator
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -18,58 +19,31 @@ from ftl_lightning.batches import sampled
 from ftl_lightning.composition_text import Part, parse_composition
 from ftl_lightning.concepts.composition import Composition, space_of
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.concepts.explanation import Explanation, explain
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.errors import UserError, short, shown
-from ftl_lightning.evaluation.execution import Execution
+from ftl_lightning.evaluation.closed_loop import reset
+from ftl_lightning.evaluation.execution import Execution, episodes
+from ftl_lightning.judging import judged, picture
+from ftl_lightning.learned_concept import LearnedConcept, concept_of
 from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.hub import card as model_card
-from ftl_lightning.learning.hub import download, upload
+from ftl_lightning.learning.hub import download, save_with_card, upload
 from ftl_lightning.learning.longer import longer_than_plans
-from ftl_lightning.learning.model_folder import save_model
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
 from ftl_lightning.ranges import LARGEST_STEP
 from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.representation import Shown
-from ftl_lightning.seeding import EVALUATION_SEED, generator
+from ftl_lightning.seeding import EVALUATION_SEED
 from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped_models
-from ftl_lightning.tensor_file import atomic
 from ftl_lightning.trust import vouching
 from ftl_lightning.tuned import Tuned, settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, repr=False)
-class LearnedConcept(Composition):
-    """A learned concept; it composes with others like any composition.
-
-    Attributes:
-        concept: embeddings, weights and where they come from.
-        model: it was learned through.
-    """
-
-    concept: Concept
-    model: ConceptModel
-
-    def _words(self) -> Iterator[str]:
-        return self.concept._words()
-
-    def explain(self, nearest: int = 3) -> Explanation:
-        """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""
-        expect_whole("nearest", nearest, 1)
-        embedding = self.concept.weighted_sum.mean(dim=0)
-        return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
-
-    def save(self, path: str | Path) -> None:
-        """Write it to a file that every command reads."""
-        self.concept.save(path)
 
 
 GIVEN = {
@@ -193,7 +167,7 @@ class FewShot(Shown):
         parts = [self._part(part) for part in parse_composition(text)]
         if not parts:
             raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
-        return _sum(parts)
+        return functools.reduce(operator.add, parts)
 
     def _part(self, part: Part) -> Composition:
         found = part.weight * (self.load(part.concept) if part.concept.endswith(".safetensors") else self[part.concept])
@@ -205,28 +179,8 @@ class FewShot(Shown):
         return LearnedConcept(**parts | {"space": self._space}, concept=concept, model=self.model)
 
     def _own(self, call: str, concept: object) -> Composition:
-        """A concept of this model, on its device.
-
-        Raises:
-            UserError: for one of another model, or what is no concept.
-        """
-        if not isinstance(concept, Composition):
-            text = short(self.training_concepts[0], 40)
-            raise UserError(
-                f"{call}: expected a concept, such as model[{text!r}], model.compose(text), model.load(path) or what model.learn "
-                f"returns, found {shown(concept)}"
-            )
-        if concept.space not in ("", self._space):
-            raise UserError(
-                f"{call}: expected a concept of this model, {self._space}, found one of {concept.space}; learn it with this model"
-            )
-        n = self.model.config.concept_dim
-        if concept.embeddings.dim() != 3 or concept.embeddings.shape[2] != n:
-            raise UserError(
-                f"{call}: expected a concept of this model, {self._space}, with embeddings (K, knots, {n}), "
-                f"found {tuple(concept.embeddings.shape)}"
-            )
-        return concept if concept.weights.device == self.device else concept.to(self.device)
+        """A concept of this model, on its device."""
+        return concept_of(self.model, self._space, call, concept)
 
     def demonstrations(
         self,
@@ -371,11 +325,7 @@ class FewShot(Shown):
             UserError: for plans of another domain, a goal that the domain cannot judge by, or a domain that judges no plans.
         """
         expect_of_domain("evaluate", plans, self.domain)
-        if not self._judging.metrics:
-            raise UserError(f"evaluate: expected a domain that judges plans, found {self.domain.name}; execute them")
-        self._judging.expect_goal(goal)
-        found = self._judging.measure(goal, plans.states, plans.initial_states)
-        return {name: float(values.float().mean()) for name, values in found.items()}
+        return judged(self._judging, plans, goal)
 
     @property
     def _judging(self) -> Domain:
@@ -391,12 +341,7 @@ class FewShot(Shown):
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """A picture of plans; with a goal, right ones are framed green and wrong ones red."""
         expect_of_domain("render", plans, self.domain)
-        starts, right = plans.initial_states, None
-        if goal:
-            self._judging.expect_goal(goal)
-            judged = self._judging.measure(goal, plans.states, starts).values()
-            right = next((one.tolist() for one in judged if one.dtype == torch.bool and one.dim()), None)
-        return self.domain.show.picture(plans.states, right, goal or "samples", starts if self.domain.observed else None)
+        return picture(self._judging, plans, goal)
 
     def execute(
         self,
@@ -423,8 +368,6 @@ class FewShot(Shown):
         Raises:
             UserError: for a concept of another model; in a domain without an environment, or without one of this name.
         """
-        from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, reset, roll_out, sampled_plans
-
         loop = closed_loop_of(self.domain)
         if environment and environment not in loop.others:
             raise UserError(f"environment: expected {' or '.join(loop.others) or 'none'}, found {shown(environment)}")
@@ -432,25 +375,15 @@ class FewShot(Shown):
         if goal:
             self._judging.expect_goal(goal)
         every = self.tuned.replan if replan is None else expect_whole("replan", replan, 1)
-        concept, sampling, seed = (
-            self._own("execute", concept),
-            self._sampling("execute", changes),
-            expect_whole("seed", seed, 0, None),
-        )
+        concept, sampling = self._own("execute", concept), self._sampling("execute", changes)
+        seed = expect_whole("seed", seed, 0, None)
         starts = scenes if isinstance(scenes, InitialStates) else reset(loop, scenes_of(scenes))
-        draws = [generator("cpu", seed, 1, episode) for episode in range(len(starts))]
-        make = sampled_plans(self.model, [concept] * len(starts), sampling, draws)
-        policy = PlanFollower(make, planner(self.model, loop), every)
-        rollout = roll_out(loop, starts, policy)
-        return Execution(self.domain, goal, rollout, policy.followed)
+        rollout, followed = episodes(self.model, loop, concept, starts, sampling, every, seed)
+        return Execution(self.domain, goal, rollout, followed)
 
     def save_pretrained(self, folder: str | Path) -> None:
         """Write ``config.json``, ``model.safetensors`` and, if there is none yet, a ``README.md`` to a folder."""
-        folder = Path(folder)
-        save_model(self.model, folder)
-        if not (card := folder / "README.md").is_file():
-            with atomic(card) as temporary:
-                temporary.write_text(model_card(self.model), encoding="utf-8")
+        save_with_card(self.model, Path(folder))
 
     def push_to_hub(self, repository: str, private: bool = False) -> str:
         """Upload the model to the Hugging Face Hub as ``owner/name``; needs a network and a login.
@@ -461,10 +394,3 @@ class FewShot(Shown):
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder)
             return upload(folder, repository, private)
-
-
-def _sum(parts: Iterable[Composition]) -> Composition:
-    first, *rest = parts
-    for part in rest:
-        first = first + part
-    return first

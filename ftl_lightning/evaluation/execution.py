@@ -9,12 +9,47 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.domain import Domain, closed_loop_of
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.domain import ClosedLoop, Domain, closed_loop_of
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
+from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
+from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.representation import Shown, counted
+from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import atomic
+
+
+def episodes(
+    model: ConceptModel,
+    loop: ClosedLoop,
+    concept: Composition,
+    starts: InitialStates,
+    sampling: Sampling,
+    replan: int,
+    seed: int,
+) -> tuple[Rollout, Mapping[int, Sequence[Tensor]]]:
+    """Execute a concept from some scenes.
+
+    Args:
+        model: makes the plans.
+        loop: the environment.
+        concept: ``(K, ...)``.
+        starts: initial states with scenes, one for each episode.
+        sampling: sampler, steps and temperature.
+        replan: steps that a plan is followed before a new one is made.
+        seed: of the noise.
+
+    Returns:
+        What happened, and for each episode the plan ``(horizon, state)`` of each of its steps.
+    """
+    draws = [generator("cpu", seed, 1, episode) for episode in range(len(starts))]
+    make = sampled_plans(model, [concept] * len(starts), sampling, draws)
+    policy = PlanFollower(make, planner(model, loop), replan)
+    return roll_out(loop, starts, policy), policy.followed
 
 
 @dataclass(frozen=True, repr=False)

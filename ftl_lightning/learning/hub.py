@@ -5,6 +5,8 @@ from pathlib import Path
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import CONFIG
+from ftl_lightning.learning.model_folder import save_model
+from ftl_lightning.tensor_file import atomic
 
 
 def download(repository: str) -> Path:
@@ -45,3 +47,11 @@ def card(model: ConceptModel) -> str:
         f'    from ftl_lightning import FewShot\n    model = FewShot.from_pretrained("FOLDER OR NAME")\n\n'
         f"Files: `{CONFIG}`, `model.safetensors` (weights in half precision).\n"
     )
+
+
+def save_with_card(model: ConceptModel, folder: Path) -> None:
+    """Write a model's folder and, if there is none yet, a ``README.md`` into it."""
+    save_model(model, folder)
+    if not (readme := folder / "README.md").is_file():
+        with atomic(readme) as temporary:
+            temporary.write_text(card(model), encoding="utf-8")

@@ -76,7 +76,8 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
     with about(path):
         if examples is not None:
             domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
-        assert domain is not None
+        elif domain is None:
+            domain = domain_of_file(config.domain)
         expect_domain(config, domain)
         # First on paper: a file of a few bytes can name sizes that no memory holds.
         with torch.device("meta"), at_most(sum(value.numel() for value in tensors.values())):

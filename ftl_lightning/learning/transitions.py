@@ -54,16 +54,15 @@ def expect_window(config: StepConfig, data: PretrainingData) -> None:
         raise UserError(f"data.horizon: expected {config.window} (states that a transition spans), found {data.horizon}")
 
 
-def unroll(model: ConceptModel, predict: Callable[[Tensor | None], Tensor], observed: Observed) -> Tensor:
+def unroll(model: ConceptModel, config: StepConfig, predict: Callable[[Tensor | None], Tensor], observed: Observed) -> Tensor:
     """Plans ``(batch, horizon, state)`` in the domain's units.
 
     Args:
-        model: whose transitions they are; its configuration is a :class:`StepConfig`.
+        model: whose transitions they are.
+        config: the model's.
         predict: ``observed vectors as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
         observed: features ``(batch, *shape)`` by name, in the domain's units.
     """
-    config = model.config
-    assert isinstance(config, StepConfig)
     images = model.of_images(observed)  # those of the start: what follows is imagined, and no picture shows it
     first = model.decode(predict(model.vector(observed, images)), observed)
     if config.horizon == 1 or (config.horizon, config.stride) == (2, 1):

@@ -114,4 +114,4 @@ class CloningModel(AdditiveModel, TextConceptModel):
         def predict(vector: Tensor | None) -> Tensor:
             return self.predict(None if vector is None else vector[None], condition[None])[member, rows]
 
-        return unroll(self, predict, observed or {}).unflatten(0, (len(compositions), count))
+        return unroll(self, self.config, predict, observed or {}).unflatten(0, (len(compositions), count))

@@ -173,4 +173,4 @@ class InContextModel(ConceptModel):
             following = middles[logits.argmax(dim=-1)].flatten(0, 1)
             return torch.stack((self.start.expand_as(following), following), dim=1)
 
-        return unroll(self, predict, observed or {}).unflatten(0, (len(compositions), count))
+        return unroll(self, self.config, predict, observed or {}).unflatten(0, (len(compositions), count))

@@ -1,0 +1,39 @@
+"""Plans judged and drawn, for the Python API."""
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:
+    """What the domain's metrics say of plans: shares of right ones, or means, by name.
+
+    Raises:
+        UserError: for a goal that the domain cannot judge by, or a domain that judges no plans.
+    """
+    if not domain.metrics:
+        raise UserError(f"evaluate: expected a domain that judges plans, found {domain.name}; execute them")
+    domain.expect_goal(goal)
+    measured = domain.measure(goal, plans.states, plans.initial_states)
+    return {name: float(values.float().mean()) for name, values in measured.items()}
+
+
+def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
+    """A picture of plans; with a goal, right ones are framed green and wrong ones red.
+
+    Raises:
+        UserError: for a goal that the domain cannot judge by.
+    """
+    starts, right = plans.initial_states, None
+    if goal:
+        domain.expect_goal(goal)
+        measured = domain.measure(goal, plans.states, starts).values()
+        right = next((values.tolist() for values in measured if values.dtype == torch.bool and values.dim()), None)
+    return domain.show.picture(plans.states, right, goal or "samples", starts if domain.observed else None)

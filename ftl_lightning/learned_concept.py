@@ -1,0 +1,69 @@
+"""A learned concept as a user of the Python API holds it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ftl_lightning.arguments import expect_whole
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.explanation import Explanation, explain
+from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.learning.concept_model import ConceptModel
+
+
+@dataclass(frozen=True, repr=False)
+class LearnedConcept(Composition):
+    """A learned concept; it composes with others like any composition.
+
+    Attributes:
+        concept: embeddings, weights and where they come from.
+        model: it was learned through.
+    """
+
+    concept: Concept
+    model: ConceptModel
+
+    def _words(self) -> Iterator[str]:
+        return self.concept._words()
+
+    def explain(self, nearest: int = 3) -> Explanation:
+        """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""
+        expect_whole("nearest", nearest, 1)
+        embedding = self.concept.weighted_sum.mean(dim=0)
+        return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a file that every command reads."""
+        self.concept.save(path)
+
+
+def concept_of(model: ConceptModel, space: str, call: str, concept: object) -> Composition:
+    """A concept of a model, on the model's device.
+
+    Args:
+        model: that is to use it.
+        space: whose concepts the model's are, see :func:`~ftl_lightning.concepts.composition.space_of`.
+        call: what it is given to, such as ``'sample'``.
+        concept: what was given.
+
+    Raises:
+        UserError: for one of another model, or what is no concept.
+    """
+    if not isinstance(concept, Composition):
+        text = short(model.config.training_concepts[0], 40)
+        raise UserError(
+            f"{call}: expected a concept, such as model[{text!r}], model.compose(text), model.load(path) or what model.learn "
+            f"returns, found {shown(concept)}"
+        )
+    if concept.space not in ("", space):
+        raise UserError(
+            f"{call}: expected a concept of this model, {space}, found one of {concept.space}; learn it with this model"
+        )
+    n = model.config.concept_dim
+    if concept.embeddings.dim() != 3 or concept.embeddings.shape[2] != n:
+        raise UserError(
+            f"{call}: expected a concept of this model, {space}, with embeddings (K, knots, {n}), "
+            f"found {tuple(concept.embeddings.shape)}"
+        )
+    return concept if concept.weights.device == model.device else concept.to(model.device)
