@@ -28,7 +28,7 @@ from ftl_lightning.domains.mocap.skeleton import (
     mirrored,
 )
 from ftl_lightning.domains.mocap.standing import standing_poses
-from ftl_lightning.domains.mocap.tasks import AND, TRAINING_CONCEPTS
+from ftl_lightning.domains.mocap.tasks import ACTION_OF, AND, TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import save_tensors
@@ -88,6 +88,7 @@ def test_texts_name_one_action_each() -> None:
     assert action("run, leap") is None, "two actions, one after the other"
     assert sum(judged(text) for text in TRAINING_CONCEPTS) > 60
     assert all(action(name) == name for name in CLASSES if name != OTHER)
+    assert {name for name in ACTION_OF.values() if name} <= set(CLASSES)
     assert not judged(OTHER)
 
 
