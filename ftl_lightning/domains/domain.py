@@ -236,7 +236,7 @@ class ClosedLoop:
 
 @dataclass(frozen=True)
 class View:
-    """How a model sees behaviour, where it is not as it stands in files.
+    """How a model sees behaviour, where this differs from what files hold.
 
     Attributes:
         features: the features that the model observes, by name.

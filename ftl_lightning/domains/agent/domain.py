@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows of navigation."""
+"""The domain object: what the rest of the package knows about navigation."""
 
 from collections.abc import Callable
 from pathlib import Path

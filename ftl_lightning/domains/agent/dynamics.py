@@ -8,7 +8,7 @@ STEP = 0.05
 SUBSTEPS = 6
 MAX_STEPS = 128
 LOOKAHEAD = 5
-"""An action is the way to where a plan is so many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
+"""An action is the displacement to the plan's state this many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
 DRAG = 16.0
 """The rate per second at which the agent's speed decays: so fast that pulling towards a point does not overshoot it."""
 MASS = LOOKAHEAD * STEP / DRAG
@@ -19,7 +19,7 @@ MAX_FORCE = 0.2
 RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
 """Of the bodies' footprints, metres; half the edge of a cube."""
 MARGIN = 0.001
-"""Metres. The simulator keeps a cone so far above what it stands on; the ground lies so much lower, else the agent would hop."""
+"""Metres. The simulator keeps a cone this far above the ground, so the ground is this much lower; otherwise the agent would hop."""
 
 
 def expect_simulator() -> None:

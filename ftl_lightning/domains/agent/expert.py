@@ -20,9 +20,9 @@ LENGTH = 150
 SPEED = 0.4
 """m/s of the expert's reference point along its route."""
 KEEP_CLEAR = 0.5
-"""The route keeps at least so far from the distractor's centre, metres."""
+"""Least distance of the route from the distractor's centre, metres."""
 STOP = 0.26
-"""The route ends so far before the target's centre, metres: just before the bodies touch."""
+"""Distance from the end of the route to the target's centre, metres: just before the bodies touch."""
 AT_REST = 0.02
 """m/s below which the agent has stopped."""
 
@@ -45,7 +45,7 @@ def route(start: Plane, target: Plane, distractor: Plane) -> Plane:
 
 
 def along(corners: Plane, distance: float) -> Plane:
-    """The point ``(2,)`` so many metres along a polyline; its end beyond that."""
+    """The point ``(2,)`` at a distance in metres along a polyline; its end if it is shorter."""
     for here, there in itertools.pairwise(corners):
         length = float(np.linalg.norm(there - here))
         if distance <= length:

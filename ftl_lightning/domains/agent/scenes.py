@@ -60,7 +60,7 @@ TRAINING_GROUPS = (
     tuple(itertools.product(("red", "yellow"), ("cone", "sphere"))),
     tuple(itertools.product(("purple", "green"), ("bowl", "cube"))),
 )
-"""Looks (colour, shape) of the objects of pretraining; the two objects of a training scene are of one group (paper)."""
+"""Colour and shape of the objects of pretraining; the two objects of a training scene belong to one group (paper)."""
 _TRAINING_LOOKS = tuple(itertools.chain(*TRAINING_GROUPS))
 
 Look = tuple[str, str]

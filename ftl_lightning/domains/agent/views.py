@@ -1,4 +1,4 @@
-"""How a model may see a drive: as it stands in files, or in steps."""
+"""Views of a drive: states as in files, or changes from one state to the next (``steps``)."""
 
 import itertools
 
@@ -22,4 +22,4 @@ def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
 
 
 VIEWS = {"steps": View({OBSERVED: FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps)}
-"""In ``steps`` methods that go from one state to the next need not copy the state, of which a step changes a hundredth."""
+"""With ``steps``, methods that predict one state after another need not copy the state, of which a step changes a hundredth."""

@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows of driving."""
+"""The domain object: what the rest of the package knows about driving."""
 
 from dataclasses import asdict
 from functools import partial

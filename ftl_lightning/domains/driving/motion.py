@@ -1,4 +1,4 @@
-"""What happens between two states of a vehicle ``(..., 7)``, in its own terms: the same numbers on any road."""
+"""Motion between two states of a vehicle ``(..., 7)``, relative to the vehicle: the same numbers on any road."""
 
 import torch
 from torch import Tensor

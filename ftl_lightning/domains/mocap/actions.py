@@ -7,7 +7,7 @@ The texts are descriptions of the CMU motion capture database, whose actions sta
 from ftl_lightning.domains.mocap.tasks import ACTION_OF, cleaned, goal_parts
 
 OTHER = "other"
-"""None of the actions: what one person did once, people who stand still, and what is no motion (a frozen frame, trembling)."""
+"""None of the actions: what one person did once, people who stand still, and windows without motion (a frozen frame, trembling)."""
 
 _NAMES = (
     "walk",
@@ -48,7 +48,7 @@ STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")
 STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")
 """Actions of the legs, whatever the arms do."""
 REVERSIBLE = ("jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch")
-"""Actions that go to and fro: backwards in time they are the same."""
+"""Periodic actions: played backwards they are the same action."""
 LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)
 """What a judge tells apart by the legs alone."""
 

@@ -24,7 +24,7 @@ _SIDEWAYS = (-1.0, 1.0, 1.0)
 
 
 def bones(joints: Tensor) -> Tensor:
-    """Each joint ``(..., 14, 3)`` seen from the one that it hangs on."""
+    """Each joint ``(..., 14, 3)`` relative to its parent."""
     origin = torch.zeros_like(joints[..., 0, :])
     base = [joints[..., PARENT[joint], :] if joint in PARENT else origin for joint in range(JOINTS)]
     return joints - torch.stack(base, dim=-2)
@@ -99,7 +99,7 @@ def _of_course(values: Tensor) -> Tensor:
 
 
 def _sides(right: Tensor, left: Tensor) -> list[Tensor]:
-    """The same of both sides, so that a mirror image has the same: mean and difference."""
+    """Mean and difference of both sides, which are the same for the mirror image."""
     return [(right + left) / 2, (right - left).abs()]
 
 
@@ -114,14 +114,14 @@ def _spread(values: Tensor) -> Tensor:
 
 
 def _together(one: Tensor, other: Tensor) -> Tensor:
-    """How much two courses ``(sample, frame)`` go together: ``(sample, 1)`` from -1 to 1, towards 0 where they hardly change."""
+    """Correlation of two trajectories ``(sample, frame)``: ``(sample, 1)`` from -1 to 1, near 0 where they hardly change."""
     one, other = (values - values.mean(dim=1, keepdim=True) for values in (one, other))
     lengths = torch.linalg.vector_norm(one, dim=1) * torch.linalg.vector_norm(other, dim=1)
     return ((one * other).sum(dim=1) / (lengths + 0.05))[:, None]
 
 
 def _alike(where: Tensor, right: int, left: int) -> list[Tensor]:
-    """How much two joints of both sides go together: sideways, forwards, upwards, in speed."""
+    """Correlation of a right and a left joint: sideways, forwards, upwards, in speed."""
     speed = torch.linalg.vector_norm(torch.diff(where, dim=1), dim=-1)
     return [
         _together(-where[:, :, right, 0], where[:, :, left, 0]),
@@ -194,7 +194,7 @@ def _ways_together(where: Tensor, one: tuple[int, int], other: tuple[int, int], 
 
 
 def _arms_and_legs(where: Tensor) -> list[Tensor]:
-    """How arms and legs go together, of the same and of the other side."""
+    """Correlation of arms and legs, of the same and of opposite sides."""
     found = [_together(where[:, :, [RW, LW], 2].mean(dim=-1), (where[:, :, RA, 0] - where[:, :, LA, 0]).abs())]
     for one, other in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA)), ((RW, RK), (LW, LK)), ((RW, LK), (LW, RK))):
         found += _distances(where, one, other)
@@ -203,7 +203,7 @@ def _arms_and_legs(where: Tensor) -> list[Tensor]:
 
 
 def summary(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Numbers of the whole window for a linear recogniser, the same for its mirror image: ``(sample, feature)``.
+    """Features of the whole window for a linear classifier, the same for its mirror image: ``(sample, feature)``.
 
     Args:
         states: windows ``(sample, frame, 42)``.
@@ -264,7 +264,7 @@ def _pair_together(values: Tensor) -> Tensor:
 
 
 def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Fewer numbers of the whole window for a second linear recogniser, the same for its mirror image: ``(sample, feature)``.
+    """Fewer features of the whole window for a second linear classifier, the same for its mirror image: ``(sample, feature)``.
 
     How high, how far, how bent, how fast joints get, on the side that does more and on the one that does less.
 

@@ -124,7 +124,7 @@ def mirrored_text(text: str) -> str:
 
 
 def goal_parts(goal: str) -> tuple[str, ...]:
-    """The concepts that a goal asks for, of which most ask for one."""
+    """The concepts of a goal, mostly one."""
     return tuple(goal.split(AND))
 
 

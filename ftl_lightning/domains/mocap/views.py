@@ -11,7 +11,7 @@ from ftl_lightning.domains.mocap.skeleton import L_HIP, R_HIP, RIGID, as_joints
 from ftl_lightning.domains.mocap.source import OBSERVED, POSE
 
 SHORTEST = 1e-3
-"""Metres: a bone that is generated shorter has no direction, and stays as it is."""
+"""Metres: a generated bone shorter than this has no direction and is not changed."""
 
 
 def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:

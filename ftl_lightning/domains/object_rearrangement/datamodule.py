@@ -4,7 +4,7 @@ from ftl_lightning.domains.data import PretrainingData
 
 
 class ObjectRearrangementData(PretrainingData):
-    """Scenes of the twelve training concepts, drawn anew from the seed (half a second).
+    """Scenes of the twelve training concepts, drawn from the seed for each run (half a second).
 
     920 samples of each concept give the paper's ~11,000 scenes.
     """

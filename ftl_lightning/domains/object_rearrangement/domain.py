@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows of object rearrangement."""
+"""The domain object: what the rest of the package knows about object rearrangement."""
 
 from pathlib import Path
 

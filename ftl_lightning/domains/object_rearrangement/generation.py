@@ -127,7 +127,7 @@ def _uniform_scenes(rng: np.random.Generator, count: int) -> NDArray[np.float32]
 
 
 def random_scenes(count: int, seed: int) -> Tensor:
-    """The same as states ``(count, 21)``: a reference line, what a policy that knows nothing of the task reaches."""
+    """The same as states ``(count, 21)``: a reference line, the result of a policy that does not use the task."""
     return _flat(_uniform_scenes(np.random.default_rng(seed), count))
 
 
