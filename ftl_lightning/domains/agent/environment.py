@@ -30,7 +30,7 @@ STEP = 0.05
 SUBSTEPS = 6
 MAX_STEPS = 128
 LOOKAHEAD = 5
-"""An action is the displacement to the plan's state this many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
+"""An action is the way to where a plan is so many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
 DRAG = 16.0
 """The rate per second at which the agent's speed decays: so fast that pulling towards a point does not overshoot it."""
 MASS = LOOKAHEAD * STEP / DRAG
@@ -44,7 +44,7 @@ BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]
 """Half the size of the floor that is drawn."""
 MARGIN = 0.001
-"""Metres. The simulator keeps a cone this far above the ground, so the ground is this much lower; otherwise the agent would hop."""
+"""Metres. The simulator keeps a cone so far above what it stands on; the ground lies so much lower, else the agent would hop."""
 IMAGE = (200, 320)
 """Height and width of a rendered picture."""
 
