@@ -46,6 +46,8 @@ def _type(annotation: ast.expr) -> str:
             return " or ".join(f"`{ast.unparse(value)}`" for value in values)
         case ast.Name(id="Distance"):
             return "function"
+        case ast.Constant(value=str(quoted)):
+            return _type(ast.parse(quoted, mode="eval").body)
     return f"`{ast.unparse(annotation)}`"
 
 
@@ -54,7 +56,7 @@ def _default(field: "dataclasses.Field[object]") -> str:
         return f"`{field.default_factory()!r}`"
     if field.default is dataclasses.MISSING:
         return "required"
-    return "the goal itself" if field.default is str else f"`{field.default!r}`"
+    return "a function" if callable(field.default) else f"`{field.default!r}`"
 
 
 def table(described: type) -> str:

@@ -280,7 +280,7 @@ class Domain(Shown):
         observed: features that a plan is conditioned on, by name; empty where plans have no initial state.
         metrics: how plans are judged in open loop, by name; the first is the one that ablations report. Empty where behaviour is
             judged in closed loop only.
-        ours: the name under which results hold the form of our method that is compared with others; by default the paper's method.
+        ours: our method in the form that others are compared with; the paper's by default.
         headline: what methods are compared by: the name of a metric, or ``'closed loop '`` and an outcome.
         references: reference lines (trivial policies and oracles) by name: ``(goal, samples, initial states or None, seed) ->
             states (sample, horizon, state)``.
