@@ -173,7 +173,7 @@ class Composition(Shown):
     def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
         """What ``count`` samples are generated from: a composition ``(row, K, ...)``, and each sample's row ``(count,)``.
 
-        Nothing is drawn from the generator where there are no modes.
+        Where there are no modes the generator stays as it is.
         """
         if self.modes is None:
             embeddings, weights = self.embeddings[None], self.weights[None]
@@ -251,9 +251,9 @@ def batched(compositions: Sequence[Composition], count: int, generators: Sequenc
     drawn, numbers, rows, first = [], [], [], 0
     for composition, draw in zip(compositions, generators, strict=True):
         part, row = composition.draw(count, draw)
-        together = torch.tensor([0, *(1 + adapters.index(adapter) for adapter in part.adapters)], device=part.weights.device)
+        renumbered = torch.tensor([0, *(1 + adapters.index(adapter) for adapter in part.adapters)], device=part.weights.device)
         drawn.append(part)
-        numbers.append(together[part.adapter_number])
+        numbers.append(renumbered[part.adapter_number])
         rows.append(first + row)
         first += len(part.weights)
 

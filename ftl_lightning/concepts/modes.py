@@ -48,9 +48,9 @@ class Modes(Shown):
         is.
         """
 
-        def paired(own: Tensor, others: Tensor) -> Tensor:
-            outer = own.repeat_interleave(len(others), dim=0)
-            inner = others.repeat(len(own), *(1,) * (others.dim() - 1))
+        def paired(first: Tensor, second: Tensor) -> Tensor:
+            outer = first.repeat_interleave(len(second), dim=0)
+            inner = second.repeat(len(first), *(1,) * (second.dim() - 1))
             return torch.cat((outer, inner), dim=1)
 
         embeddings, weights = paired(self.embeddings, other.embeddings), paired(self.weights, other.weights)
