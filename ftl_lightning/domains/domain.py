@@ -224,7 +224,7 @@ class ClosedLoop:
     policies: Mapping[str, Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]] = field(default_factory=dict)
 
     def inside(self, name: str) -> Self:
-        """The same in another environment; in its own for the empty name."""
+        """How plans are executed in another environment; in the domain's own for the empty name."""
         return replace(self, environment=self.others[name]) if name else self
 
 

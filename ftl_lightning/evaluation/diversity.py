@@ -135,9 +135,9 @@ class Real:
         starts = behaviour.initial_states if self.domain.observed else None
         return self.added(Judged.of(self.task, self._windows(behaviour), starts, self.domain))
 
-    def added(self, one: Judged) -> Judged:
-        """The same with its novelty and coverage."""
-        return one.compared(self.values(one.states))
+    def added(self, judged: Judged) -> Judged:
+        """Generated behaviour of the task with its novelty and coverage."""
+        return judged.compared(self.values(judged.states))
 
 
 def novelty(distances: Tensor) -> float:
@@ -168,9 +168,9 @@ def real_behaviour(
     """
     behaviour = []
     with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
-        for one in judged:
-            known = demonstrations_of(one.task, demonstrated)
-            behaviour.append(Real.of(one.task, domain, len(one.states), known, root, seed))
+        for generated in judged:
+            known = demonstrations_of(generated.task, demonstrated)
+            behaviour.append(Real.of(generated.task, domain, len(generated.states), known, root, seed))
             advance()
     return behaviour
 

@@ -86,12 +86,12 @@ def share(values: Tensor) -> float:
     return float(metric.compute())
 
 
-def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
-    """In which episodes ``(sample,)`` one succeeds and a policy, from the same initial state, does not, and the reverse.
+def paired(method: Judged, reference: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
+    """In which episodes ``(sample,)`` a method succeeds and a policy, from the same initial state, does not, and the reverse.
 
     Args:
-        one: what a method did.
-        other: what the policy did.
+        method: what a method did.
+        reference: what the policy did.
         policy: its name.
         domain: whose headline decides, if it is an outcome, else success.
 
@@ -100,12 +100,12 @@ def paired(one: Judged, other: Judged, policy: str, domain: Domain) -> dict[str,
     """
     name = domain.headline.removeprefix(f"{CLOSED} ")
     compared = name if name != domain.headline else SUCCESS
-    found: dict[str, Tensor] = {}
-    for place, ours in one.outcomes.items():
-        if place in other.outcomes and (place == compared or place.startswith(f"{compared} (")):
-            theirs, named = other.outcomes[place], f"{policy}{place.removeprefix(compared)}"
-            found |= {f"{WON}{named}": ours & ~theirs, f"{LOST}{named}": theirs & ~ours}
-    return found
+    episodes: dict[str, Tensor] = {}
+    for place, ours in method.outcomes.items():
+        if place in reference.outcomes and (place == compared or place.startswith(f"{compared} (")):
+            theirs, named = reference.outcomes[place], f"{policy}{place.removeprefix(compared)}"
+            episodes |= {f"{WON}{named}": ours & ~theirs, f"{LOST}{named}": theirs & ~ours}
+    return episodes
 
 
 def standard_error(values: Sequence[float]) -> float:
@@ -121,6 +121,6 @@ def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environme
         UserError: for a domain without an environment.
     """
     loop = closed_loop_of(domain).inside(environment)
-    starts = join([one.starts for one in judged if one.starts is not None])
-    parts = roll_out(loop, starts, policy).split([len(one.states) for one in judged])
-    return [one.executed(part, domain, environment) for one, part in zip(judged, parts, strict=True)]
+    starts = join([behaviour.starts for behaviour in judged if behaviour.starts is not None])
+    parts = roll_out(loop, starts, policy).split([len(behaviour.states) for behaviour in judged])
+    return [behaviour.executed(part, domain, environment) for behaviour, part in zip(judged, parts, strict=True)]

@@ -33,27 +33,31 @@ def references(
         seed: of the policies.
         environments: of the domain's others, in which the method's was executed besides its own.
     """
-    loop = None if all(one.rollout is None for one in judged) else domain.closed_loop
-    lines = {name: [_planned(name, one, domain, loop, seed, environments) for one in judged] for name in domain.references}
+    loop = None if all(generated.rollout is None for generated in judged) else domain.closed_loop
+    lines = {
+        name: [_planned(name, generated, domain, loop, seed, environments) for generated in judged] for name in domain.references
+    }
     if loop is not None:
         for name in loop.policies:
-            acted = (_acted(name, one, domain, loop, demonstrated, seed, environments) for one in judged)
-            lines[name] = [one for one in acted if one is not None]
+            acted = (_acted(name, generated, domain, loop, demonstrated, seed, environments) for generated in judged)
+            lines[name] = [generated for generated in acted if generated is not None]
     return lines
 
 
-def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
+def _planned(
+    name: str, generated: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]
+) -> Judged:
     """A policy that makes its plan once."""
-    key = (name, domain.name, one.task.goal, len(one.states), _hash(one.starts), seed)
+    key = (name, domain.name, generated.task.goal, len(generated.states), _hash(generated.starts), seed)
     if key not in _KNOWN:
-        _KNOWN[key] = domain.references[name](one.task.goal, len(one.states), one.starts, seed)
+        _KNOWN[key] = domain.references[name](generated.task.goal, len(generated.states), generated.starts, seed)
     plans = _KNOWN[key]
-    if (expected := (len(one.states), domain.plans.horizon, one.states.shape[2])) != tuple(plans.shape):
+    if (expected := (len(generated.states), domain.plans.horizon, generated.states.shape[2])) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")
-    planned = Judged.of(one.task, plans, one.starts, domain)
+    planned = Judged.of(generated.task, plans, generated.starts, domain)
     if loop is None:
         return planned
-    starts = expect_starts(one.starts)
+    starts = expect_starts(generated.starts)
     for place in ("", *environments):
         if (*key, "executed", place) not in _KNOWN:
             follower = PlanFollower(fixed_plans(plans), loop.act, loop.steps)
@@ -64,7 +68,7 @@ def _planned(name: str, one: Judged, domain: Domain, loop: ClosedLoop | None, se
 
 def _acted(
     name: str,
-    one: Judged,
+    generated: Judged,
     domain: Domain,
     loop: ClosedLoop,
     demonstrated: Callable[[str], Demonstrations | None],
@@ -72,18 +76,19 @@ def _acted(
     environments: Sequence[str],
 ) -> Judged | None:
     """A policy that acts as it goes; ``None`` where it would take too long."""
-    starts = expect_starts(one.starts)
-    known = demonstrations_of(one.task, demonstrated)
+    starts = expect_starts(generated.starts)
+    known = demonstrations_of(generated.task, demonstrated)
+    acted = generated
     for place in ("", *environments):
-        key = (name, domain.name, one.task.goal, known.hash if known else "", _hash(starts), seed, place)
+        key = (name, domain.name, generated.task.goal, known.hash if known else "", _hash(starts), seed, place)
         if key not in _KNOWN:
-            policy = loop.policies[name](one.task.goal, starts, known, seed)
+            policy = loop.policies[name](generated.task.goal, starts, known, seed)
             _KNOWN[key] = policy and roll_out(loop.inside(place), starts, policy)
         rollout: Rollout | None = _KNOWN[key]
         if rollout is None:
             return None
-        one = one.executed(rollout, domain, place)
-    return one
+        acted = acted.executed(rollout, domain, place)
+    return acted
 
 
 def _hash(starts: InitialStates | None) -> str:
