@@ -9,22 +9,19 @@ kinds, says what they are. Reference lines: fresh strokes of the generator, and 
 
 import argparse
 import json
-import sys
 import tempfile
 from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 
+from ftl_lightning.cli import main as ftl_lightning
+from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.adaptation import file_name
+from ftl_lightning.tensor_file import write_text
+from ftl_lightning.testing.strokes import NEW, TRAINING, recognised, strokes
+
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
-
-from ftl_lightning.cli import main as ftl_lightning  # noqa: E402
-from ftl_lightning.few_shot import FewShot  # noqa: E402
-from ftl_lightning.learning.adaptation import file_name  # noqa: E402
-from ftl_lightning.tensor_file import write_text  # noqa: E402
-from tests.strokes import NEW, TRAINING, recognised, strokes  # noqa: E402
-
 SAMPLES, FEW, PRETRAINING = 50, 5, 100
 """Strokes that are judged, learned from, and pretrained on, of each kind."""
 MODEL = "logs/own/fit/pretrained"

@@ -75,7 +75,7 @@ def take(observed: Observed, rows: Tensor | Sequence[int] | slice | int) -> dict
 
 
 def moved(observed: Observed, device: torch.device) -> dict[str, Tensor]:
-    """The same on a device."""
+    """Observed features on a device."""
     return {name: values.to(device) for name, values in observed.items()}
 
 
@@ -147,6 +147,6 @@ def expect_starts(starts: InitialStates | None) -> InitialStates:
 
 
 def join(parts: Sequence[InitialStates]) -> InitialStates:
-    """Several one after another."""
+    """Initial states of several batches one after another."""
     scenes = [part.scenes for part in parts if part.scenes is not None]
     return InitialStates(joined([part.observed for part in parts]), torch.cat(scenes) if scenes else None)

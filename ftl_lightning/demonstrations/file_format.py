@@ -28,7 +28,7 @@ INITIAL = "initial_state"
 class Contents(TypedDict):
     """What a file says, by the attributes of :class:`~ftl_lightning.demonstrations.container.Demonstrations`.
 
-    Types are as there; whether shapes and values fit each other is not yet known.
+    Types are as annotated here; whether shapes and values fit each other is known once the container is made.
     """
 
     states: Tensor

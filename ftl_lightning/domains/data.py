@@ -5,8 +5,9 @@ the step's number alone, so a run that is killed and resumed goes on exactly as 
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import lightning.pytorch as pl
 import torch
@@ -54,6 +55,23 @@ class Steps(IterableDataset[int]):
         return iter(range(start, start + self.length - start % self.length))
 
 
+@dataclass(frozen=True)
+class Windows:
+    """Which windows of demonstrations a step of pretraining sees.
+
+    Attributes:
+        horizon: states in a window; ``None`` for the domain's plans.
+        start_exponent: exponent u of the windows' starts, ``start = length * share^u``: 1 is uniform, with 3 half of the windows
+            start in the first eighth of a demonstration. ``None`` for the domain's where windows are as long as plans, else 1.
+        balance: exponent with which concepts are drawn by their number of states: 1 draws every state alike, 0 every concept, 0.5
+            by the square root; of a concept, demonstrations are drawn by their length. ``None`` to draw demonstrations alike.
+    """
+
+    horizon: int | None = None
+    start_exponent: float | None = None
+    balance: float | None = None
+
+
 class PretrainingData(pl.LightningDataModule):
     """Batches of (behaviour, concept) pairs of a domain. A subclass may name the domain.
 
@@ -69,11 +87,8 @@ class PretrainingData(pl.LightningDataModule):
         encoder: text encoder, ``'table'`` (shipped embeddings), ``'minilm'``, ``'hashing'``, or the name or path of a language
             model, see :func:`ftl_lightning.concepts.encoder.load_encoder`.
         revision: of a Hugging Face model.
-        horizon: states in a window; ``None`` for the domain's plans.
-        start_exponent: exponent u of the windows' starts, ``start = length * share^u``: 1 is uniform, with 3 half of the windows
-            start in the first eighth of a demonstration. ``None`` for the domain's where windows are as long as plans, else 1.
-        balance: exponent with which concepts are drawn by their number of states: 1 draws every state alike, 0 every concept, 0.5
-            by the square root; of a concept, demonstrations are drawn by their length. ``None`` to draw demonstrations alike.
+        **windows: which windows a step sees: the attributes of :class:`Windows`, which are keys of a configuration beside the
+            others.
 
     Raises:
         UserError: for a value that is none.
@@ -93,21 +108,23 @@ class PretrainingData(pl.LightningDataModule):
         steps_per_epoch: int = 500,
         encoder: str = "table",
         revision: str = "main",
-        horizon: int | None = None,
-        start_exponent: float | None = None,
-        balance: float | None = None,
+        **windows: Any,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["balance"] if balance is None else None)
+        chosen = Windows(**windows)
+        windows = asdict(chosen)  # hyper-parameters are the local variables: those that were not given count too
+        # Configurations from before there was a balance keep their hash.
+        self.save_hyperparameters(ignore=["balance"] if chosen.balance is None else None)
         if self.own_domain and domain not in ("", self.own_domain):
             raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
         self.domain_name, self.domain = self._domain(self.own_domain or domain)
         self._number = {text: number for number, text in enumerate(self.domain.concepts.training)}
         self.metrics: Mapping[str, float] = {}
-        self.horizon = self.domain.plans.horizon if horizon is None else horizon
-        self.start_exponent = self.domain.plans.exponent(self.horizon) if start_exponent is None else start_exponent
+        plans = self.domain.plans
+        self.horizon = plans.horizon if chosen.horizon is None else chosen.horizon
+        self.start_exponent = plans.exponent(self.horizon) if chosen.start_exponent is None else chosen.start_exponent
         if self.start_exponent < 1:
-            raise UserError(f"data.start_exponent: expected 1 or more, found {start_exponent}")
+            raise UserError(f"data.start_exponent: expected 1 or more, found {chosen.start_exponent}")
         expect_factor("data.start_exponent", self.start_exponent, 1)
         counts = {
             "batch_size": (batch_size, MOST_TOGETHER),
@@ -119,9 +136,9 @@ class PretrainingData(pl.LightningDataModule):
         for name, (value, most) in counts.items():
             expect_count(f"data.{name}", value, 1, most)
         expect_range("data.seed", seed, 0)
-        if balance is not None and not 0 <= balance <= 1:
-            raise UserError(f"data.balance: expected a number from 0 to 1, found {balance}")
-        self.balance = balance
+        self.balance = chosen.balance
+        if self.balance is not None and not 0 <= self.balance <= 1:
+            raise UserError(f"data.balance: expected a number from 0 to 1, found {self.balance}")
         self.root = None if root is None else Path(root)
         self.samples_per_concept = samples_per_concept
         self.validation_per_concept = validation_per_concept
@@ -208,8 +225,9 @@ class OwnData(PretrainingData):
             :meth:`ftl_lightning.demonstrations.container.Demonstrations.load`; or the name of an installed Minari data set.
         metrics: what plans are judged by, a name and a number each, see :mod:`ftl_lightning.domains.from_file`; empty for nothing.
         validation_share: share of each concept's demonstrations that is held out, at least one.
-        seed, batch_size, steps_per_epoch, encoder, revision, horizon, start_exponent: see :class:`PretrainingData`; the default
-            encoder is ``'minilm'`` where it is installed, else ``'hashing'``.
+        seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
+            where it is installed, else ``'hashing'``.
+        horizon, start_exponent: see :class:`Windows`.
     """
 
     def __init__(
@@ -318,13 +336,13 @@ class InversionData(pl.LightningDataModule):
 
 
 def shares(demonstrations: Demonstrations, balance: float) -> Tensor:
-    """How often each demonstration is drawn ``(demo,)``, see ``balance`` of :class:`PretrainingData`; they sum to 1."""
+    """How often each demonstration is drawn ``(demo,)``, see ``balance`` of :class:`Windows`; they sum to 1."""
     lengths = demonstrations.lengths.double()
     texts = {text: number for number, text in enumerate(dict.fromkeys(demonstrations.concepts))}
     concepts = torch.tensor([texts[text] for text in demonstrations.concepts])
     states = torch.zeros(len(texts), dtype=torch.double).index_add(0, concepts, lengths)
-    found = lengths * states[concepts] ** (balance - 1)
-    return found / found.sum()
+    weights = lengths * states[concepts] ** (balance - 1)
+    return weights / weights.sum()
 
 
 def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
@@ -333,11 +351,11 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
     Raises:
         UserError: naming it, if it does not fit the domain.
     """
-    found = read_own(path)
+    demonstrations = read_own(path)
     columns = len(domain.plans.columns)
-    if found.domain not in ("", domain.name):
-        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {short(found.domain)!r}")
-    if found.states.shape[2] != columns:
-        raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(found.states.shape)}")
+    if demonstrations.domain not in ("", domain.name):
+        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {short(demonstrations.domain)!r}")
+    if demonstrations.states.shape[2] != columns:
+        raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(demonstrations.states.shape)}")
     with about(path):
-        return found.fitted(domain.observed)
+        return demonstrations.fitted(domain.observed)

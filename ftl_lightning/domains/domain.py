@@ -230,7 +230,7 @@ class ClosedLoop:
     expect: Callable[[], None] = lambda: None
 
     def inside(self, name: str) -> Self:
-        """The same in another environment; in its own for the empty name."""
+        """How plans are executed in another environment; in the domain's own for the empty name."""
         return replace(self, environment=self.others[name]) if name else self
 
 

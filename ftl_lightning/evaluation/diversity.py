@@ -174,9 +174,9 @@ def real_behaviour(
     """
     behaviour = []
     with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
-        for one in judged:
-            known = demonstrations_of(one.task, demonstrated)
-            behaviour.append(Real.of(one.task, domain, len(one.states), known, root, seed))
+        for generated in judged:
+            known = demonstrations_of(generated.task, demonstrated)
+            behaviour.append(Real.of(generated.task, domain, len(generated.states), known, root, seed))
             advance()
     return behaviour
 

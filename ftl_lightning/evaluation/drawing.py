@@ -21,15 +21,15 @@ def draw(logger: TensorBoardLogger, judged: Sequence[Judged], domain: Domain, fi
         step: the trainer's.
     """
     shown = slice(0, figures)
-    for one in judged:
-        name = f"{one.task.setting}/{one.task.name}"
-        start = None if one.starts is None else one.starts.take(shown)
-        right = None if one.right is None else one.right[shown].tolist()
-        title = one.task.name if one.right is None else f"{one.task.name}: {share(one.right):.2f}"
-        logger.experiment.add_figure(name, domain.show.picture(one.states[shown], right, title, start), step)
+    for behaviour in judged:
+        name = f"{behaviour.task.setting}/{behaviour.task.name}"
+        start = None if behaviour.starts is None else behaviour.starts.take(shown)
+        right = None if behaviour.right is None else behaviour.right[shown].tolist()
+        title = behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f}"
+        logger.experiment.add_figure(name, domain.show.picture(behaviour.states[shown], right, title, start), step)
         if domain.show.film is not None:
-            log_animation(logger, f"film/{name}", domain.show.film(one.states[0]), step, title)
+            log_animation(logger, f"film/{name}", domain.show.film(behaviour.states[0]), step, title)
         film = domain.closed_loop.film if domain.closed_loop else None
-        if film and one.rollout is not None and one.followed is not None:
-            pictures = film(one.rollout.take(0, 1), one.followed)
-            log_animation(logger, f"{CLOSED}/{name}", pictures, step, outcome_text(one.task.goal, one.outcomes))
+        if film and behaviour.rollout is not None and behaviour.followed is not None:
+            pictures = film(behaviour.rollout.take(0, 1), behaviour.followed)
+            log_animation(logger, f"{CLOSED}/{name}", pictures, step, outcome_text(behaviour.task.goal, behaviour.outcomes))

@@ -48,5 +48,5 @@ def demonstrations_of(task: EvaluationTask, demonstrated: Callable[[str], Demons
         task: what is evaluated.
         demonstrated: what a concept was learned from, by its name.
     """
-    found = [own for name in task.learned if (own := demonstrated(name)) is not None]
-    return concatenate(found) if len(found) > 1 else next(iter(found), None)
+    learned = [demonstrations for name in task.learned if (demonstrations := demonstrated(name)) is not None]
+    return concatenate(learned) if len(learned) > 1 else next(iter(learned), None)

@@ -120,7 +120,7 @@ class Evaluator(pl.Callback):
             return
         module = _evaluable(pl_module)
         self._generate(module, _data(trainer))
-        by_task = {(one.task.setting, one.task.name): one.values for one in self.judged}
+        by_task = {(behaviour.task.setting, behaviour.task.name): behaviour.values for behaviour in self.judged}
         pl_module.log_dict({f"val/{name}": value for name, value in setting_means(by_task).items()}, batch_size=1)
         for logger in _boards(trainer):
             self._draw(logger, module.domain, trainer.global_step)
@@ -153,7 +153,7 @@ class Evaluator(pl.Callback):
         beside = references(self.judged, domain, module.demonstrated, seed, self.generation.environments) if compared else {}
         if self.diversity:
             real = real_behaviour(self.judged, domain, module.demonstrated, data.root, seed)
-            self.judged = [behaviour.added(one) for behaviour, one in zip(real, self.judged, strict=True)]
+            self.judged = [known.added(generated) for known, generated in zip(real, self.judged, strict=True)]
             beside |= lines(real) if compared else {}
         return beside
 

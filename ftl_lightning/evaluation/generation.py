@@ -155,8 +155,8 @@ def execute(module: Evaluable, judged: Sequence[Judged], generation: Generation)
     """
     model, domain = module.model, module.domain
     act = planner(model, closed_loop_of(domain))
-    compositions = _composed(module, (one.task for one in judged))
-    episodes = [(one.task, episode) for one in judged for episode in range(len(one.states))]
+    compositions = _composed(module, (behaviour.task for behaviour in judged))
+    episodes = [(behaviour.task, episode) for behaviour in judged for episode in range(len(behaviour.states))]
 
     def follower() -> PlanFollower:
         noise = [generation.noise(task, episode) for task, episode in episodes]
@@ -167,6 +167,9 @@ def execute(module: Evaluable, judged: Sequence[Judged], generation: Generation)
     done = executed(judged, policy, domain)
     for environment in generation.environments:
         done = executed(done, follower(), domain, environment)
-    firsts = itertools.accumulate((len(one.states) for one in judged[:-1]), initial=0)
+    firsts = itertools.accumulate((len(behaviour.states) for behaviour in judged[:-1]), initial=0)
     followed = (policy.followed.get(first) for first in firsts)  # none where the first episode could not begin
-    return [replace(one, followed=None if plans is None else torch.stack(plans)) for one, plans in zip(done, followed, strict=True)]
+    return [
+        replace(behaviour, followed=None if plans is None else torch.stack(plans))
+        for behaviour, plans in zip(done, followed, strict=True)
+    ]

@@ -121,6 +121,6 @@ def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environme
         UserError: for a domain without an environment.
     """
     loop = closed_loop_of(domain).inside(environment)
-    starts = join([one.starts for one in judged if one.starts is not None])
-    parts = roll_out(loop, starts, policy).split([len(one.states) for one in judged])
-    return [one.executed(part, domain, environment) for one, part in zip(judged, parts, strict=True)]
+    starts = join([behaviour.starts for behaviour in judged if behaviour.starts is not None])
+    parts = roll_out(loop, starts, policy).split([len(behaviour.states) for behaviour in judged])
+    return [behaviour.executed(part, domain, environment) for behaviour, part in zip(judged, parts, strict=True)]

@@ -28,8 +28,8 @@ from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.testing.strokes import strokes
 from ftl_lightning.tuned import Tuned
-from tests.strokes import strokes
 
 SIZES = Sizes(horizon=8, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})
 ORIGIN = Origin("new", "own", "e", "p", "d", 5, "fixed", 0.15)

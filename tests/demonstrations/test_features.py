@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ftl_lightning.demonstrations.features import Feature, InitialStates, expect_features, join, joined, moved, take
+from ftl_lightning.demonstrations.features import Feature, InitialStates, expect_features, expect_starts, join, joined, moved, take
 from ftl_lightning.errors import UserError
 
 
@@ -68,3 +68,10 @@ def test_some_of_the_initial_states_and_several_one_after_another() -> None:
 def test_scenes_that_are_missing_are_told_where_an_environment_needs_them() -> None:
     with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), what an environment is reset with, found none"):
         InitialStates(observed(2)).require_scenes()
+
+
+def test_initial_states_that_are_missing_are_told_where_nothing_goes_without() -> None:
+    starts = InitialStates(observed(2))
+    assert expect_starts(starts) is starts
+    with pytest.raises(UserError, match="starts: expected initial states, found none; give what is observed where plans start"):
+        expect_starts(None)

@@ -18,7 +18,8 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluable import demonstrations_of
-from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import COLUMNS, Row, append_rows, label, labels, read_rows
 from ftl_lightning.evaluation.rows import configuration
@@ -114,6 +115,46 @@ def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: P
     assert all(torch.equal(one.states, other.states) for one, other in zip(first, again, strict=True))
     with pytest.raises(UserError, match="suites: expected some of training, paper"):
         tasks_of(module.domain, ["exam"], ())
+
+
+def test_what_cannot_be_generated_or_executed_is_told(tiny: Path) -> None:
+    module = Trained(GenerativeModel.load(tiny))
+    (judged,) = generate(module, tasks_of(module.domain, ["training"], ())[:1], Generation(2, "ddim", 2))
+    with pytest.raises(UserError, match="expected a domain with an environment, found object_rearrangement, which has none"):
+        execute(module, [judged], Generation())
+    for key in ("samples", "replan"):
+        with pytest.raises(UserError, match=f"^evaluation.{key}: expected 1 or more, found 0"):
+            Generation(**{key: 0})
+    with pytest.raises(UserError, match=r"^evaluation\.sampler: expected"):
+        Generation(sampler="euler")
+
+
+def test_a_task_that_starts_in_demonstrations_needs_some(tiny: Path) -> None:
+    class Driver(Trained):
+        domain = load_domain("driving")
+
+        def composition(self, task: EvaluationTask) -> Composition | None:
+            return Composition(torch.zeros(1, 384), torch.ones(1))
+
+    task = EvaluationTask("s", "merge", learned=("merge",), initial="demonstrated")
+    with pytest.raises(UserError, match="evaluation task 'merge': initial: expected demonstrations of 'merge', found none"):
+        generate(Driver(GenerativeModel.load(tiny)), [task], Generation(1))
+
+
+def test_the_keys_of_generation_stand_beside_those_of_the_callback() -> None:
+    evaluator = Evaluator(suites=["paper"], figures=0, samples=3, sampler="ddim", steps=4, environments=["step veto"], seed=7)
+    assert evaluator.generation == Generation(3, "ddim", 4, environments=["step veto"], seed=7)
+    assert evaluator.settings(LightningDataModule()) == {
+        "suites": "paper",
+        "samples": 3,
+        "sampler": "ddim",
+        "steps": 4,
+        "temperature": 0.1,
+        "sample_seed": 7,
+        "environments": ["step veto"],
+    }
+    with pytest.raises(TypeError, match="sample"):
+        Evaluator(sample=3)
 
 
 def test_what_a_task_is_learned_from_is_that_of_all_its_concepts() -> None:

@@ -11,9 +11,9 @@ from ftl_lightning.cli import main
 from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import WholeCheckpoints, read_checkpoint
+from ftl_lightning.testing.strokes import TRAINING, strokes
 from tests.conftest import CONF
 from tests.domains.mocap_samples import folder
-from tests.strokes import TRAINING, strokes
 
 OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop")
 FITS = [Path(f"{domain}.yaml") for domain in OURS] + sorted(

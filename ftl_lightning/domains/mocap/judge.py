@@ -132,8 +132,8 @@ class Recogniser(nn.Module):
 
     def _still(self, states: Tensor) -> Tensor:
         """Whether no joint gets anywhere within a sixth of a second: ``(sample,)``. Trembling joints do not."""
-        seen = as_joints(states)[:, :, list(self.joints)]
-        way = torch.linalg.vector_norm(seen[:, _SIXTH:] - seen[:, :-_SIXTH], dim=-1)
+        positions = as_joints(states)[:, :, list(self.joints)]
+        way = torch.linalg.vector_norm(positions[:, _SIXTH:] - positions[:, :-_SIXTH], dim=-1)
         return way.amax(dim=(1, 2)) * (FPS / _SIXTH) < STILL
 
     def says(self, states: Tensor, name: str) -> Tensor:
@@ -210,8 +210,8 @@ class Judge(nn.Module):
         if not isinstance(members, int) or not 1 <= members <= 100:
             raise UserError(f"{path}: key 'members': expected a number of networks, found {members!r}; train it again")
         judge = cls(members)
-        own = judge.state_dict()
-        if {name: value.shape for name, value in tensors.items()} != {name: value.shape for name, value in own.items()}:
+        expected = judge.state_dict()
+        if {name: value.shape for name, value in tensors.items()} != {name: value.shape for name, value in expected.items()}:
             raise UserError(f"{path}: expected weights of this version's judge, found others; train it again")
         judge.load_state_dict(tensors)
         return judge.requires_grad_(False)

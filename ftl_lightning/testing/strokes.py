@@ -1,14 +1,15 @@
-"""Pen strokes in the plane: a small data set that nothing in this repository was tuned on, with a rule that tells its kinds apart.
+"""Pen strokes in the plane: a small data set that nothing in this package was tuned on, with a rule that tells its kinds apart.
 
 Eight kinds are for pretraining, three others are new and learned from five strokes each.
 """
 
 import functools
-import zlib
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ftl_lightning.seeding import task_key
 
 STEPS = 40
 """Points of a stroke."""
@@ -76,7 +77,7 @@ def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
     Returns:
         ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
     """
-    rng = np.random.default_rng([seed, zlib.crc32(kind.encode())])
+    rng = np.random.default_rng([seed, task_key(kind)])
     even = np.linspace(0, 1, STEPS)
     uneven = rng.uniform(-0.5, 0.5, (count, 1)) * np.sin(np.pi * even) * np.cos(np.pi * even) / np.pi
     points = _SHAPES[kind](even + uneven)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tests.strokes import NEW, STEPS, TRAINING, recognised, strokes
+from ftl_lightning.testing.strokes import NEW, STEPS, TRAINING, recognised, strokes
 
 
 @pytest.mark.parametrize("kind", [*TRAINING, *NEW])
