@@ -1,6 +1,6 @@
 """A learned concept and its file."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Self
@@ -221,12 +221,3 @@ class Concept(Shown):
                 raise UserError(f"key 'components': expected {len(learned.weights)}, found {shown(header['components'])}")
             learned.expect_finite("content")
             return learned
-
-
-def load_concepts(paths: Iterable[str | Path]) -> list[Concept]:
-    """Read several concepts.
-
-    Raises:
-        UserError: as :meth:`Concept.load`.
-    """
-    return [Concept.load(path) for path in paths]
