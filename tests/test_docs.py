@@ -76,6 +76,12 @@ def test_every_command_names_a_verb_and_files_that_exist(path: Path) -> None:
             assert any(found), f"{verb} --config {name}"
 
 
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_benchmark_that_is_named_is_there(path: Path) -> None:
+    named = set(re.findall(r"benchmarks/[\w/]+\.py", path.read_text(encoding="utf-8")))
+    assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
 def test_every_page_is_in_the_contents() -> None:
     index = ROOT / "docs" / "index.md"
     listed = {line for block in re.findall(r"```\{toctree\}\n(.*?)```", index.read_text(), re.DOTALL) for line in block.split()}

@@ -1,6 +1,6 @@
 """A learned concept and its file."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Self
@@ -235,12 +235,3 @@ def _expect_shapes(tensors: Mapping[str, Tensor], axes: Sequence[str]) -> None:
         if values.shape != expected[name] or values.dtype != torch.float32:
             told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
             raise UserError(f"key {name!r}: expected float32 of shape {expected[name]}, found {told}")
-
-
-def load_concepts(paths: Iterable[str | Path]) -> list[Concept]:
-    """Read several concepts.
-
-    Raises:
-        UserError: as :meth:`Concept.load`.
-    """
-    return [Concept.load(path) for path in paths]

@@ -71,11 +71,6 @@ def learned_settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
     return [setting for setting in settings(domain, rows) if setting not in training_settings(domain)]
 
 
-def judges_plans(domain: Domain) -> bool:
-    """Whether plans are judged, not only what comes of them."""
-    return bool(domain.metrics)
-
-
 def metrics(domain: Domain) -> tuple[str, ...]:
     """What the methods are compared by: the main metric, success in closed loop, the headline, and the paper's."""
     executed = [EXECUTED] if domain.closed_loop else []

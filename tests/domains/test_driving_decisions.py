@@ -22,7 +22,7 @@ TASK = "roundabout third exit"
 
 @pytest.fixture(scope="module")
 def benchmark() -> dict[str, Any]:
-    return runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "driving_decisions.py"))
+    return runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "driving" / "decisions.py"))
 
 
 def test_who_plans_what_the_expert_drives_agrees_and_drives_as_far(benchmark: dict[str, Any]) -> None:

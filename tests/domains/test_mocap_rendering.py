@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
-from ftl_lightning.domains.mocap.rendering import LEFT, MAX_SAMPLES, RIGHT, SOLE, TRUNK, film, picture, side_by_side, wireframe
+from ftl_lightning.domains.mocap.rendering import LEFT, MAX_SAMPLES, RIGHT, SOLE, TRUNK, film, picture, wireframe
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.wireframe import seen
-from ftl_lightning.evaluation.animation import gif
+from ftl_lightning.evaluation.animation import gif, side_by_side
 
 STANDING = (
     (0.1, 0, 0), (0.1, 0, -0.42), (0.1, 0, -0.82), (-0.1, 0, 0), (-0.1, 0, -0.42), (-0.1, 0, -0.82), (0.2, 0, 0.5), (0.22, 0, 0.22),

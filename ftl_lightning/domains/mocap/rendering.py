@@ -14,7 +14,6 @@ from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.skeleton import BONES, FPS, HIPS, SHOULDERS, as_joints
 from ftl_lightning.domains.wireframe import Points, Wireframe, drawn, seen
 from ftl_lightning.escape import figure_text
-from ftl_lightning.evaluation.animation import side_by_side as side_by_side
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
 """Colours of the person's own left and right limbs and of what is between; told apart by the colour-blind too."""

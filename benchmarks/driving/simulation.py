@@ -1,6 +1,6 @@
 """What the expert costs: with deep copies of the published simulation, and with ours.
 
-python benchmarks/driving.py [--out results/driving_speed.json]
+python benchmarks/driving/simulation.py [--out results/driving_speed.json]
 
 A minute or two a scenario, nearly all of it for the deep copies. Both drive the same episode with the same search.
 """

@@ -1,6 +1,6 @@
 """Which method is ahead in driving, episode by episode: all of them from the same starts, with models of their own for each seed.
 
-    python benchmarks/driving_paired.py --out results/driving_paired.json
+    python benchmarks/driving/paired.py --out results/driving_paired.json
 
 Takes the models that ``ablate --config conf/ablation/comparison.yaml`` pretrains, and makes its episodes again: one task and three
 seeds are too few pairs of *rates* to decide anything, but 150 pairs of *episodes* may. Ten minutes on one thread.

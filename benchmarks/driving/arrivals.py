@@ -1,6 +1,6 @@
 """How a concept has to be learned so that it arrives: the validation scenario in closed loop, with settings of the inversion.
 
-    python benchmarks/driving_arrivals.py --learn '{"guidance_scale": 1.0, "tolerance": 0.03}'
+    python benchmarks/driving/arrivals.py --learn '{"guidance_scale": 1.0, "tolerance": 0.03}'
 
 Three pretrained models (those that ``ablate --config conf/ablation/driving.yaml`` makes), each with two sets of demonstrations, and
 for each of these six other new starts, none of which an evaluation uses. Four minutes on one thread.

@@ -1,6 +1,6 @@
 """What looking ahead costs: seconds of episodes that follow a learned concept's plans, with each veto.
 
-    python benchmarks/driving_vetoes.py [--out results/driving_vetoes.json]
+    python benchmarks/driving/vetoes.py [--out results/driving_vetoes.json]
 
 A minute or two, on one thread.
 """

@@ -1,7 +1,7 @@
 """What five drives teach: how often policies decide as the expert does, on drives of the expert from new starts.
 
-    python benchmarks/driving_decisions.py --task "roundabout third exit" --drives 30
-    python benchmarks/driving_decisions.py --task roundabout --pretrained logs/ablation/driving-steps{0,1,2}/pretrained
+    python benchmarks/driving/decisions.py --task "roundabout third exit" --drives 30
+    python benchmarks/driving/decisions.py --task roundabout --pretrained logs/ablation/driving-steps{0,1,2}/pretrained
 
 The expert drives; at each decision every policy is asked what it would do there. Its wish is turned into a decision by the planner
 and its veto, as in closed loop. Two decisions that make the same of the vehicle, such as keeping and raising the highest speed, are

@@ -1,6 +1,6 @@
 """Drives of the expert that knows no more than what can be seen, of all training scenarios.
 
-    python benchmarks/driving_blind.py --out logs/blind --count 110
+    python benchmarks/driving/blind.py --out logs/blind --count 110
     python -m ftl_lightning fit --config conf/driving.yaml --data.root logs/blind --model.output logs/blind/pretrained
 
 Each episode is kept as it is made: a run that is killed goes on where it stopped. A drive takes from three seconds (highway) to
