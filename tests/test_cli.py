@@ -21,7 +21,10 @@ from ftl_lightning.trainer import Trainer
 from tests.conftest import CONF, ROOT, TINY
 
 OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop")
-FITS = [*OURS, *sorted(f"{method}/{path.stem}" for method in ("bc", "cvae", "in_context") for path in (CONF / method).glob("*.yaml"))]
+FITS = [
+    *OURS,
+    *sorted(f"{method}/{path.stem}" for method in ("bc", "cvae", "in_context") for path in (CONF / method).glob("*.yaml")),
+]
 INVERSIONS = [[name] for name in (*FITS, "mocap_adapter", "tabletop_adapter")] + [[name, "method/language"] for name in OURS]
 CONFIGS = [
     *(("fit", [name]) for name in FITS),
