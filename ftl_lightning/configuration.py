@@ -108,7 +108,8 @@ def _plain(keys: object) -> dict[str, Any]:
 
 def _parts(path: str | Path, verb: str) -> Iterator[tuple[Path, DictConfig]]:
     section = section_of(verb)
-    for file in _today(path, section) or [_File(find(path), section)]:
+    today = _today(path, section)
+    for file in [_File(find(path), section)] if today is None else today:
         yield from _merged(file, ())
 
 

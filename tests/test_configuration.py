@@ -1,20 +1,28 @@
-"""Configuration files: parts, their order, their mistakes, and what is shipped."""
+"""Configuration files: parts, sections, their order, their mistakes, former names, and what is shipped."""
 
+import functools
+import importlib
+import inspect
 import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import yaml
 
-from ftl_lightning.configuration import expanded, find, load, parts
+from ftl_lightning.cli import main
+from ftl_lightning.configuration import SECTIONS, _say_once, expanded, find, load, parts
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import FOLDERS, shipped
+from ftl_lightning.tuned import settings_of
 from tests.conftest import CONF, ROOT
+from tests.test_cli import CONFIGS
 
-GROUPS = ("verb", "domain", "sampling", "method")
+PARTS = ("verb.yaml", "domain", "sampling", "method")
+"""What configurations are built from."""
 
 
 def write(path: str, text: str) -> str:
@@ -28,7 +36,7 @@ def test_later_parts_win_and_a_file_wins_over_its_parts() -> None:
     write("b.yaml", "model: {y: 2, z: 2}\n")
     write("c.yaml", "defaults: [a.yaml, b.yaml]\nmodel: {z: 3}\nlist: [4]\nseed: ${other}\n")
     assert load("c.yaml") == {"model": {"x": 1, "y": 2, "z": 3}, "list": [4], "seed": "${other}"}
-    assert [path.name for path in parts("c.yaml")] == ["a.yaml", "b.yaml", "c.yaml"]
+    assert [path.name for path, _ in parts("c.yaml")] == ["a.yaml", "b.yaml", "c.yaml"]
 
 
 def test_a_part_is_looked_for_beside_the_file_then_above_it_then_among_the_shipped_ones(tmp_path: Path) -> None:
@@ -37,8 +45,8 @@ def test_a_part_is_looked_for_beside_the_file_then_above_it_then_among_the_shipp
     assert load("deep/er/file.yaml") == {"x": "above"}
     write("deep/er/parts/a.yaml", "x: beside\n")
     assert load(tmp_path / "deep" / "er" / "file.yaml") == {"x": "beside"}
-    write("mine.yaml", "defaults: [conf/invert/agent.yaml]\nmodel: {init_args: {omega: 2.0}}\n")
-    found = load("mine.yaml")
+    write("mine.yaml", "defaults: [conf/agent.yaml]\nmodel: {init_args: {omega: 2.0}}\n")
+    found = load("mine.yaml", "invert")
     assert found["model"]["init_args"]["omega"] == 2.0
     assert found["data"]["init_args"]["domain"] == "agent"
 
@@ -113,28 +121,248 @@ def test_nothing_else_of_the_package_is_shipped(path: str) -> None:
     assert shipped(path) == Path(path)
 
 
+def test_sections_count_for_their_verb_alone_and_after_the_other_keys_of_their_file() -> None:
+    write("a.yaml", "x: 1\ny: 1\nfit: {x: 2}\ninvert: {x: 3, z: {u: 1}}\n")
+    write("b.yaml", "defaults: [a.yaml]\nx: 4\nfit: {y: 5}\ninvert: {z: {v: 2}}\n")
+    assert load("a.yaml", "fit") == {"x": 2, "y": 1}
+    assert load("b.yaml", "fit") == {"x": 4, "y": 5}  # file after file, in each its section at the end
+    assert load("b.yaml", "invert") == {"x": 4, "y": 1, "z": {"u": 1, "v": 2}}
+    assert load("b.yaml", "validate") == load("b.yaml", "test") == load("b.yaml", "fit")
+    assert [(path.name, keys) for path, keys in parts("a.yaml", "invert")] == [
+        ("a.yaml", {"x": 1, "y": 1}),
+        ("a.yaml", {"x": 3, "z": {"u": 1}}),
+    ]
+    assert yaml.safe_load(expanded(["--config=b.yaml"], "fit")[0].removeprefix("--config=")) == {"x": 4, "y": 5}
+
+
+def test_files_of_other_verbs_have_no_sections() -> None:
+    write("a.yaml", "x: 1\nfit: {x: 2}\n")
+    assert load("a.yaml", "ablate") == load("a.yaml") == {"x": 1, "fit": {"x": 2}}
+
+
+def test_an_empty_section_is_none_and_one_that_is_no_mapping_is_refused() -> None:
+    write("a.yaml", "x: 1\nfit:\n")
+    assert load("a.yaml", "fit") == {"x": 1}
+    write("a.yaml", "x: 1\nfit: [1]\n")
+    for verb in ("fit", "invert"):
+        with pytest.raises(UserError, match=r"a\.yaml: key 'fit': expected a mapping of keys, found \[1\]"):
+            load("a.yaml", verb)
+
+
+def test_a_mistake_is_told_with_the_section_of_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    write("a.yaml", "defaults: [conf/agent.yaml]\ninvert:\n  trainer: {max_stepz: 1}\nfit:\n  trainer: {max_stepz: 2}\n")
+    for verb, number in (("fit", 5), ("invert", 3)):
+        assert main([verb, "--config=a.yaml"]) == 2
+        assert f"error: a.yaml: line {number}: " in capsys.readouterr().err
+
+
+@pytest.fixture
+def told(capsys: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
+    """What was said on standard error since it was asked for last; a note is said once by a process."""
+    _say_once.cache_clear()
+    return lambda: capsys.readouterr().err.splitlines()
+
+
+Told = Callable[[], list[str]]
+
+
+@pytest.mark.parametrize(
+    ("former", "verb", "today", "advice"),
+    [
+        ("invert/agent.yaml", "invert", ["agent.yaml"], "is now conf/agent.yaml (for fit and invert)"),
+        ("invert/mocap_adapter.yaml", "invert", ["mocap_adapter.yaml"], "is now conf/mocap_adapter.yaml (for fit and invert)"),
+        ("baseline/bc/tabletop.yaml", "fit", ["bc/tabletop.yaml"], "is now conf/bc/tabletop.yaml (for fit and invert)"),
+        ("baseline/cvae/invert/agent.yaml", "invert", ["cvae/agent.yaml"], "is now conf/cvae/agent.yaml (for fit and invert)"),
+        (
+            "baseline/language/invert/driving.yaml",
+            "invert",
+            ["verb.yaml", "domain/driving.yaml", "sampling/driving.yaml", "method/language.yaml"],
+            "is now conf/driving.yaml and after it conf/method/language.yaml",
+        ),
+        (
+            "baseline/language/invert/object_rearrangement.yaml",
+            "invert",
+            ["verb.yaml", "domain/object_rearrangement.yaml", "method/language.yaml"],
+            "is now conf/object_rearrangement.yaml and after it conf/method/language.yaml",
+        ),
+        ("verb/fit.yaml", "fit", ["verb.yaml"], "is now conf/verb.yaml (for fit and invert)"),
+        ("verb/invert.yaml", "invert", ["verb.yaml"], "is now conf/verb.yaml (for fit and invert)"),
+        ("verb/common.yaml", "", ["verb.yaml"], "is now conf/verb.yaml"),
+        ("domain/fit/mocap.yaml", "fit", ["domain/mocap.yaml"], "is now conf/domain/mocap.yaml (for fit and invert)"),
+        ("method/invert/bc.yaml", "invert", ["method/bc.yaml"], "is now conf/method/bc.yaml (for fit and invert)"),
+        ("sampling/object_rearrangement.yaml", "", [], "says what is the default; leave it out"),
+    ],
+)
+def test_a_former_name_stands_for_the_files_of_today(
+    former: str, verb: str, today: list[str], advice: str, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the verb of the run is: the name says which section was meant."""
+    expected: dict[str, object] = {}
+    for name in today:
+        for _, keys in parts(CONF / name, verb or "fit"):
+            expected = merged(expected, keys if verb else {"seed_everything": 0})
+    write("mine.yaml", f"defaults: [conf/{former}]\n")
+    for path in (f"conf/{former}", "mine.yaml"):
+        for running in ("fit", "invert", "test"):
+            found = load(path, running)
+            assert found == expected if verb else set(expected) <= set(found), (path, running)
+            assert not found.keys() & {"fit", "invert"}
+    assert told() == [f"note: conf/{former} {advice}"]
+    # In a checkout the path may be written in other ways, and from files within the folder without it.
+    checkout = Path("checkout")
+    checkout.mkdir()
+    (checkout / "conf").symlink_to(CONF)
+    assert load(checkout.absolute() / "conf" / former, "fit") == load(f"conf/{former}", "fit")
+    assert len(told()) == 1
+    monkeypatch.chdir(checkout)
+    assert load(f"./conf/{former}", "fit") == load(f"conf/{former}", "fit")
+
+
+def merged(below: dict[str, object], keys: dict[str, object]) -> dict[str, object]:
+    """Mappings key by key; of everything else the later value."""
+    found = dict(below)
+    for key, value in keys.items():
+        old = found.get(key)
+        found[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return found
+
+
+def test_a_former_name_needs_no_prefix_in_a_folder_of_the_shipped_files(tmp_path: Path, told: Told) -> None:
+    shutil.copytree(CONF, tmp_path / "copy" / "conf")
+    package = tmp_path / "copy" / "conf"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ftl_lightning.configuration.CONFIGURATIONS", package)
+        write(str(package / "mine.yaml"), "defaults: [verb/fit.yaml, domain/fit/agent.yaml, method/fit/ftl_igm.yaml]\n")
+        assert load(package / "mine.yaml", "fit")["data"]["init_args"]["horizon"] == 128
+    assert told() == [
+        "note: verb/fit.yaml is now conf/verb.yaml (for fit and invert)",
+        "note: domain/fit/agent.yaml is now conf/domain/agent.yaml (for fit and invert)",
+        "note: method/fit/ftl_igm.yaml is now conf/method/ftl_igm.yaml (for fit and invert)",
+    ]
+
+
+def test_a_file_of_one_s_own_wins_over_a_former_name(told: Told) -> None:
+    write("conf/invert/agent.yaml", "x: mine\n")
+    write("mine.yaml", "defaults: [conf/invert/agent.yaml]\n")
+    assert load("conf/invert/agent.yaml", "invert") == load("mine.yaml", "invert") == {"x": "mine"}
+    assert told() == []
+
+
+def test_a_former_name_never_means_a_file_of_one_s_own(told: Told) -> None:
+    write("conf/agent.yaml", "x: mine\n")
+    write("mine.yaml", "defaults: [conf/invert/agent.yaml]\n")
+    assert load("conf/agent.yaml", "invert") == {"x": "mine"}
+    for path in ("conf/invert/agent.yaml", "mine.yaml"):
+        assert load(path, "invert") == load(CONF / "agent.yaml", "invert")
+    assert len(told()) == 1
+
+
+@pytest.mark.parametrize("name", ["conf/invert/chess.yaml", "conf/baseline/telepathy/agent.yaml", "elsewhere/invert/agent.yaml"])
+def test_a_name_that_never_was_is_missing(name: str, told: Told) -> None:
+    with pytest.raises(UserError, match="expected a configuration file, found nothing"):
+        load(name, "invert")
+    assert told() == []
+
+
+def test_a_run_with_a_former_name_says_one_line(told: Told) -> None:
+    assert main(["fit", "--config=conf/baseline/bc/agent.yaml", "--print_config"]) == 0
+    assert told() == ["note: conf/baseline/bc/agent.yaml is now conf/bc/agent.yaml (for fit and invert)"]
+
+
+def test_settings_go_with_a_domain_by_its_name() -> None:
+    assert settings_of("agent") == "conf/agent.yaml"
+    assert settings_of("agent", "in_context") == "conf/in_context/agent.yaml"
+    assert settings_of("object_rearrangement", "in_context") == settings_of("chess") == "conf/own.yaml"
+    write("conf/chess.yaml", "defaults: [conf/verb.yaml, conf/method/ftl_igm.yaml]\n")
+    assert settings_of("chess") == "conf/own.yaml"  # for pretraining alone
+    write(
+        "conf/chess.yaml", "defaults: [conf/verb.yaml, conf/method/ftl_igm.yaml]\ninvert: {model: {init_args: {pretrained: x}}}\n"
+    )
+    assert settings_of("chess") == "conf/chess.yaml"
+    write("conf/invert/chess.yaml", "model: {init_args: {omega: 2.0}}\n")
+    assert settings_of("chess") == "conf/invert/chess.yaml"
+
+
+def test_there_are_at_most_fifty_configuration_files() -> None:
+    assert 0 < len(list(CONF.rglob("*.yaml"))) <= 50
+
+
 def test_every_part_is_used_by_a_configuration() -> None:
     files = {path.resolve() for path in CONF.rglob("*.yaml")}
-    inside = {path for path in files if path.relative_to(CONF.resolve()).parts[0] in GROUPS}
-    used = {part.resolve() for path in files - inside for part in parts(path)}
-    assert inside <= used
+    inside = {path for path in files if path.relative_to(CONF.resolve()).parts[0] in PARTS}
+    used = {part.resolve() for path in files - inside for verb in SECTIONS for part, _ in parts(path, verb)}
+    assert inside - used == {CONF.resolve() / "method" / "language.yaml"}  # which is added to another
     assert inside
 
 
+def leaves(keys: dict[str, object], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], object]]:
+    """Values with their keys, an argument of a class as one."""
+    for key, value in keys.items():
+        if isinstance(value, dict) and "init_args" not in at and (at[:1] != ("trainer",) or key in ("logger", "init_args")):
+            yield from leaves(value, (*at, key))
+        else:
+            yield (*at, key), value
+
+
+@functools.cache
+def defaults_of(path: str) -> dict[str, object]:
+    """The arguments of a class with their defaults, those that it passes on to the classes above it included."""
+    module, _, name = path.rpartition(".")
+    found: dict[str, object] = {}
+    for one in getattr(importlib.import_module(module), name).__mro__:
+        if "__init__" not in vars(one):
+            continue
+        own = inspect.signature(one.__init__).parameters.values()
+        found = {parameter.name: parameter.default for parameter in own} | found
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in own):
+            break
+    return found
+
+
+ENTRIES = [(verb, names) for verb, names in CONFIGS if verb in SECTIONS]
+OTHERWISE = {("evaluation", "replan")}
+"""Values whose default is another one where :class:`~ftl_lightning.tuned.Tuned` reads them."""
+
+
+def repeated(verb: str, names: list[str]) -> dict[tuple[str, str, str], bool]:
+    """Of every value of the files of a run, by file and key, whether it says what is so without it.
+
+    Then the files before it give the value already or, where none of them has the key, it is the default of the class. Where a
+    file that is added changes a class, references to other keys go with the former one.
+    """
+    found = [(str(part), keys) for name in names for part, keys in parts(CONF / f"{name}.yaml", verb)]
+    classes = {"evaluation": "ftl_lightning.evaluation.evaluator.Evaluator", "trainer": "ftl_lightning.trainer.Trainer"}
+    for _, keys in found:
+        classes |= {key: keys[key]["class_path"] for key in ("model", "data") if "class_path" in keys.get(key, {})}
+    assert set(classes) == {"model", "data", "evaluation", "trainer"}
+    before: dict[tuple[str, ...], object] = {}
+    says = {}
+    for part, keys in found:
+        own = dict(leaves(keys))
+        changed = {key[0] for key in own if key[1:] == ("class_path",) and key in before}
+        before = {key: value for key, value in before.items() if key[0] not in changed or "${" not in str(value)}
+        for key, value in own.items():
+            default = defaults_of(classes[key[0]]).get(key[-1], ...) if key[0] in classes and "logger" not in key else ...
+            says[verb, part, ".".join(key)] = before.get(key, default) == value and key not in OTHERWISE
+        before |= own
+    return says
+
+
 def test_a_configuration_says_only_what_differs() -> None:
-    """No key of a file repeats the value that its parts give it already."""
+    """Every value of a file makes a difference in a run that the file is part of."""
+    useless: dict[tuple[str, str, str], bool] = {}
+    for verb, names in ENTRIES:
+        for place, same in repeated(verb, names).items():
+            useless[place] = useless.get(place, True) and same
+    assert len(useless) > 300
+    assert [place for place, same in useless.items() if same] == []
 
-    def repeated(own: object, below: object, at: str) -> list[str]:
-        if isinstance(own, dict) and isinstance(below, dict):
-            return [key for name in own.keys() & below.keys() for key in repeated(own[name], below[name], f"{at}.{name}")]
-        return [at] if own == below else []
 
-    for path in CONF.rglob("*.yaml"):
-        own = yaml.safe_load(path.read_text())
-        if names := own.pop("defaults", None):
-            below = Path("below.yaml")
-            below.write_text(yaml.safe_dump({"defaults": [str(CONF / name) for name in names]}))
-            assert repeated(own, load(below), str(path)) == []
+@pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONF)))
+def test_sections_do_not_say_the_same(path: Path) -> None:
+    """What counts for both stands above them."""
+    sections = [dict(leaves(yaml.safe_load(path.read_text()).get(name, {}))) for name in SECTIONS]
+    assert {key for key in sections[0].keys() & sections[1].keys() if sections[0][key] == sections[1][key]} == set()
 
 
 def test_a_wheel_holds_every_configuration_and_model(tmp_path: Path) -> None:

@@ -192,9 +192,7 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
         demonstrations = ["--data.demonstrations=drives.safetensors"]
     adapt = [*demonstrations, *recorded, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
     executed = [] if domain == "object_rearrangement" else ["--evaluation.closed_loop=false"]
-    assert (
-        main(["invert", "--config", str(path), *adapt, *executed, "--model.output=concepts", "--evaluation.results=r.csv"]) == 0
-    )
+    assert main(["invert", "--config", str(path), *adapt, *executed, "--model.output=concepts", "--evaluation.results=r.csv"]) == 0
     learned = Concept.load(next(Path("concepts").iterdir()))
     assert learned.origin.pretrained == model.hash
     if domain not in ("driving", "tabletop"):  # which judge episodes alone
