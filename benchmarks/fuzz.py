@@ -41,8 +41,8 @@ from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
 from ftl_lightning.learning.checkpoint import read_checkpoint
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.seeding import generator
 from ftl_lightning.shipped import pretrained_folder
 

@@ -33,9 +33,10 @@ from ftl_lightning.diffusion.schedule import denoising_loss
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.domain import ACCURACY
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.seeding import generator
@@ -262,7 +263,7 @@ def main() -> None:
     parser.add_argument("--learned", help="an earlier run's file to take from what the published procedure has learned by then")
     parser.add_argument("--full", action="store_true", help="run the published inversion of one concept to its end")
     options = parser.parse_args()
-    model, tuned = GenerativeModel.load(options.pretrained), Tuned.read(options.config)
+    model, tuned = read_model(GenerativeModel, options.pretrained), Tuned.read(options.config)
     changes = {key: value for key in ("tolerance", "samples") if (value := getattr(options, key)) is not None}
     settings = replace(tuned.inversion, seed=options.seed, modes=1, **changes)
     most = options.steps or tuned.learning_steps

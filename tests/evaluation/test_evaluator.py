@@ -21,7 +21,8 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import Row, append_rows, labels, read_rows
 from ftl_lightning.evaluation.rows import configuration
-from ftl_lightning.learning.generative_model import GenerativeModel
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 
 
 class Trained:
@@ -106,11 +107,11 @@ def test_standard_error_over_tasks() -> None:
 
 def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: Path) -> None:
     evaluator = Evaluator(suites=["training", "paper"], samples=3, sampler="ddim", steps=4)
-    first, again = (evaluator.evaluate(Trained(GenerativeModel.load(tiny))) for _ in range(2))
+    first, again = (evaluator.evaluate(Trained(read_model(GenerativeModel, tiny))) for _ in range(2))
     assert len(first) == 12
     assert all(torch.equal(one.states, other.states) for one, other in zip(first, again, strict=True))
     with pytest.raises(UserError, match="suites: expected some of training, paper"):
-        Evaluator(suites=["exam"]).evaluate(Trained(GenerativeModel.load(tiny)))
+        Evaluator(suites=["exam"]).evaluate(Trained(read_model(GenerativeModel, tiny)))
 
 
 def test_what_a_task_is_learned_from_is_that_of_all_its_concepts() -> None:
@@ -172,7 +173,7 @@ def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path) -> Non
 
 
 def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_by_name_and_version(tiny: Path) -> None:
-    module, data = Trained(GenerativeModel.load(tiny)), LightningDataModule()
+    module, data = Trained(read_model(GenerativeModel, tiny)), LightningDataModule()
     found = []
     for content, name in ((b"one", "a.npz"), (b"one", "b.npz"), (b"two", "a.npz")):
         Path(name).write_bytes(content)
