@@ -30,7 +30,6 @@ import numpy as np
 import safetensors.torch
 import torch
 import yaml
-from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.concepts.adapter import LowRank, adaptable
 from ftl_lightning.concepts.composition import Composition
@@ -42,8 +41,10 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
 from ftl_lightning.learning.checkpoint import read_checkpoint
+from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.seeding import generator
 from ftl_lightning.shipped import pretrained_folder
 
@@ -319,7 +320,7 @@ class Fuzz:
         """A learned concept, checked against its model and sampled from."""
         path = self._written("concept.safetensors", odd_safetensors(draw.choice(self.concepts), draw))
         found = Concept.load(path)
-        self.model.check(found, path)
+        expect_concept(self.model, found, path)
         _sampled(self.model, found)
         found.save(self.folder / "again.safetensors")
 

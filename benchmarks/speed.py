@@ -17,13 +17,12 @@ import json
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean, median
 from typing import Any, TypeVar
 
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
@@ -36,6 +35,8 @@ from ftl_lightning.domains.domain import ACCURACY
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.seeding import generator, task_key
@@ -262,9 +263,9 @@ def main() -> None:
     parser.add_argument("--learned", help="an earlier run's file to take from what the published procedure has learned by then")
     parser.add_argument("--full", action="store_true", help="run the published inversion of one concept to its end")
     options = parser.parse_args()
-    model, tuned = GenerativeModel.load(options.pretrained), Tuned.read(options.config)
+    model, tuned = read_model(GenerativeModel, options.pretrained), Tuned.read(options.config)
     changes = {key: value for key in ("tolerance", "samples") if (value := getattr(options, key)) is not None}
-    settings = replace(tuned.inversion, seed=options.seed, modes=1, **changes)
+    settings = tuned.inversion.changed(seed=options.seed, modes=1, **changes)
     most = options.steps or tuned.learning_steps
     domain = load_domain(model.config.domain)
     suite = domain.concepts.suites[SUITE]
@@ -301,7 +302,12 @@ def main() -> None:
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
         },
-        "settings": {"samples": settings.samples, "tolerance": settings.tolerance, "steps": most, "seed": options.seed},
+        "settings": {
+            "samples": settings.budget.samples,
+            "tolerance": settings.budget.tolerance,
+            "steps": most,
+            "seed": options.seed,
+        },
         "seconds": {
             f"{PUBLISHED}{'' if options.full else f' (scaled from {steps} steps)'}": round(curves[PUBLISHED][-1].seconds, 1),
             ONE: round(curves[ONE][-1].seconds, 3),

@@ -29,7 +29,7 @@ from yaml import YAMLError
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.limits import expect_readable
 from ftl_lightning.printing import say
-from ftl_lightning.regrouped import regrouped
+from ftl_lightning.regrouped import class_of, regrouped
 from ftl_lightning.renamed import renamed
 from ftl_lightning.shipped import CONFIGURATIONS, shipped
 
@@ -84,11 +84,14 @@ def load(path: str | Path, verb: str = "") -> dict[str, Any]:
         UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
     """
     try:
-        merged = OmegaConf.merge(OmegaConf.create(), *(keys for _, keys in _parts(path, verb)))
+        files = parts(path, verb)
+        named = class_of([keys for _, keys in files], section_of(verb) or "")
+        today = [OmegaConf.create(regrouped(keys, str(part), named)) for part, keys in files]
+        merged = OmegaConf.merge(OmegaConf.create(), *today)
         found = OmegaConf.to_container(merged, resolve=False)
     except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
-    return regrouped(_plain(found), str(path))
+    return _plain(found)
 
 
 def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]:
@@ -126,17 +129,12 @@ def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictCo
         for below in _beside(file, name):
             yield from _merged(below, (*above, path))
     sections = {} if file.section is None else {name: keys.pop(name, None) for name in SECTIONS}
-    yield path, _regrouped(keys, path)
+    yield path, keys
     for name, own in sections.items():
         if own is not None and not isinstance(own, DictConfig):
             raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(own))}")
     if file.section and (own := sections[file.section]) is not None:
-        yield path, _regrouped(own, path)
-
-
-def _regrouped(keys: DictConfig, path: Path) -> DictConfig:
-    """A file's keys as they are called today."""
-    return OmegaConf.create(regrouped(_plain(OmegaConf.to_container(keys, resolve=False)), str(path)))
+        yield path, own
 
 
 def _beside(file: _File, name: str) -> list[_File]:

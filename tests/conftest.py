@@ -2,13 +2,18 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.errors import LONGEST
+
+if TYPE_CHECKING:
+    from ftl_lightning.learning import InversionModule
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -42,6 +47,15 @@ def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *expected:
     return told
 
 
+def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
+    """The module of ``invert`` with some options, given by their flat names."""
+    from ftl_lightning.learning import InversionModule
+    from ftl_lightning.learning.inversion_settings import InversionSettings
+
+    settings = InversionSettings().changed(**options)
+    return InversionModule(str(pretrained), **{field.name: getattr(settings, field.name) for field in fields(settings)})
+
+
 @pytest.fixture(autouse=True)
 def _in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # logs and outputs of a test stay its own
@@ -71,7 +85,7 @@ def invert(tiny: Path, tmp_path: Path) -> Callable[..., Path]:
 
     def run(*options: str) -> Path:
         arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
-        arguments += ["--data.steps=5", "--model.samples=4", "--evaluation.samples=3", "--evaluation.steps=3"]
+        arguments += ["--data.steps=5", "--model.budget.samples=4", "--evaluation.samples=3", "--evaluation.steps=3"]
         arguments += ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", *options]
         assert main(arguments) == 0
         return tmp_path / "logs" / "object_rearrangement" / "invert"

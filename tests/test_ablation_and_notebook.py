@@ -134,7 +134,7 @@ def quick(tiny: Path) -> dict[str, object]:
     options = {
         "model.pretrained": str(tiny),
         "data.steps": 2,
-        "model.samples": 2,
+        "model.budget.samples": 2,
         "evaluation.samples": 2,
         "evaluation.steps": 2,
         "evaluation.figures": 0,

@@ -331,8 +331,8 @@ def test_a_checkpoint_of_another_form_is_refused(tiny: Path, capsys: pytest.Capt
     [
         (["--evaluation.suites=[trainig]"], "evaluation.suites: expected some of training"),
         (["--evaluation.steps=1000"], "evaluation.steps: expected 1 to 100"),
-        (["--model.restarts=0"], "model.restarts: expected 1 or more"),
-        (["--model.timestep_power=0.5"], "model.timestep_power: expected 1 or more"),
+        (["--model.budget.restarts=0"], "model.budget.restarts: expected 1 or more"),
+        (["--model.loss.timestep_power=0.5"], "model.loss.timestep_power: expected 1 or more"),
         (["--data.steps=0"], "data.steps, data.demonstrations_per_concept: expected 1 or more"),
         (["--trainer.logger.init_args.save_dir=/proc/logs"], "choose a writable place"),
     ],
@@ -370,7 +370,7 @@ def one_concept(invert: Callable[..., Path], *options: str) -> Path:
 def test_modes_are_learned_explained_and_sampled_from(
     tiny: Path, invert: Callable[..., Path], capsys: pytest.CaptureFixture[str], modes: str, how: str
 ) -> None:
-    file = one_concept(invert, f"--model.modes={modes}")
+    file = one_concept(invert, f"--model.modes.sets={modes}")
     learned = Concept.load(file)
     assert learned.modes is not None
     assert len(learned.modes) == 5
@@ -395,7 +395,7 @@ def test_modes_are_learned_explained_and_sampled_from(
 def test_a_run_that_stops_by_itself_says_after_how_many_steps(
     invert: Callable[..., Path], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--data.steps=150", "--model.tolerance=0.5", "--trainer.enable_progress_bar=true"]
+    options = ["--data.steps=150", "--model.budget.tolerance=0.5", "--trainer.enable_progress_bar=true"]
     one_concept(invert, *options)
     told = capfd.readouterr().err
     (steps,) = [int(line.split()[1]) for line in told.splitlines() if line.startswith("invert: ") and " steps, " in line]
@@ -407,10 +407,10 @@ def test_a_run_that_stops_by_itself_says_after_how_many_steps(
 @pytest.mark.parametrize(
     ("option", "expected"),
     [
-        ("--model.modes=0", "model.modes: expected 1 or more, 'each' or 'auto', found 0"),
-        ("--model.modes=some", "modes"),
-        ("--model.tolerance=1", "model.tolerance: expected null or a share from 0 up to 1, found 1.0"),
-        ("--model.tolerance=much", "tolerance"),
+        ("--model.modes.sets=0", "model.modes.sets: expected 1 or more, 'each' or 'auto', found 0"),
+        ("--model.modes.sets=some", "modes"),
+        ("--model.budget.tolerance=1", "model.budget.tolerance: expected null or a share from 0 up to 1, found 1.0"),
+        ("--model.budget.tolerance=much", "tolerance"),
     ],
 )
 def test_modes_and_tolerances_that_are_none_are_one_clear_line(
@@ -497,11 +497,11 @@ SHORT = [*TINY, "--trainer.max_steps=2", "--data.steps_per_epoch=1", "--evaluati
         "--model.learning_rate=-1",
         "--model.learning_rate=.nan",
         "--model.weight_decay=-1",
-        "--model.condition_dropout=2",
+        "--model.loss.condition_dropout=2",
         "--model.ema_decay=5",
         "--model.guidance=.inf",
         "--model.diffusion_steps=0",
-        "--model.code_knots=0",
+        "--model.codes.knots=0",
         "--model.denoiser_args.hidden_dim=0",
         "--model.denoiser_args.depth=0",
         "--model.denoiser_args.condition_dim=-1",
@@ -532,12 +532,12 @@ def test_sizes_of_baselines_out_of_their_ranges_are_one_line(method: str, option
     "option",
     [
         "--model.learning_rate=-1",
-        "--model.weight_learning_rate=.inf",
-        "--model.adapter_learning_rate=-1",
-        "--model.initial_spread=-1",
-        "--model.initial_omega=.nan",
+        "--model.weights.learning_rate=.inf",
+        "--model.adapter.learning_rate=-1",
+        "--model.embeddings.initial_spread=-1",
+        "--model.weights.initial=.nan",
         "--model.omega=.nan",
-        "--model.training_omega=.nan",
+        "--model.weights.training=.nan",
         "--model.seed=-1",
         "--data.seed=-1",
         "--trainer.max_epochs=0",

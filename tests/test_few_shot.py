@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from PIL import Image
 
 import ftl_lightning
@@ -24,6 +23,8 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot, LearnedConcept, Tuned
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import file_hash
 from tests.conftest import CONF, ROOT
@@ -65,7 +66,7 @@ def test_a_model_is_found_by_its_name_or_folder_and_brings_its_settings(scenes: 
     learning, evaluation = told["model"]["init_args"], told["evaluation"]
     tuned = FewShot.from_pretrained("agent").tuned
     assert tuned.inversion.omega == learning["omega"]
-    assert tuned.inversion.tolerance == learning["tolerance"]
+    assert tuned.inversion.budget.tolerance == learning["budget"]["tolerance"]
     assert tuned.sampling.temperature == evaluation["temperature"]
     assert tuned.learning_steps == told["data"]["init_args"]["steps"]
     assert ftl_lightning.FewShot is FewShot
@@ -395,9 +396,9 @@ def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
     )
     torch.manual_seed(0)
     limits = Normalization(torch.zeros(2), torch.tensor([1.0, 2.0]))
-    net = GenerativeModel(config, own_domain(examples, texts, 8, judged), limits, torch.randn(3, 6))
+    net = GenerativeModel(Prepared(config, own_domain(examples, texts, 8, judged), limits, torch.randn(3, 6)))
     net.examples = examples
-    model = FewShot(net.requires_grad_(False).eval(), Tuned(InversionSettings(samples=4), 2, Sampling(steps=5), 1))
+    model = FewShot(net.requires_grad_(False).eval(), Tuned(InversionSettings().changed(samples=4), 2, Sampling(steps=5), 1))
     between = walks("between", 1.0)
     with pytest.raises(UserError, match=r"goal: expected a task of own, such as .*, found 'between'"):
         model.evaluate(between, "between")
@@ -455,14 +456,14 @@ def test_a_learner_with_a_tolerance_stops_by_itself(
     found = scenes.learn(shown, steps=150, progress=True, tolerance=0.5, samples=8)
     told = capsys.readouterr().err
     assert f"learning '{NEW}'" in told
-    settings = replace(scenes.tuned.inversion, tolerance=0.5, samples=8)
+    settings = scenes.tuned.inversion.changed(tolerance=0.5, samples=8)
     losses: list[float] = []
     expected = invert(scenes.model, shown, settings, 150, losses.append)[NEW]
     assert 20 <= len(losses) < 150
     assert torch.equal(found.embeddings, expected.embeddings)
     for changes, message in (
-        ({"modes": "some"}, r"model\.modes: expected a number, 'each' or 'auto', found 'some'"),
-        ({"tolerance": 1}, r"model\.tolerance: expected null or a share from 0 up to 1, found 1"),
+        ({"modes": "some"}, r"model\.modes\.sets: expected a number, 'each' or 'auto', found 'some'"),
+        ({"tolerance": 1}, r"model\.budget\.tolerance: expected null or a share from 0 up to 1, found 1"),
     ):
         with pytest.raises(UserError, match=message):
             scenes.learn(shown, steps=1, **changes)

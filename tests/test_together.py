@@ -21,7 +21,7 @@ from ftl_lightning.tensor_file import atomic, write_text
 
 from .conftest import CONF, ROOT, TINY
 
-INVERT = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), "--data.steps=2", "--model.samples=2"]
+INVERT = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), "--data.steps=2", "--model.budget.samples=2"]
 QUIET = ["--evaluation.samples=1", "--evaluation.steps=1", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
 
 

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning import FewShot
 from ftl_lightning.concepts.composition import Composition
@@ -40,6 +39,7 @@ from ftl_lightning.domains.driving.simulation import advance
 from ftl_lightning.domains.driving.traffic import MAX_STEPS, STATE, STEP, TRAFFIC, decision_seconds
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.progress import bar
 from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
 from ftl_lightning.tensor_file import write_text

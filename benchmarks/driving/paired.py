@@ -11,8 +11,6 @@ import json
 from collections.abc import Mapping
 
 import torch
-from ftl_lightning.learning.baselines.in_context import InContextModel
-from ftl_lightning.learning.generative_model import GenerativeModel
 from torch import Tensor
 
 from ftl_lightning import FewShot
@@ -20,6 +18,8 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from ftl_lightning.methods.in_context.model import InContextModel
 from ftl_lightning.reporting.paired import episodes
 from ftl_lightning.seeding import DEMONSTRATION_SEED
 from ftl_lightning.tensor_file import write_text

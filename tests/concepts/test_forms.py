@@ -25,9 +25,10 @@ from ftl_lightning.diffusion.temporal_unet import over_time
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.testing.strokes import strokes
 from ftl_lightning.tuned import Tuned
 
@@ -233,7 +234,7 @@ def model() -> GenerativeModel:
         denoiser="TemporalUNet",
         denoiser_args=arguments,
     )
-    found = GenerativeModel(config, domain, Normalization.fit(states), normal(3, 6))
+    found = GenerativeModel(Prepared(config, domain, Normalization.fit(states), normal(3, 6)))
     found.examples = examples
     return found.requires_grad_(False).eval()
 
@@ -244,7 +245,7 @@ def model() -> GenerativeModel:
     ids=str,
 )
 def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeModel, options: dict[str, object]) -> None:
-    learner = FewShot(model, Tuned(InversionSettings(samples=8), 40, Sampling(steps=2), 1))
+    learner = FewShot(model, Tuned(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
     before = {name: parameter.clone() for name, parameter in model.named_parameters()}
     demonstrations = learner.demonstrations(strokes("heart", 3, 0), name="heart")
     short, long = (learner.learn(demonstrations, name="heart", steps=steps, **options) for steps in (1, 40))
@@ -263,12 +264,12 @@ def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeMo
 
 
 def test_what_is_learned_with_an_adapter_does_not_depend_on_what_is_learned_beside_it(model: GenerativeModel) -> None:
-    learner = FewShot(model, Tuned(InversionSettings(samples=8), 40, Sampling(steps=2), 1))
+    learner = FewShot(model, Tuned(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
     one = learner.demonstrations(strokes("heart", 3, 0), name="heart")
     other = learner.demonstrations(strokes("square", 3, 0), name="square")
     from ftl_lightning.demonstrations.container import concatenate
 
-    settings = InversionSettings(samples=8, adapter=2)
+    settings = InversionSettings().changed(samples=8, adapter=2)
     alone, beside = invert(model, one, settings, 5), invert(model, concatenate([other, one]), settings, 5)
     assert torch.allclose(alone["heart"].embeddings, beside["heart"].embeddings, atol=1e-5)
     first, second = alone["heart"].adapter, beside["heart"].adapter
@@ -281,18 +282,21 @@ def test_what_is_learned_with_an_adapter_does_not_depend_on_what_is_learned_besi
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"knots": 0}, "model.knots: expected 1 or more, found 0"),
-        ({"adapter": -1}, "model.adapter: expected 0 \\(none\\) or a rank, found -1"),
-        ({"adapter": 2, "tolerance": 0.1}, "model.adapter: expected model.modes 1 and model.tolerance null beside it"),
+        ({"knots": 0}, "model.embeddings.knots: expected 1 or more, found 0"),
+        ({"adapter": -1}, "model.adapter.rank: expected 0 \\(none\\) or a rank, found -1"),
+        (
+            {"adapter": 2, "tolerance": 0.1},
+            "model.adapter.rank: expected model.modes.sets 1 and model.budget.tolerance null beside it",
+        ),
     ],
 )
 def test_settings_that_are_none_are_told(options: dict[str, int], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        InversionSettings(**options)  # type: ignore[arg-type]
+        InversionSettings().changed(**options)
 
 
 def test_knots_are_refused_where_a_plan_is_a_single_state(shipped: Path) -> None:
     learner = FewShot.from_pretrained(shipped)
     scene = learner.domain.source(None).draw("circle right of square", 1, 0)
-    with pytest.raises(UserError, match=r"model\.knots: expected 1 for this model"):
+    with pytest.raises(UserError, match=r"model\.embeddings\.knots: expected 1 for this model"):
         learner.learn(scene, steps=1, knots=4)

@@ -16,7 +16,8 @@ from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, scenes
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import sampled_plans
-from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
 STEPS = 6
@@ -38,7 +39,7 @@ def model(denoiser: str, options: dict[str, Any], prediction: str = "epsilon", *
     )
     torch.manual_seed(0)
     limits = [Normalization(-torch.ones(count), torch.ones(count)) for count in (13, config.vector_dim)]
-    return GenerativeModel(config, load_domain("agent"), limits[0], torch.randn(3, 6), limits[1]).eval()
+    return GenerativeModel(Prepared(config, load_domain("agent"), limits[0], torch.randn(3, 6), limits[1])).eval()
 
 
 @pytest.fixture

@@ -14,13 +14,15 @@ from ftl_lightning.diffusion.image_encoder import ImageEncoder, ImageEncoders, S
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import InversionData, OwnData
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.baselines.cloning import CloningPretraining
-from ftl_lightning.learning.baselines.in_context import InContextPretraining
-from ftl_lightning.learning.baselines.prompting import InContextAdaptation
-from ftl_lightning.learning.diffusion_pretraining import PretrainingModule
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.learning.inversion_settings import BudgetOptions
+from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
+from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.bc.pretraining import CloningPretraining
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
+from ftl_lightning.methods.in_context.pretraining import InContextPretraining
 from ftl_lightning.seeding import generator
 from ftl_lightning.trainer import Trainer
 
@@ -183,7 +185,7 @@ def test_a_model_sees_where_to_go(fitted: Path) -> None:
     assert dict(model.config.feature_dropout) == {"place": 0.4}
     for concept in ("to", "away"):
         assert error(model, concept) < 1.5  # by chance 5
-    again = GenerativeModel.load(fitted)
+    again = read_model(GenerativeModel, fitted)
     assert again.hash == model.hash
 
 
@@ -238,7 +240,7 @@ def test_images_are_read_once_a_plan_and_concepts_are_learned_through_them(fitte
     assert calls == [40]
     calls.clear()
     file = write(fitted.parent / "new.npz", ways("away", 5, 11))
-    module = InversionModule(str(fitted), samples=16, components=1, output="concepts")
+    module = InversionModule(str(fitted), budget=BudgetOptions(samples=16), components=1, output="concepts")
     trainer(max_epochs=1).invert(module, InversionData("own", demonstrations=file, steps=4))
     # Once a step; the rest is where the learned concept is judged.
     assert calls.count(16) == 4
@@ -284,6 +286,6 @@ def test_cloning_looks_once_and_in_context_learning_takes_a_trained_encoder(fitt
     assert read is not None
     for name, weight in source.state_dict().items():
         assert torch.equal(read.state_dict()[name], weight), name
-    adaptation = InContextAdaptation("icl", output="prompts")
+    adaptation = LearnerAdaptation("icl", output="prompts")
     trainer(max_epochs=1).invert(adaptation, InversionData("own", demonstrations=seen, steps=1))
     assert sorted(path.name for path in Path("prompts").iterdir()) == ["away.safetensors", "to.safetensors"]

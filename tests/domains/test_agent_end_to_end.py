@@ -38,7 +38,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_invert_judges_plans_and_executes_them(model: Path) -> None:
-    options = ["--data.steps=3", "--model.samples=2", "--data.demonstrations_per_concept=2"]
+    options = ["--data.steps=3", "--model.budget.samples=2", "--data.demonstrations_per_concept=2"]
     assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET]) == 0
     rows = pd.read_csv("logs/agent/invert/results.csv", keep_default_na=False)
     ours = rows[rows["K"] == 2]
@@ -119,6 +119,6 @@ def test_demonstrations_whose_first_observations_alone_are_known(model: Path) ->
     replace(whole, observed={OBSERVED: first}, per_step=()).save("first.safetensors")
     assert torch.equal(whole.initial_states.observed[OBSERVED], first)
     assert torch.equal(Demonstrations.load("first.safetensors").initial_states.observed[OBSERVED], first)
-    options = ["--data.steps=2", "--model.samples=2", "--evaluation.suites=[paper]", "--evaluation.closed_loop=false"]
+    options = ["--data.steps=2", "--model.budget.samples=2", "--evaluation.suites=[paper]", "--evaluation.closed_loop=false"]
     own = ["--data.demonstrations=first.safetensors"]
     assert main(["invert", *INVERT, f"--model.pretrained={model}", *own, *options, *QUICK, *QUIET]) == 0

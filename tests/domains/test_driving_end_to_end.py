@@ -6,7 +6,6 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.composition import Composition
@@ -18,6 +17,8 @@ from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.traffic import SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.evaluation.closed_loop import planner
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
 
@@ -65,7 +66,7 @@ def test_the_shipped_demonstrations() -> None:
 
 
 def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
-    options = ["--data.steps=3", "--model.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
+    options = ["--data.steps=3", "--model.budget.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
     beside = "--evaluation.environments=[step veto]"
     assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, beside]) == 0
     rows = pd.read_csv("logs/driving/invert/results.csv", keep_default_na=False)
@@ -107,7 +108,7 @@ def test_cells_share_what_reference_policies_did(model: Path, monkeypatch: pytes
 
     for name, make in list(POLICIES.items()):
         monkeypatch.setitem(POLICIES, name, recorded(name, make))
-    options = ["--data.steps=2", "--model.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
+    options = ["--data.steps=2", "--model.budget.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
     for components in (1, 2):
         run = ["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, "--seed_everything=5"]
         assert main([*run, f"--model.components={components}", "--evaluation.samples=1", "--evaluation.results=r.csv"]) == 0
@@ -119,7 +120,7 @@ def test_cells_share_what_reference_policies_did(model: Path, monkeypatch: pytes
 
 def test_the_shipped_model_knows_the_training_scenarios() -> None:
     """On held-out episodes its next states are nearer than those of a vehicle that keeps its speed."""
-    shipped = GenerativeModel.load(ROOT / "pretrained" / "driving")
+    shipped = read_model(GenerativeModel, ROOT / "pretrained" / "driving")
     assert DOMAIN.closed_loop is not None
     assert planner(shipped, DOMAIN.closed_loop) is VIEWS["steps"].act
     for name in ("highway", "merge"):

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,7 +20,10 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, generate, tasks_of
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning import InversionModule, PretrainingModule
+from ftl_lightning.learning.inversion_settings import BudgetOptions
+from ftl_lightning.learning.model_folder import save_model
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.trainer import Trainer
 
 SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go between": (0.5, 0.5)}
@@ -269,7 +271,7 @@ def test_a_model_of_ones_own_data_keeps_what_it_is_judged_by(fitted: Path) -> No
     assert model.examples.hash == held_out.hash
     assert model.domain.plans.horizon == TIME
     assert list(model.domain.metrics) == list(JUDGED)
-    model.save("copy")
+    save_model(model, "copy")
     again = load_model("copy")
     assert again.hash == model.hash
     assert again.examples is not None
@@ -284,7 +286,7 @@ def test_a_model_of_ones_own_data_keeps_what_it_is_judged_by(fitted: Path) -> No
 def test_a_new_concept_is_learned_generated_and_judged_beside_the_known_ones(fitted: Path) -> None:
     np.savez("between.npz", states=walks("go between", 4, 5), concepts="go between")
     data = InversionData("own", demonstrations="between.npz", steps=150)
-    module = InversionModule(str(fitted), samples=16, components=1, output="concepts")
+    module = InversionModule(str(fitted), budget=BudgetOptions(samples=16), components=1, output="concepts")
     judge = Evaluator(samples=8, sampler="ddim", steps=10, temperature=0.1, results="r.csv")
     trainer(max_epochs=1, callbacks=[judge]).invert(module, data)
     assert [path.name for path in Path("concepts").iterdir()] == ["go_between.safetensors"]

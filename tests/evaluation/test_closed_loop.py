@@ -21,7 +21,8 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation import closed_loop
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, reset, roll_out, sampled_plans
 from ftl_lightning.evaluation.tensorboard import gif
-from ftl_lightning.learning.generative_model import DiffusionConfig, GenerativeModel
+from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
 
@@ -172,7 +173,8 @@ def model() -> GenerativeModel:
         diffusion_steps=10,
     )
     limits = torch.tensor([-10.0]), torch.tensor([10.0])
-    return GenerativeModel(config, load_domain("agent"), Normalization(*limits), torch.randn(3, 6), Normalization(*limits)).eval()
+    limited = Normalization(*limits)
+    return GenerativeModel(Prepared(config, load_domain("agent"), limited, torch.randn(3, 6), limited)).eval()
 
 
 def test_episodes_do_not_depend_on_their_neighbours() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 from lightning.pytorch import LightningDataModule
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -23,6 +22,8 @@ from ftl_lightning.evaluation.generation import Generation, execute, generate, t
 from ftl_lightning.evaluation.judged import Judged, standard_error
 from ftl_lightning.evaluation.results import COLUMNS, Row, append_rows, label, labels, read_rows
 from ftl_lightning.evaluation.rows import configuration
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 
 
 class Trained:
@@ -107,7 +108,7 @@ def test_standard_error_over_tasks() -> None:
 
 
 def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: Path) -> None:
-    module = Trained(GenerativeModel.load(tiny))
+    module = Trained(read_model(GenerativeModel, tiny))
     tasks = tasks_of(module.domain, ["training", "paper"], ())
     assert {task.learned for task in tasks} > {()}
     first, again = (generate(module, tasks, Generation(3, "ddim", 4)) for _ in range(2))
@@ -118,7 +119,7 @@ def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: P
 
 
 def test_what_cannot_be_generated_or_executed_is_told(tiny: Path) -> None:
-    module = Trained(GenerativeModel.load(tiny))
+    module = Trained(read_model(GenerativeModel, tiny))
     (judged,) = generate(module, tasks_of(module.domain, ["training"], ())[:1], Generation(2, "ddim", 2))
     with pytest.raises(UserError, match="expected a domain with an environment, found object_rearrangement, which has none"):
         execute(module, [judged], Generation())
@@ -138,7 +139,7 @@ def test_a_task_that_starts_in_demonstrations_needs_some(tiny: Path) -> None:
 
     task = EvaluationTask("s", "merge", learned=("merge",), initial="demonstrated")
     with pytest.raises(UserError, match="evaluation task 'merge': initial: expected demonstrations of 'merge', found none"):
-        generate(Driver(GenerativeModel.load(tiny)), [task], Generation(1))
+        generate(Driver(read_model(GenerativeModel, tiny)), [task], Generation(1))
 
 
 def test_the_keys_of_generation_stand_beside_those_of_the_callback() -> None:
@@ -281,7 +282,7 @@ def test_the_same_measurement_in_an_older_file_is_replaced(tmp_path: Path) -> No
 
 
 def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_by_name_and_version(tiny: Path) -> None:
-    module, data = Trained(GenerativeModel.load(tiny)), LightningDataModule()
+    module, data = Trained(read_model(GenerativeModel, tiny)), LightningDataModule()
     found = []
     for content, name in ((b"one", "a.npz"), (b"one", "b.npz"), (b"two", "a.npz")):
         Path(name).write_bytes(content)

@@ -5,12 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from ftl_lightning.learning.baselines.additive import added
-from ftl_lightning.learning.baselines.cloning import CloningConfig, CloningModel, ParallelMLP
-from ftl_lightning.learning.baselines.in_context import InContextConfig, InContextModel
-from ftl_lightning.learning.baselines.language import LanguageAdaptation
-from ftl_lightning.learning.baselines.transitions import StepConfig, unroll
-from ftl_lightning.learning.baselines.vae import VAEConfig, VAEModel
 from torch import nn
 
 from ftl_lightning.cli import main
@@ -23,8 +17,15 @@ from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.learning.additive import added
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.learning.transitions import StepConfig, unroll
+from ftl_lightning.methods.bc.model import CloningConfig, CloningModel, ParallelMLP
+from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
+from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
+from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.seeding import generator
 from tests.conftest import CONF, ROOT
 from tests.domains.mocap_samples import folder
@@ -41,14 +42,15 @@ def limits(columns: int) -> Normalization:
 def cloning(**changes: object) -> CloningModel:
     config = {**AGENT, "horizon": 6, "concept_dim": 5, "training_concepts": TEXTS, "view": "steps", "hidden_dim": 8} | changes
     torch.manual_seed(0)
-    return CloningModel(CloningConfig(**config), DOMAIN, limits(13), torch.randn(3, 5), limits(52)).eval()  # type: ignore[arg-type]
+    prepared = Prepared(CloningConfig(**config), DOMAIN, limits(13), torch.randn(3, 5), limits(52))  # type: ignore[arg-type]
+    return CloningModel(prepared).eval()
 
 
 def transformer() -> InContextModel:
     sizes = {"tokens": 3, "width": 16, "layers": 1, "heads": 2, "concept_dim": 3 * 65, "horizon": 6}
     torch.manual_seed(0)
     config = InContextConfig(**AGENT, **sizes, training_concepts=TEXTS, view="steps")  # type: ignore[arg-type]
-    return InContextModel(config, DOMAIN, limits(13), torch.randn(3, 3 * 65), limits(52)).eval()
+    return InContextModel(Prepared(config, DOMAIN, limits(13), torch.randn(3, 3 * 65), limits(52))).eval()
 
 
 def sampled(
@@ -121,7 +123,7 @@ def test_the_vae_composes_by_adding_and_its_noise_is_the_temperatures() -> None:
     config = {"domain": "object_rearrangement", "state_dim": 21, "encoder": "e", "horizon": 1, "concept_dim": 4, "hidden_dim": 8}
     torch.manual_seed(0)
     config = VAEConfig(**config, training_concepts=("a", "b"))  # type: ignore[arg-type]
-    model = VAEModel(config, load_domain("object_rearrangement"), limits(21), torch.randn(3, 4)).eval()
+    model = VAEModel(Prepared(config, load_domain("object_rearrangement"), limits(21), torch.randn(3, 4))).eval()
     both = sampled(model, [torch.stack((model.concept("a"), model.concept("b")))], None, 3)
     alone = model.plans((model.concept("a") + model.concept("b"))[None], {})
     assert torch.allclose(both[0], model.decode(alone, {}).expand(3, -1, -1), atol=1e-6)
@@ -198,7 +200,7 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
     if domain not in ("driving", "tabletop"):  # which judge episodes alone
         rows = read_rows("r.csv")
         own = rows[rows["role"] == "method"]
-        assert set(own["method"]) == {model.name}
+        assert set(own["method"]) == {model.method.name}
         assert set(own["demonstrations"]) == {2}
 
 
@@ -237,11 +239,11 @@ def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     drives = load_domain("driving").source(None).split("train", 2, 0).select("merge")
     drives.save("drives.safetensors")
     Path("adapt.yaml").write_text(
-        f"model: {{class_path: {method}.prompting.InContextAdaptation}}\n"
+        "model: {class_path: ftl_lightning.learning.learner_adaptation.LearnerAdaptation}\n"
         "data: {class_path: ftl_lightning.domains.data.InversionData, init_args: {domain: driving}}"
     )
     assert main(["fit", "--config", config, "--config=adapt.yaml", *made, *QUIET]) == 2
-    assert "expected invert (model.class_path: InContextAdaptation learns nothing), found fit" in capsys.readouterr().err
+    assert "expected invert (model.class_path: LearnerAdaptation learns nothing), found fit" in capsys.readouterr().err
     replace(drives, observed=drives.initial_states.observed, per_step=()).save("drives.safetensors")
     assert main(["invert", "--config", config, *made, *QUIET]) == 2
     assert "key 'per_step': expected every feature to be observed at each time" in capsys.readouterr().err
@@ -256,7 +258,7 @@ def test_prompts_can_hide_the_road() -> None:
     model = load_model(ROOT / "pretrained" / "baseline" / "in_context" / "driving")
     assert isinstance(model, InContextModel)
     drives = load_domain("driving").source(None).split("train", 1, 0)
-    shown, hidden = (model.prompts(drives, hide=hide).unflatten(-1, (model.config.tokens, -1)) for hide in (False, True))
+    shown, hidden = (model.prompts(drives, perturbed=hide).unflatten(-1, (model.config.tokens, -1)) for hide in (False, True))
     place = [0, 1, 2, 3]  # of what the view observes: place, and place with what is far squashed
     assert (hidden[..., place] == hidden[0, 0, place]).all()  # nowhere
     assert not (shown[..., place] == hidden[..., place]).all()

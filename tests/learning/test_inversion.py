@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
@@ -20,14 +19,16 @@ from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.inversion import explained, invert
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
+from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
-from tests.conftest import CONF
+from tests.conftest import CONF, inversion_module
 
 
-def learn(tiny: Path, data: InversionData | None = None, **options: object) -> InversionModule:
-    module = InversionModule(str(tiny), samples=8, **options)  # type: ignore[arg-type]
+def learn(tiny: Path, data: InversionData | None = None, **options: Any) -> InversionModule:
+    module = inversion_module(tiny, samples=8, **options)
     data = data or InversionData("object_rearrangement", suite="validation", steps=6)
     settings = {
         "logger": False,
@@ -70,7 +71,7 @@ def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, 
     data = InversionData("object_rearrangement", suite="validation", steps=7)
     module = learn(tiny, data, seed=3, **options)
     told: list[float] = []
-    settings = InversionSettings(samples=8, seed=3, **options)
+    settings = InversionSettings().changed(samples=8, seed=3, **options)
     found = invert(load_model(tiny), data.demonstrations, settings, 7, told.append)
     expected = module.learned()
     assert list(found) == list(expected) == list(data.concepts)
@@ -86,28 +87,28 @@ def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, 
     ("options", "message"),
     [
         ({"components": 0}, r"model\.components: expected 1 or more, found 0"),
-        ({"restarts": 0}, r"model\.restarts: expected 1 or more, found 0"),
-        ({"samples": 0}, r"model\.samples: expected 1 or more, found 0"),
-        ({"off_span": 1.1}, r"model\.off_span: expected 0 \(span\) to 1 \(free\), found 1.1"),
-        ({"timestep_power": 0.5}, r"model\.timestep_power: expected 1 or more, found 0.5"),
-        ({"mode_samples": 0}, r"model\.mode_samples: expected 1 or more, found 0"),
-        ({"modes": 0}, r"model\.modes: expected 1 or more, 'each' or 'auto', found 0"),
-        ({"modes": "some"}, r"model\.modes: expected a number, 'each' or 'auto', found 'some'"),
-        ({"guidance_scale": -1.0}, r"model\.guidance_scale: expected .* found -1"),
-        ({"tolerance": 1}, r"model\.tolerance: expected null or a share from 0 up to 1, found 1"),
-        ({"tolerance": -0.1}, r"model\.tolerance: expected null or a share from 0 up to 1, found -0.1"),
-        ({"loss": "displacement"}, r"model\.loss: expected one of epsilon, v, clean, found 'displacement'"),
+        ({"restarts": 0}, r"model\.budget\.restarts: expected 1 or more, found 0"),
+        ({"samples": 0}, r"model\.budget\.samples: expected 1 or more, found 0"),
+        ({"off_span": 1.1}, r"model\.embeddings\.off_span: expected 0 \(span\) to 1 \(free\), found 1.1"),
+        ({"timestep_power": 0.5}, r"model\.loss\.timestep_power: expected 1 or more, found 0.5"),
+        ({"mode_samples": 0}, r"model\.modes\.samples: expected 1 or more, found 0"),
+        ({"modes": 0}, r"model\.modes\.sets: expected 1 or more, 'each' or 'auto', found 0"),
+        ({"modes": "some"}, r"model\.modes\.sets: expected a number, 'each' or 'auto', found 'some'"),
+        ({"guidance_scale": -1.0}, r"model\.weights\.scale: expected .* found -1"),
+        ({"tolerance": 1}, r"model\.budget\.tolerance: expected null or a share from 0 up to 1, found 1"),
+        ({"tolerance": -0.1}, r"model\.budget\.tolerance: expected null or a share from 0 up to 1, found -0.1"),
+        ({"loss": "displacement"}, r"model\.loss\.kind: expected one of epsilon, v, clean, found 'displacement'"),
     ],
 )
 def test_settings_that_are_none_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        InversionSettings(**options)
+        InversionSettings().changed(**options)
 
 
 def test_a_loss_that_is_not_finite_is_told(tiny: Path) -> None:
     data = InversionData("object_rearrangement", suite="validation", steps=1)
-    with pytest.raises(UserError, match=r"inversion: the loss became nan at step \d; lower model\.learning_rate"):
-        invert(load_model(tiny), data.demonstrations, InversionSettings(samples=2, learning_rate=1e30), 9)
+    with pytest.raises(UserError, match=r"inversion: the loss became nan at step \d; lower model\.budget\.learning_rate"):
+        invert(load_model(tiny), data.demonstrations, InversionSettings().changed(samples=2, learning_rate=1e30), 9)
 
 
 @pytest.mark.parametrize(("power", "expected"), [(1.0, 12.5), (3.0, 50.0)])
@@ -170,7 +171,7 @@ def test_a_concept_file_names_where_it_comes_from(invert: Callable[..., Path], t
     files = sorted(folder.iterdir())
     assert len(files) == 14
     concept = Concept.load(files[0])
-    model = GenerativeModel.load(tiny)
+    model = read_model(GenerativeModel, tiny)
     assert concept.origin.pretrained == model.hash
     assert concept.origin.encoder == model.config.encoder
     assert concept.origin.weights == "fixed"
@@ -261,7 +262,7 @@ def shown(count: int = 5, task: str = RING) -> Demonstrations:
 
 def from_few(tiny: Path, own: Demonstrations, steps: int = 6, **changes: Any) -> Concept:
     """The only concept of some demonstrations."""
-    (found,) = invert(load_model(tiny), own, InversionSettings(samples=8, **changes), steps).values()
+    (found,) = invert(load_model(tiny), own, InversionSettings().changed(samples=8, **changes), steps).values()
     return found
 
 
@@ -405,7 +406,7 @@ def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Pa
     data = InversionData("object_rearrangement", suite="validation", steps=6)
 
     def of(**options: Any) -> dict[str, Any]:
-        return configuration(InversionModule(str(tiny), **options), data, {})
+        return configuration(inversion_module(tiny, **options), data, {})
 
     plain = of()
     assert plain["model/components"] == 2
@@ -438,7 +439,7 @@ def test_options_of_the_trainer_that_change_what_is_learned_are_part_of_the_iden
 
 @pytest.mark.parametrize(("modes", "told"), [(1, ""), (3, ", modes: 3"), ("each", ", modes: each"), ("auto", "")])
 def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told: str) -> None:
-    plain, module = InversionModule(str(tiny)), InversionModule(str(tiny), modes=modes)  # type: ignore[arg-type]
+    plain, module = InversionModule(str(tiny)), inversion_module(tiny, modes=modes)
     assert module.variant == plain.variant + told
     assert module.method == plain.method == "FTL-IGM"
     assert (plain.form, module.form) == ("", "" if modes == 1 else "with modes")
@@ -471,9 +472,11 @@ def test_modes_learn_from_noised_demonstrations_of_a_number_of_their_own(tiny: P
 def test_a_concept_that_is_not_finite_is_not_learned(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--data.suite=validation", "--data.steps=1", "--model.learning_rate=1e30", "--evaluation.samples=1"]
     arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+    options = ["--data.suite=validation", "--data.steps=1", "--model.budget.learning_rate=1e30", "--evaluation.samples=1"]
+    arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
     for tolerance in ("null", "0.01"):
-        more = [f"--model.tolerance={tolerance}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+        more = [f"--model.budget.tolerance={tolerance}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
         assert main([*arguments, *options, *more]) == 2
         assert "inversion: concept" in (told := capsys.readouterr().err)
-        assert "expected finite numbers, found others in 'loss'; lower model.learning_rate" in told
+        assert "expected finite numbers, found others in 'loss'; lower model.budget.learning_rate" in told
     assert not list(Path().rglob("concepts"))

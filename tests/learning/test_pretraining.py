@@ -4,17 +4,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from ftl_lightning.learning.generative_model import GenerativeModel
 from safetensors.torch import load_file
 
 from ftl_lightning.cli import main
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
+from ftl_lightning.learning.model_folder import read_model, save_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from ftl_lightning.methods.ftl_igm.pretraining import LossOptions
 from tests.conftest import CONF, ROOT, TINY
 
 FIT = ["fit", "--config", str(CONF / "object_rearrangement.yaml"), *TINY, "--evaluation.samples=2", "--evaluation.figures=0"]
@@ -37,7 +38,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
     hashes = []
     for index, seed in enumerate((1, 1, 2)):
         assert fit("--trainer.max_steps=12", f"--seed_everything={seed}", f"--model.output=out{index}") == 0
-        hashes.append(GenerativeModel.load(f"out{index}").hash)
+        hashes.append(read_model(GenerativeModel, f"out{index}").hash)
     assert hashes[0] == hashes[1] != hashes[2]
 
 
@@ -47,7 +48,7 @@ def test_several_threads_give_the_same_bytes_too() -> None:
     hashes = []
     for index in range(3):
         assert fit("--trainer.max_steps=12", *wide, f"--model.output=out{index}") == 0
-        hashes.append(GenerativeModel.load(f"out{index}").hash)
+        hashes.append(read_model(GenerativeModel, f"out{index}").hash)
     assert len(set(hashes)) == 1
 
 
@@ -101,13 +102,13 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(capsys: p
     assert not (LOG / "pretrained").exists()
 
 
-def given(batch_size: int, **options: Any) -> tuple[torch.Tensor, torch.Tensor]:
+def given(batch_size: int, loss: LossOptions) -> tuple[torch.Tensor, torch.Tensor]:
     """Timesteps and rows of the concepts that the network is given in the first step of a fit."""
     from ftl_lightning.domains.object_rearrangement.datamodule import ObjectRearrangementData
     from ftl_lightning.trainer import Trainer
 
     seen = []
-    module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 1, "condition_dim": 8}, **options)
+    module = PretrainingModule(denoiser_args={"hidden_dim": 16, "depth": 1, "condition_dim": 8}, loss=loss)
     data = ObjectRearrangementData(samples_per_concept=5, validation_per_concept=1, batch_size=batch_size, steps_per_epoch=1)
 
     def spy(module: torch.nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
@@ -126,13 +127,13 @@ def given(batch_size: int, **options: Any) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_condition_dropout_is_drawn_per_sample() -> None:
-    _, rows = given(400, condition_dropout=0.5)
+    _, rows = given(400, LossOptions(condition_dropout=0.5))
     assert 140 < (rows == 0).sum() < 260  # neither none nor all, as once a batch would give
 
 
 @pytest.mark.parametrize(("power", "noisiest"), [(1.0, 0.10), (3.0, 0.46), (10.0, 0.79)])
 def test_a_power_draws_noisy_timesteps(power: float, noisiest: float) -> None:
-    timesteps, _ = given(2000, timestep_power=power)
+    timesteps, _ = given(2000, LossOptions(timestep_power=power))
     assert timesteps.min() >= 0
     assert timesteps.max() == 99
     assert (timesteps >= 90).float().mean().item() == pytest.approx(noisiest, abs=0.05)
@@ -140,7 +141,7 @@ def test_a_power_draws_noisy_timesteps(power: float, noisiest: float) -> None:
 
 def test_a_task_of_texts_is_composed_with_the_guidance_weight_and_against_others(tiny: Path) -> None:
     module = PretrainingModule(guidance=1.5)
-    module.model = GenerativeModel.load(tiny)
+    module.model = read_model(GenerativeModel, tiny)
     one, other = module.model.config.training_concepts[:2]
     found = module.composition(EvaluationTask("s", "g", texts=(one,), without=(other,)))
     assert found is not None
@@ -150,10 +151,10 @@ def test_a_task_of_texts_is_composed_with_the_guidance_weight_and_against_others
 
 
 def test_the_model_folder_round_trips_and_refuses_mixtures(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = GenerativeModel.load(tiny)
+    model = read_model(GenerativeModel, tiny)
     assert not any(parameter.requires_grad for parameter in model.parameters())
-    model.save(tmp_path / "copy")
-    assert GenerativeModel.load(tmp_path / "copy").hash == model.hash
+    save_model(model, tmp_path / "copy")
+    assert read_model(GenerativeModel, tmp_path / "copy").hash == model.hash
     config = tmp_path / "copy" / "config.json"
     config.write_text(config.read_text().replace(model.hash, "0" * 16))
     assert main(["sample", f"--pretrained={tmp_path / 'copy'}"]) == 2

@@ -74,7 +74,9 @@ def test_every_shipped_configuration_goes_on_to_the_same_bytes(path: Path, tmp_p
         assert found == Path("unbroken/model.safetensors").read_bytes(), step
 
 
-@pytest.mark.parametrize("options", [[], ["--model.adapter=2", "--model.tolerance=null"], ["--model.modes=each"]], ids=str)
+@pytest.mark.parametrize(
+    "options", [[], ["--model.adapter.rank=2", "--model.budget.tolerance=null"], ["--model.modes.sets=each"]], ids=str
+)
 def test_learning_that_is_interrupted_goes_on_to_the_same_bytes(options: list[str], tiny: Path) -> None:
     invert = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}", *options]
     invert += ["--data.suite=validation", "--data.steps=7", "--trainer.accelerator=cpu", "--trainer.enable_progress_bar=false"]

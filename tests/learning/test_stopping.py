@@ -18,6 +18,7 @@ from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.learning.stopping import IDLE, ROUND, Stopping
 from ftl_lightning.trainer import Trainer
+from tests.conftest import inversion_module
 
 RING, BOTH = "circle, triangle and square in a circle of radius 1.25", "triangle right of circle and square above circle"
 
@@ -144,7 +145,7 @@ def shown(*tasks: str) -> Demonstrations:
 
 def learn(model: ConceptModel, *tasks: str, steps: int = 200, **changes: Any) -> tuple[Inversion, int]:
     """An inversion by hand, and the number of its steps."""
-    inversion = Inversion(model, shown(*tasks), InversionSettings(samples=8, **changes))
+    inversion = Inversion(model, shown(*tasks), InversionSettings().changed(samples=8, **changes))
     optimizer, _ = inversion.optimizer(steps)
     for step in range(steps):
         optimizer.zero_grad()
@@ -163,7 +164,7 @@ def test_without_a_tolerance_all_steps_are_made_and_the_last_embeddings_are_lear
 
 
 def test_fewer_steps_than_a_round_has_are_not_lost(model: ConceptModel) -> None:
-    few = InversionSettings(samples=8, tolerance=0.05)
+    few = InversionSettings().changed(samples=8, tolerance=0.05)
     at_all = [invert(model, shown(RING), few, steps)[RING].embeddings for steps in (1, ROUND - 1)]
     start = Inversion(model, shown(RING), few).embeddings[0]
     assert not torch.equal(at_all[0], start)
@@ -179,7 +180,7 @@ def test_a_tolerance_ends_learning_early_at_the_best_round(model: ConceptModel) 
     assert torch.equal(learned.embeddings, inversion.stopping.embeddings[0])
     assert not torch.equal(learned.embeddings, inversion.embeddings[0].detach())
     with torch.no_grad():
-        start = Inversion(model, shown(RING), InversionSettings(samples=8)).learned()[RING]
+        start = Inversion(model, shown(RING), InversionSettings().changed(samples=8)).learned()[RING]
     assert learned.origin.loss < start.origin.loss
 
 
@@ -197,7 +198,7 @@ def test_a_concept_is_the_same_alone_as_beside_one_that_is_learned_longer(model:
 
 
 def test_what_modes_learn_from_does_not_depend_on_which_other_runs_go_on(model: ConceptModel) -> None:
-    inversion = Inversion(model, shown(RING), InversionSettings(samples=8, tolerance=0.1, modes="each", mode_samples=4))
+    inversion = Inversion(model, shown(RING), InversionSettings().changed(samples=8, tolerance=0.1, modes="each", mode_samples=4))
     inversion.step_losses(0)
     every = inversion.step_losses(1)
     assert inversion.stopping is not None
@@ -206,7 +207,7 @@ def test_what_modes_learn_from_does_not_depend_on_which_other_runs_go_on(model: 
 
 
 def test_runs_that_have_stopped_are_not_computed_any_more(model: ConceptModel) -> None:
-    inversion = Inversion(model, shown(RING, BOTH), InversionSettings(samples=4, tolerance=0.1))
+    inversion = Inversion(model, shown(RING, BOTH), InversionSettings().changed(samples=4, tolerance=0.1))
     assert inversion.step_losses(0).shape == (2,)
     assert inversion.stopping is not None
     inversion.stopping.going[0] = False
@@ -224,7 +225,7 @@ def test_runs_that_have_stopped_are_not_computed_any_more(model: ConceptModel) -
 def fit(tiny: Path, steps: int, *, resume: str | None = None, every: int = 0, **options: Any) -> tuple[InversionModule, Trainer]:
     from lightning.pytorch.callbacks import ModelCheckpoint
 
-    module = InversionModule(str(tiny), samples=8, **options)
+    module = inversion_module(tiny, samples=8, **options)
     data = InversionData("object_rearrangement", suite="validation", steps=steps)
     settings: dict[str, Any] = {
         "logger": False,
@@ -249,7 +250,7 @@ def test_with_a_trainer_the_same_is_learned_in_as_many_steps_to_the_bit(tiny: Pa
     module, trainer = fit(tiny, 60, **options)
     told: list[float] = []
     data = InversionData("object_rearrangement", suite="validation", steps=60)
-    found = invert(load_model(tiny), data.demonstrations, InversionSettings(samples=8, **options), 60, told.append)
+    found = invert(load_model(tiny), data.demonstrations, InversionSettings().changed(samples=8, **options), 60, told.append)
     assert trainer.global_step == len(told)
     assert (len(told) < 60) == ("tolerance" in options)
     for name, concept in module.learned().items():

@@ -13,8 +13,9 @@ from ftl_lightning.cli import main
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import Row, append_rows
-from ftl_lightning.learning.generative_model import GenerativeModel
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.reporting.figures import learning_time
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached, read_speed
 from ftl_lightning.seeding import generator
@@ -87,7 +88,7 @@ def test_ratios_are_of_the_ends_and_of_when_the_common_accuracy_is_first_reached
 def test_the_published_procedure_learns_the_same_of_many_concepts_in_a_batch(
     benchmark: dict[str, Callable[..., Any]], tiny: Path
 ) -> None:
-    model = GenerativeModel.load(tiny)
+    model = read_model(GenerativeModel, tiny)
     data = InversionData("object_rearrangement", suite="validation").demonstrations
     states = [data.select(name).states for name in dict.fromkeys(data.concepts)][:3]
     together = benchmark["published_together"](model, states, [generator("cpu", place) for place in range(3)], (1, 5))
@@ -101,11 +102,11 @@ def test_the_published_procedure_learns_the_same_of_many_concepts_in_a_batch(
 
 
 def test_a_curve_of_ours_ends_where_every_run_has_stopped(benchmark: dict[str, Callable[..., Any]], tiny: Path) -> None:
-    model = GenerativeModel.load(tiny)
+    model = read_model(GenerativeModel, tiny)
     data = InversionData("object_rearrangement", suite="validation").demonstrations
     names = tuple(dict.fromkeys(data.concepts))[:2]
     judge = benchmark["Judge"](model, names)
-    settings = InversionSettings(samples=4, tolerance=0.9)  # stops as soon as it can
+    settings = InversionSettings().changed(samples=4, tolerance=0.9)  # stops as soon as it can
     curve = benchmark["our_curve"]("ours", judge, [data.select(name) for name in names], settings, 400, 1)
     steps = [point.steps for point in curve]
     assert steps == sorted(set(steps))
