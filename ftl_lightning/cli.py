@@ -92,7 +92,7 @@ def _dispatch(arguments: list[str]) -> None:
     elif verb == "--version":
         say(__version__)
     elif verb in COMMANDS:
-        inputs.check_inputs(arguments[1:], inputs.command_checks(verb))
+        inputs.check_inputs(arguments[1:], inputs.command_checks(verb), verb)
         from jsonargparse import auto_cli
 
         trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs take no other class
@@ -105,7 +105,7 @@ def _dispatch(arguments: list[str]) -> None:
         if kind:  # options in a class of their own
             function(found)
     elif verb in TRAINER_VERBS:
-        inputs.check_inputs(arguments[1:], inputs.TRAINER)
+        inputs.check_inputs(arguments[1:], inputs.TRAINER, verb)
         from ftl_lightning.lightning_cli import run
 
         run(arguments)

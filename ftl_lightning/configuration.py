@@ -20,7 +20,7 @@ from yaml import YAMLError
 
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.limits import expect_readable
-from ftl_lightning.regrouped import regrouped
+from ftl_lightning.regrouped import class_of, regrouped
 from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
@@ -47,18 +47,26 @@ def _near(path: str | Path) -> str:
     return f"; {parent} holds {', '.join(there)}" if there and folder.resolve() != Path.cwd() else ""
 
 
-def load(path: str | Path) -> dict[str, Any]:
-    """The keys of a configuration file and of all that it builds on.
+def load(path: str | Path, verb: str = "") -> dict[str, Any]:
+    """The keys of a configuration file and of all that it builds on; what is older in a file is told in one line.
+
+    Args:
+        path: of the file.
+        verb: that it configures, which tells older options apart where none of the files names a class.
 
     Raises:
         UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
     """
     try:
-        found = OmegaConf.to_container(OmegaConf.merge(*(keys for _, keys in _parts(find(path), ()))), resolve=False)
+        files = [(str(part), _plain(keys)) for part, keys in _parts(find(path), ())]
+        named = class_of([keys for _, keys in files], verb)
+        found = OmegaConf.to_container(
+            OmegaConf.merge(*(OmegaConf.create(regrouped(keys, where, named)) for where, keys in files)), resolve=False
+        )
     except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
     assert isinstance(found, dict)
-    return regrouped({str(key): value for key, value in found.items()}, str(path))
+    return {str(key): value for key, value in found.items()}
 
 
 def parts(path: str | Path) -> list[Path]:
@@ -70,7 +78,7 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConf
     """Every file with its own keys. ``above`` are the files that led here."""
     if path.resolve() in (one.resolve() for one in above):
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
-    keys = OmegaConf.create(regrouped(read(path), str(path)))
+    keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
     if not isinstance(names, ListConfig | list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
@@ -101,7 +109,11 @@ def read(path: Path) -> dict[str, Any]:
     Raises:
         UserError: as :func:`load`.
     """
-    found = OmegaConf.to_container(_read(path), resolve=False)
+    return _plain(_read(path))
+
+
+def _plain(keys: DictConfig) -> dict[str, Any]:
+    found = OmegaConf.to_container(keys, resolve=False)
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
 
@@ -140,15 +152,19 @@ def configurations(arguments: Sequence[str]) -> list[str]:
     return [value for _, _, value in _given(arguments)]
 
 
-def expanded(arguments: Sequence[str]) -> list[str]:
+def expanded(arguments: Sequence[str], verb: str = "") -> list[str]:
     """A command line with the content of configuration files, as :func:`load` has it, in place of their names.
+
+    Args:
+        arguments: with or without the verb.
+        verb: see :func:`load`.
 
     Raises:
         UserError: as :func:`load`.
     """
     result = list(arguments)
     for index, prefix, value in _given(arguments):
-        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value)))
+        result[index] = prefix + OmegaConf.to_yaml(OmegaConf.create(load(value, verb)))
     return result
 
 

@@ -91,19 +91,20 @@ def command_checks(verb: str) -> Mapping[str, Check]:
     return {**_COMMANDS, **_WRITTEN.get(verb, {})}
 
 
-def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
+def check_inputs(arguments: Sequence[str], checks: Mapping[str, Check], verb: str) -> None:
     """Refuse a command line, its configuration files included, that names input files that are not there or outputs that are none.
 
     Args:
         arguments: those of a verb, without it.
         checks: by option.
+        verb: whose arguments they are.
 
     Raises:
         UserError: for the first one, or for a configuration file that cannot be read.
     """
     values: dict[str, Any] = {}
     for path in configurations(arguments):
-        values |= dict(_flat(load(path), ""))
+        values |= dict(_flat(load(path, verb), ""))
     values |= {option.replace(".init_args.", "."): value for option, value in options(arguments)}
     if {"help", "print_config"} & values.keys() or "-h" in arguments:
         return

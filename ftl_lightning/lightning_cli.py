@@ -270,7 +270,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(regrouped_arguments(arguments, verb)),
+            args=expanded(regrouped_arguments(arguments, verb), verb),
         )
     except OSError as error:
         raise UserError(

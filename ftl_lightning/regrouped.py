@@ -4,9 +4,11 @@ This is the only place that knows how they were called; what is older keeps work
 """
 
 import functools
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ftl_lightning.learning.options import groups_of
 from ftl_lightning.printing import say
 
 PRETRAINING: Mapping[str, str] = {
@@ -41,6 +43,7 @@ INVERSION: Mapping[str, str] = {
     "training_omega": "weights.training",
 }
 """Of an inversion, where each option is, by its flat name, under which results, checkpoints and the Python API know it."""
+_GROUPS = groups_of(PRETRAINING) + groups_of(INVERSION)
 _INVERSIONS = (
     "ftl_lightning.learning.InversionModule",
     "ftl_lightning.learning.inversion_module.InversionModule",
@@ -61,29 +64,49 @@ _EITHER = "learning_rate"
 _PLACES: Mapping[str, str] = {name: place for name, place in {**PRETRAINING, **INVERSION}.items() if name != _EITHER}
 
 
-def regrouped(keys: Mapping[str, Any], where: str) -> dict[str, Any]:
+def class_of(files: Sequence[Mapping[str, Any]], verb: str) -> str:
+    """The class of ``model`` that files which are merged in order configure, as it is called today.
+
+    Args:
+        files: their keys.
+        verb: ``invert``'s is told where no file names one; empty for none.
+    """
+    models = [model for keys in files if isinstance(model := keys.get("model"), Mapping)]
+    named = [str(model["class_path"]) for model in models if model.get("class_path") is not None]
+    path = named[-1] if named else _INVERSIONS[0] if verb == "invert" else ""
+    return CLASSES.get(path, path)
+
+
+def regrouped(keys: Mapping[str, Any], where: str, named: str) -> dict[str, Any]:
     """A configuration file's keys as they are called today; what is older is told in one line.
 
     Args:
-        keys: of one file, or of several that were merged.
+        keys: of the file.
         where: the file.
+        named: the class of ``model``, which another file may name.
     """
+    found, told = _renamed(keys, named)
+    if told:
+        _tell(f"note: {where}: {', '.join(told)}")
+    return found
+
+
+def _renamed(keys: Mapping[str, Any], named: str) -> tuple[dict[str, Any], list[str]]:
+    """The keys as they are called today, and what is told of each that was older."""
     model = keys.get("model")
     if not isinstance(model, Mapping):
-        return dict(keys)
+        return dict(keys), []
     renamed, told = dict(model), []
     path = str(model.get("class_path"))
     if path in CLASSES:
         renamed["class_path"] = CLASSES[path]
         told.append(f"{path} is now {CLASSES[path]}")
-    places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if renamed.get("class_path") in _INVERSIONS else {})
+    places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if named in _INVERSIONS else {})
     options = model.get("init_args")
     if isinstance(options, Mapping):
         renamed["init_args"], names = _grouped(options, places)
         told += [f"model.{name} is now model.{places[name]}" for name in names]
-    if told:
-        _tell(f"note: {where}: {', '.join(told)}")
-    return {**keys, "model": renamed}
+    return {**keys, "model": renamed}, told
 
 
 @functools.cache
@@ -108,6 +131,34 @@ def _grouped(options: Mapping[str, Any], places: Mapping[str, str]) -> tuple[dic
     return result, moved
 
 
+_INLINE: Mapping[str, Sequence[str]] = {
+    "--config": (),
+    "-c": (),
+    "--model": ("model",),
+    "--model.init_args": ("model", "init_args"),
+}
+"""Options that may be given several keys at once, with the keys above these."""
+
+
+def _inline(text: str, above: Sequence[str], named: str) -> tuple[str, list[str]]:
+    """Keys that are themselves an argument as they are called today, and what is told of each that was older."""
+    from omegaconf import OmegaConf  # which learning and sampling without a command line do not need
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    try:
+        keys: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (OmegaConfBaseException, YAMLError, ValueError, TypeError):  # told by the parser
+        return text, []
+    for key in reversed(above):
+        keys = {key: keys}
+    found: Any
+    found, told = _renamed(keys, class_of((keys,), "") or named)
+    for key in above:
+        found = found[key]
+    return (json.dumps(found), told) if told else (text, [])
+
+
 def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
     """A command line's options of ``model`` as they are called today; what is older is told in one line.
 
@@ -120,11 +171,14 @@ def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
     while rest:
         argument = rest.pop(0)
         option, equals, value = argument.partition("=")
-        if not option.startswith("--model"):
+        if not option.startswith("--model") and option not in _INLINE:
             result.append(argument)
             continue
         if not equals and rest and not rest[0].startswith("--"):
             equals, value = "=", rest.pop(0)
+        if option in _INLINE and value.lstrip().startswith("{"):
+            value, more = _inline(value, _INLINE[option], class_of((), verb))
+            told += more
         name = option.removeprefix("--model.").removeprefix("init_args.")
         if name in places and not value.lstrip().startswith("{"):
             told.append(f"{option} is now --model.{places[name]}")
@@ -133,7 +187,7 @@ def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
             told.append(f"{value} is now {CLASSES[value]}")
             value = CLASSES[value]
         group, dot, last = name.partition(".")
-        if dot and value == "null":  # which the parser takes for a text in an option of a group, but not in a group
+        if dot and group in _GROUPS and value == "null":  # which the parser takes for a text in an option of a group, but not in a group
             option, value = f"--model.{group}", f'{{"{last}": null}}'
         result.append(f"{option}{equals}{value}")
     if told:

@@ -35,7 +35,7 @@ class Tuned:
         """
         from ftl_lightning.configuration import load  # OmegaConf, which nothing else here needs
 
-        content = load(path)
+        content = load(path, "invert")
         model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
         options = model.get("init_args") or {}
         learning = {
@@ -65,6 +65,6 @@ class Tuned:
         """
         from ftl_lightning.configuration import load
 
-        data = load(path).get("data") or {}
+        data = load(path, "invert").get("data") or {}
         domain = (data.get("init_args") or {}).get("domain", "")
         return [domain] if ":" in domain and (is_installed(domain.partition(":")[0]) or is_vouched(domain)) else []

@@ -147,7 +147,7 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
 def _log(cell: Cell) -> list[str]:
     """The option that names the log folder of a cell after it, unless the plan names it."""
     option = "trainer.logger.init_args.version"
-    logger = load(cell.config).get("trainer", {}).get("logger")
+    logger = load(cell.config, cell.verb).get("trainer", {}).get("logger")
     named = cell.options.get(option, "null") != "null" or "trainer.logger" in cell.options or not isinstance(logger, Mapping)
     return [] if named else [f"--{option}={cell.folder}"]
 
