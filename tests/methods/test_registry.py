@@ -1,0 +1,160 @@
+"""Methods are found by the name under which a package offers them, and say which models they adapt."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from ftl_lightning.errors import UserError
+from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
+from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.methods.in_context.prompting import prompt
+from ftl_lightning.methods.language.adaptation import LanguageAdaptation
+from ftl_lightning.methods.lora.adaptation import FineTuning
+from ftl_lightning.methods.method import Form, Method
+from ftl_lightning.methods.registry import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
+from tests.conftest import ROOT
+
+KINDS = ["diffusion", "bc", "cvae", "in-context"]
+MODULE = """
+from ftl_lightning.methods.method import Method
+METHOD = Method(name="echo", kind="diffusion", adaptation="echo_method:Missing")
+NOTHING = "a text"
+"""
+BROKEN = "raise RuntimeError('no luck')"
+OFFERED = """[ftl_lightning.methods]
+echo = echo_method:METHOD
+absent = not_installed_anywhere:METHOD
+nameless = echo_method:OTHER
+text = echo_method:NOTHING
+unlucky = unlucky_method:METHOD
+bc = echo_method:METHOD
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installed package that offers methods, of which one is as it should be."""
+    (tmp_path / "echo_method.py").write_text(MODULE)
+    (tmp_path / "unlucky_method.py").write_text(BROKEN)
+    card = tmp_path / "echo_method-1.0.dist-info"
+    card.mkdir()
+    (card / "METADATA").write_text("Metadata-Version: 2.1\nName: echo-method\nVersion: 1.0\n")
+    (card / "entry_points.txt").write_text(OFFERED)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def test_the_six_are_offered_in_the_order_of_tables() -> None:
+    assert SHIPPED == ("ftl_igm", "bc", "cvae", "in_context", "language", "lora")
+    assert method_names()[:6] == SHIPPED
+    names = [method.name for method in methods()]
+    assert len(set(names)) == len(names)
+    assert kinds() == KINDS
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_each_names_classes_that_there_are(name: str) -> None:
+    method = load_method(name)
+    assert issubclass(method.adaptation_class(), Adaptation)
+    assert callable(method.learn())
+    assert method.configurations in ("conf", f"conf/{name}")
+    assert bool(method.model) == bool(method.pretraining)
+    if method.model:
+        assert issubclass(method.model_class(), ConceptModel)
+        assert method.model_class().method is method
+        assert issubclass(method.pretraining_class(), Pretraining)
+        assert method_of(method.kind) is method
+    else:
+        assert method.kind == "diffusion"
+
+
+def test_a_kind_that_no_package_offers_has_no_method() -> None:
+    assert method_of("diffusion") is load_method("ftl_igm")
+    assert method_of("alchemy") is None
+
+
+def test_the_others_adapt_by_gradient_descent_and_in_context_learning_reads() -> None:
+    assert {name: load_method(name).learn() for name in SHIPPED} == dict.fromkeys(SHIPPED, invert) | {"in_context": prompt}
+
+
+@pytest.mark.parametrize(
+    ("adaptation", "expected"),
+    [
+        (InversionModule, ["diffusion", "bc", "cvae"]),
+        (FineTuning, ["diffusion", "bc", "cvae"]),  # what it is derived from adapts these
+        (LanguageAdaptation, ["diffusion"]),
+        (LearnerAdaptation, ["in-context"]),
+        (Adaptation, []),
+    ],
+)
+def test_an_adaptation_adapts_models_of_some_kinds(adaptation: type[Adaptation], expected: list[str]) -> None:
+    assert kinds_for(adaptation) == expected
+    assert [kind for kind in KINDS if adapts(adaptation, kind)] == expected
+    assert not adapts(adaptation, "alchemy")
+
+
+def test_a_form_is_told_by_the_option_that_decides() -> None:
+    method = Method("name", "kind", forms=(Form("with modes", "modes", 1), Form("over time", "knots", 1)))
+    assert method.form({"modes": 1, "knots": 1}) == ""
+    assert method.form({"modes": "each", "knots": 1}) == "with modes"
+    assert method.form({"modes": 2, "knots": 4}) == "with modes over time"
+
+
+def test_a_package_of_ones_own_offers_a_method_beside_ours_and_never_in_place_of_one(package: None) -> None:
+    assert method_names() == (*SHIPPED, "absent", "echo", "nameless", "text", "unlucky")
+    assert load_method("echo").name == "echo"
+    assert load_method("bc").name == "BC"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("chess", r"method: expected one of ftl_igm, bc, cvae, in_context, language, lora, absent, .*, found 'chess'"),
+        ("absent", r"method 'absent': cannot be imported \(ModuleNotFoundError: No module named 'not_installed_anywhere'\); mend"),
+        ("nameless", r"method 'nameless': cannot be imported \(AttributeError: .*has no attribute 'OTHER'\); mend its package"),
+        ("text", "method 'text': expected a Method, found str; mend its package"),
+        ("unlucky", r"method 'unlucky': cannot be imported \(RuntimeError: no luck\); mend its package"),
+    ],
+)
+def test_each_broken_entry_point_is_one_line(name: str, message: str, package: None) -> None:
+    with pytest.raises(UserError, match=message) as told:
+        load_method(name)
+    assert "\n" not in str(told.value)
+
+
+def test_a_class_that_a_method_names_and_that_is_none_is_one_line(package: None) -> None:
+    with pytest.raises(
+        UserError, match=r"method echo: expected 'echo_method:Missing', found no such thing \(.*\); mend its package"
+    ):
+        load_method("echo").adaptation_class()
+    with pytest.raises(UserError, match="method echo: expected '', found no such thing"):
+        load_method("echo").model_class()
+
+
+def test_a_model_that_reads_demonstrations_learns_and_samples_without_a_trainer() -> None:
+    learner = FewShot.from_pretrained(ROOT / "pretrained" / "baseline" / "in_context" / "agent")
+    shown = learner.domain.source(None).draw("go to bowl", 2, 0)
+    learned = learner.learn(shown)
+    expected = prompt(learner.model, shown, learner.tuned.inversion, 0)["go to bowl"]
+    assert torch.equal(learned.concept.embeddings, expected.embeddings)
+    assert learned.concept.weights.tolist() == [1.0, 1.0]
+    assert learned.concept.origin.count == 2
+    assert torch.equal(learner.learn(shown, steps=9, samples=3).concept.embeddings, expected.embeddings)
+    starts = learner.starts("go to bowl", 2)
+    found = learner.sample(learned, 2, starts, steps=1)
+    assert found.states.shape == (2, learner.model.config.horizon, learner.model.config.state_dim)
+    assert found.states.isfinite().all()
+
+
+def test_a_learner_refuses_the_model_of_another_method(shipped: Path) -> None:
+    learner = FewShot.from_pretrained(shipped)
+    shown = learner.domain.source(None).draw("circle right of square", 1, 0)
+    with pytest.raises(UserError, match="model: expected one of in-context learning, found one of"):
+        prompt(learner.model, shown, learner.tuned.inversion, 0)
+    with pytest.raises(UserError, match=r"model\.pretrained: expected a model of kind in-context, found diffusion in"):
+        LearnerAdaptation(str(shipped))
