@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ftl_lightning.errors import UserError, short, shown
-from ftl_lightning.learning.options import groups_of, replaced
+from ftl_lightning.option_groups import groups_of, replaced
 from ftl_lightning.ranges import LARGEST, expect_count, expect_range
 
 if TYPE_CHECKING:

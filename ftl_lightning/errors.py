@@ -23,7 +23,7 @@ def short(text: str, most: int = 60) -> str:
 
 
 def shown(value: object, most: int = 60) -> str:
-    """Anything as Python writes it, likewise."""
+    """Anything as Python writes it, cut to a line's length."""
     try:
         return short(repr(value), most)
     except (ValueError, RecursionError):  # a number of thousands of digits, or lists too deep

@@ -31,6 +31,7 @@ from ftl_lightning.learned_concept import LearnedConcept, concept_of
 from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.hub import download, save_with_card, upload
+from ftl_lightning.learning.learner import Learner
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -240,7 +241,8 @@ class FewShot(Shown):
         if told := longer_than_plans(own, self.model):
             warnings.warn(told, stacklevel=2)
         with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
-            learned = self.model.method.learn()(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
+            learn: Learner = self.model.method.learn()
+            learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
         self._examples.append(own)
         return self._learned(learned[own.concepts[0]])
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ftl_lightning.learning.options import groups_of
+from ftl_lightning.option_groups import groups_of
 from ftl_lightning.printing import say
 
 PRETRAINING: Mapping[str, str] = {

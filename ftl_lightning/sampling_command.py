@@ -28,8 +28,9 @@ class SampleOptions:
         count: samples.
         seed: of the samples.
         sampler: see ftl_lightning.diffusion.samplers; empty for the one that the settings name.
-        steps: of the sampler; 0 likewise.
-        temperature: the paper's alpha; lower is less diverse and more accurate; null likewise.
+        steps: of the sampler; 0 for what the settings name.
+        temperature: the paper's alpha; lower is less diverse and more accurate; null for what the settings
+            name.
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
             drawn from the seed; without a goal, those of the task that the concept was learned from, or of the first composed text.
         initial: demonstrations file whose initial states are used instead; one sample of each.
@@ -37,7 +38,7 @@ class SampleOptions:
         figure: picture to write, .png or .svg.
         execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
             episodes ended.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 likewise.
+        replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 for what the settings name.
         settings: configuration file of invert that says how to sample and how often to plan anew; empty for that of the domain.
         animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
     """

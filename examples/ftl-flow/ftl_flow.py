@@ -15,11 +15,11 @@ from ftl_lightning.diffusion import MLPDenoiser
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.learning.concept_model import Draws
+from ftl_lightning.learning.method import Method
 from ftl_lightning.learning.model_config import ModelConfig
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretraining import Pretraining
 from ftl_lightning.learning.text_concept_model import TextConceptModel
-from ftl_lightning.methods.method import Method
 
 METHOD = Method("flow matching", kind="flow", model="ftl_flow:FlowModel", pretraining="ftl_flow:FlowPretraining")
 Velocity = Callable[[Tensor, Tensor], Tensor]  # (x (batch, horizon, state), t (batch,)) -> like x

@@ -36,9 +36,9 @@ def check(cells: Sequence[Cell]) -> None:
 def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.concepts.encoder import load_encoder
     from ftl_lightning.domains.registry import load_domain
+    from ftl_lightning.learning.methods import adapts, kinds_for
     from ftl_lightning.learning.model_config import read_config
     from ftl_lightning.lightning_cli import parse
-    from ftl_lightning.methods.registry import adapts, kinds_for
 
     config = parse(cell.verb, cell.arguments)
     model, data = config["model"]["init_args"], config["data"]["init_args"]

@@ -19,8 +19,8 @@ from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.longer import longer_than_plans
+from ftl_lightning.learning.methods import adapts, kinds_for
 from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.methods.registry import adapts, kinds_for
 from ftl_lightning.printing import say
 from ftl_lightning.targets import expect_writable_file
 

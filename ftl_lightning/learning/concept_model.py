@@ -15,9 +15,9 @@ from ftl_lightning.demonstrations.features import Feature, Observed, expect_feat
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.learning.method import Method
 from ftl_lightning.learning.model_config import ModelConfig, find_view
 from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.methods.method import Method
 from ftl_lightning.representation import Shown, counted
 from ftl_lightning.tensor_file import bytes_hash, serialise
 

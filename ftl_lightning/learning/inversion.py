@@ -2,7 +2,6 @@
 
 import logging
 import math
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -21,7 +20,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.stopping import Stopping
 from ftl_lightning.learning.text_concept_model import TextConceptModel
-from ftl_lightning.seeding import generator
+from ftl_lightning.seeding import generator, task_key
 
 _LOG = logging.getLogger(__name__)
 
@@ -79,7 +78,7 @@ class Inversion(nn.Module):
         self.register_buffer("_modes", torch.tensor([run.mode > 0 for run in self.runs]), persistent=False)
         # A generator for each concept, so that its start does not depend on what is learned beside it. Its modes start alike.
         shape = (settings.budget.restarts, settings.components, model.config.concept_dim)
-        draws = [generator("cpu", settings.seed, 0, zlib.crc32(name.encode())) for name in self.concepts]
+        draws = [generator("cpu", settings.seed, 0, task_key(name)) for name in self.concepts]
         starts = [torch.randn(shape, generator=draw) for draw in draws]
         start = torch.cat([starts[run.concept] for run in self.runs[:: settings.budget.restarts]])[:, :, None]
         self.embeddings = nn.Parameter(settings.embeddings.initial_spread * start.repeat(1, 1, settings.embeddings.knots, 1))

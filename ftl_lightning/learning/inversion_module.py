@@ -20,8 +20,8 @@ from ftl_lightning.learning.inversion_settings import (
     ModeOptions,
     WeightOptions,
 )
-from ftl_lightning.learning.options import flat, groups_of
 from ftl_lightning.learning.resume import ExactResume
+from ftl_lightning.option_groups import flat, groups_of
 from ftl_lightning.regrouped import INVERSION
 
 _USUAL = InversionSettings()

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.diffusion.schedule import LARGEST_POWER
 from ftl_lightning.errors import UserError
-from ftl_lightning.learning.options import replaced
+from ftl_lightning.option_groups import replaced
 from ftl_lightning.ranges import LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.regrouped import INVERSION
 

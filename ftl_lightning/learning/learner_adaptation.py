@@ -3,6 +3,7 @@
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.learner import Learner
 
 
 class LearnerAdaptation(Adaptation):
@@ -19,5 +20,5 @@ class LearnerAdaptation(Adaptation):
         self.save_hyperparameters()
 
     def learned(self) -> dict[str, Concept]:
-        learn = self.model.method.learn()
+        learn: Learner = self.model.method.learn()
         return learn(self.model, self.demonstrations, InversionSettings(seed=self.hparams["seed"]), 0)

@@ -8,9 +8,9 @@ from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.registry import is_known, load_domain
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.methods import kinds, method_of
 from ftl_lightning.learning.model_config import CONFIG, read_config
 from ftl_lightning.learning.model_folder import read_model
-from ftl_lightning.methods.registry import kinds, method_of
 from ftl_lightning.shipped import pretrained_folder
 
 

@@ -26,9 +26,9 @@ from ftl_lightning.learning.checkpoint import Random
 from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.learning.model_config import ModelConfig, find_view
 from ftl_lightning.learning.model_folder import save_model
-from ftl_lightning.learning.options import groups_of
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.resume import ExactResume
+from ftl_lightning.option_groups import groups_of
 from ftl_lightning.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
 from ftl_lightning.seeding import generator
 
@@ -64,7 +64,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     model: M
     raw: M
     flat: ClassVar[Mapping[str, str]] = {}
-    """Of options in groups, where each is by its flat name, ``'group.option'``, see :mod:`ftl_lightning.learning.options`."""
+    """Of options in groups, where each is by its flat name, ``'group.option'``, see :mod:`ftl_lightning.option_groups`."""
     form: str = ""
     """Words behind the name in tables, of a method that has several forms."""
     variant: str = ""

@@ -19,7 +19,7 @@ class Stopping(nn.Module):
 
     Args:
         embeddings: where runs start ``(run, K, knots, n)``.
-        weights: likewise ``(run, K)``.
+        weights: where the weights of runs start ``(run, K)``.
         tolerance: a run stops when :data:`IDLE` rounds one after another gained less than this share of its whole gain.
 
     Attributes:

@@ -9,9 +9,9 @@ import pytest
 
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.inversion_settings import GROUPS, BudgetOptions, InversionSettings, LossOptions, ModeOptions
-from ftl_lightning.learning.options import flat, groups_of, replaced
 from ftl_lightning.methods.ftl_igm import pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
+from ftl_lightning.option_groups import flat, groups_of, replaced
 from ftl_lightning.regrouped import INVERSION, PRETRAINING
 from tests.conftest import inversion_module
 

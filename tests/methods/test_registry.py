@@ -12,17 +12,17 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_module import InversionModule
 from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
+from ftl_lightning.learning.method import Form, Method
+from ftl_lightning.learning.methods import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
 from ftl_lightning.learning.pretraining import Pretraining
 from ftl_lightning.methods.in_context.prompting import prompt
 from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.methods.lora.adaptation import FineTuning
-from ftl_lightning.methods.method import Form, Method
-from ftl_lightning.methods.registry import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
 from tests.conftest import ROOT
 
 KINDS = ["diffusion", "bc", "cvae", "in-context"]
 MODULE = """
-from ftl_lightning.methods.method import Method
+from ftl_lightning.learning.method import Method
 METHOD = Method(name="echo", kind="diffusion", adaptation="echo_method:Missing")
 NOTHING = "a text"
 """

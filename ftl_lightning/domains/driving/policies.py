@@ -45,7 +45,7 @@ def _always(name: str) -> Make:
 
 
 def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
-    """Any decision, replaced likewise."""
+    """Any decision at random, each as likely as the others."""
     count = int(_made(goal).action_space.n)
     draws = [generator("cpu", seed, row) for row in range(len(starts))]
     return lambda observed, rows, step: torch.stack([torch.randint(count, (1,), generator=draws[row]).float() for row in rows])

@@ -12,7 +12,7 @@ from ftl_lightning.domains.driving.traffic import FEATURES_SEEN, NAMES, SCENARIO
 SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
 """Between two decisions, by the number of the scenario."""
 KNOWN = torch.tensor([name in TRAINING_CONCEPTS for name in NAMES])
-"""Whether it is a road of pretraining, likewise."""
+"""Whether it is a road of pretraining, by the number of the scenario."""
 NEAR = 20.0
 """Metres; distances far beyond look alike, or a gap of some metres would be lost beside the hundred that can be seen."""
 _PAIRS = ((1, 3, 5), (2, 4, 6))

@@ -1,7 +1,7 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details')."""
 
 from ftl_lightning.domains.paper import WITH_MODES
-from ftl_lightning.methods.method import Form, Method
+from ftl_lightning.learning.method import Form, Method
 
 METHOD = Method(
     name="BC",

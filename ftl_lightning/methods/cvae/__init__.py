@@ -1,7 +1,7 @@
 """A conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the concepts it is paired with."""
 
 from ftl_lightning.domains.paper import WITH_MODES
-from ftl_lightning.methods.method import Form, Method
+from ftl_lightning.learning.method import Form, Method
 
 METHOD = Method(
     name="CVAE",

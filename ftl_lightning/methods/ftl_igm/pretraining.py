@@ -13,11 +13,11 @@ from ftl_lightning.diffusion.schedule import LARGEST_POWER, MOST_STEPS, denoisin
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.options import flat, groups_of
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretraining import Pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
+from ftl_lightning.option_groups import flat, groups_of
 from ftl_lightning.ranges import expect_count, expect_factor, expect_range
 from ftl_lightning.regrouped import PRETRAINING
 

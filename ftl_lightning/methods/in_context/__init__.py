@@ -1,6 +1,6 @@
 """In-context learning (paper, 'Baselines'; Xu et al., 2022): a transformer reads demonstrations and goes on as they do."""
 
-from ftl_lightning.methods.method import Method
+from ftl_lightning.learning.method import Method
 
 METHOD = Method(
     name="in-context",

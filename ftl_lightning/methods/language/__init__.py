@@ -1,7 +1,7 @@
 """Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, told in words what the new task is."""
 
+from ftl_lightning.learning.method import Method
 from ftl_lightning.methods.ftl_igm import METHOD as OURS
-from ftl_lightning.methods.method import Method
 
 METHOD = Method(
     name="language",

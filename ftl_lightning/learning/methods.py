@@ -2,14 +2,10 @@
 
 import importlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.methods.method import Method
+from ftl_lightning.learning.method import Method
 from ftl_lightning.trust import entry_points
-
-if TYPE_CHECKING:
-    from ftl_lightning.learning.adaptation import Adaptation
 
 GROUP = "ftl_lightning.methods"
 """Entry-point group in which a package offers methods: ``name = package.module:METHOD``."""
@@ -63,11 +59,11 @@ def method_of(kind: str) -> Method | None:
     return next((method for method in methods() if method.model and method.kind == kind), None)
 
 
-def adapts(adaptation: "type[Adaptation]", kind: str) -> bool:
+def adapts(adaptation: type, kind: str) -> bool:
     """Whether an adaptation adapts models of a kind: a method of this kind names it, or what it is derived from."""
     return any(method.kind == kind and issubclass(adaptation, method.adaptation_class()) for method in methods())
 
 
-def kinds_for(adaptation: "type[Adaptation]") -> list[str]:
+def kinds_for(adaptation: type) -> list[str]:
     """The kinds of models that an adaptation adapts."""
     return list(dict.fromkeys(method.kind for method in methods() if issubclass(adaptation, method.adaptation_class())))

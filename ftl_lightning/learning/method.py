@@ -3,15 +3,9 @@
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ftl_lightning.errors import UserError
-
-if TYPE_CHECKING:
-    from ftl_lightning.learning.adaptation import Adaptation
-    from ftl_lightning.learning.concept_model import ConceptModel
-    from ftl_lightning.learning.learner import Learner
-    from ftl_lightning.learning.pretraining import Pretraining
 
 
 @dataclass(frozen=True)
@@ -40,7 +34,8 @@ class Method:
         kind: of its pretrained models, as their ``config.json`` says. A method that adapts another's models has that one's kind.
         adaptation: the LightningModule of ``invert``, an :class:`~ftl_lightning.learning.adaptation.Adaptation`.
         model: the network, a :class:`~ftl_lightning.learning.concept_model.ConceptModel`; empty where it is another method's.
-        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.learning.pretraining.Pretraining`; empty likewise.
+        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.learning.pretraining.Pretraining`; empty where the
+            network is another method's.
         learner: how concepts are learned without a trainer, a :class:`~ftl_lightning.learning.learner.Learner`; gradient descent
             through the model's losses unless it says otherwise.
         forms: of its concepts, in the order in which their names are joined.
@@ -56,19 +51,19 @@ class Method:
     forms: Sequence[Form] = ()
     configurations: str = ""
 
-    def model_class(self) -> "type[ConceptModel]":
+    def model_class(self) -> Any:
         """The network's class."""
         return self._named(self.model)
 
-    def pretraining_class(self) -> "type[Pretraining[Any]]":
+    def pretraining_class(self) -> Any:
         """The LightningModule of ``fit``."""
         return self._named(self.pretraining)
 
-    def adaptation_class(self) -> "type[Adaptation]":
+    def adaptation_class(self) -> Any:
         """The LightningModule of ``invert``."""
         return self._named(self.adaptation)
 
-    def learn(self) -> "Learner":
+    def learn(self) -> Any:
         """How concepts are learned without a trainer."""
         return self._named(self.learner)
 
