@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ftl_lightning.learning.inversion_module import InversionModule
-    from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 
 __all__ = ["InversionModule", "PretrainingModule"]
 
