@@ -4,7 +4,6 @@ Name, plans, concepts and source are required; everything else has a default.
 """
 
 import difflib
-import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -118,16 +117,6 @@ class Concepts:
             object.__setattr__(self, "descriptions", tuple(texts))
         if self.reads is _UNSAID:
             object.__setattr__(self, "reads", frozenset(self.descriptions).__contains__)
-
-
-def deferred(reference: str) -> Callable[..., Any]:
-    """A function that is imported when it is called first, such as one that draws: matplotlib takes half a second to import.
-
-    Args:
-        reference: ``'package.module:function'``.
-    """
-    module, _, name = reference.partition(":")
-    return lambda *arguments: getattr(importlib.import_module(module), name)(*arguments)
 
 
 class Source(Protocol):

@@ -18,8 +18,9 @@ from ftl_lightning.domains.agent.published import PUBLISHED
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
+from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split, deferred
+from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import VALIDATION_SEED

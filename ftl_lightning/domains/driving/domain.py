@@ -11,8 +11,9 @@ from torch import Tensor
 from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split, deferred
+from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED

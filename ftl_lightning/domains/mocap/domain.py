@@ -5,7 +5,8 @@ from pathlib import Path
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates, expect_starts
-from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show, deferred
+from ftl_lightning.domains.deferred import deferred
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
 from ftl_lightning.domains.mocap.actions import TESTED, action, judged
 from ftl_lightning.domains.mocap.judge import identity
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, GROUPS, HORIZON

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Show, deferred
+from ftl_lightning.domains.deferred import deferred
+from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Show
 from ftl_lightning.domains.paper import Paper, Published
 from ftl_lightning.domains.tabletop.interface import (
     FEATURES,
