@@ -8,6 +8,7 @@ import pandas as pd
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
+from ftl_lightning.learning.methods import load_method
 from ftl_lightning.reporting.paired import leads, least_certain, same_outcome, signed
 from ftl_lightning.reporting.shown import (
     domain_of,
@@ -32,8 +33,10 @@ from ftl_lightning.reporting.tables import (
     summarise,
 )
 
-LANGUAGE = "language"
-METHODS = (PAPERS_METHOD, Compared(OURS, WITH_MODES), *map(Compared, ("BC", "CVAE", "in-context", LANGUAGE)))
+BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
+"""The paper's, by their names in tables."""
+LANGUAGE = BASELINES[-1]
+METHODS = (PAPERS_METHOD, Compared(OURS, WITH_MODES), *map(Compared, BASELINES))
 """The order of methods in tables; others come after them."""
 ALIKE = 0.9
 """In this share of episodes, at least, a reference policy ends as ours does to be told."""
