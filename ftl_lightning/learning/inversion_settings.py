@@ -69,7 +69,7 @@ class WeightOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ModeOptions:
-    """Several sets of embeddings of a concept, see :class:`~ftl_lightning.concepts.composition.Modes`.
+    """Several sets of embeddings of a concept, see :class:`~ftl_lightning.concepts.modes.Modes`.
 
     Attributes:
         sets: 1 is the paper's form; otherwise beside it, from the same start, a set is learned from every demonstration
