@@ -187,7 +187,7 @@ def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
             told.append(f"{value} is now {CLASSES[value]}")
             value = CLASSES[value]
         group, dot, last = name.partition(".")
-        if dot and group in _GROUPS and value == "null":  # which the parser takes for a text in an option of a group, but not in a group
+        if dot and group in _GROUPS and value == "null":  # a text to the parser in an option of a group, but not in a group
             option, value = f"--model.{group}", f'{{"{last}": null}}'
         result.append(f"{option}{equals}{value}")
     if told:
