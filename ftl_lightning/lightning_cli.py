@@ -6,8 +6,10 @@ import warnings
 from argparse import ArgumentError
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import NoneType
+from typing import Any, get_args, get_type_hints
 
 import lightning.pytorch as pl
 from jsonargparse import Namespace, set_parsing_settings
@@ -51,7 +53,7 @@ class CommandLine(LightningCLI):
         verb = self.config.get("subcommand")
         self._expect_keys(self.config[verb] if verb else self.config, args)
         for key in ("model", "data"):
-            _expect_values(key, (self.config[verb] if verb else self.config).get(key))
+            _expect_values(key, (self.config[verb] if verb else self.config).get(key), [option for option, _ in options(args)])
         seed = (self.config[verb] if verb else self.config).get("seed_everything")
         if isinstance(seed, int) and not isinstance(seed, bool):
             expect_range("seed_everything", seed, 0, 2**32 - 1)
@@ -163,8 +165,14 @@ class CommandLine(LightningCLI):
             read_checkpoint(path)
 
 
-def _expect_values(key: str, found: Namespace | None) -> None:
-    """Refuse what jsonargparse takes for a value that was not given: null where the class takes no ``None``.
+def _expect_values(key: str, found: Namespace | None, given: Sequence[str]) -> None:
+    """Refuse what jsonargparse takes for a value that was not given, null where the class takes no ``None``, and the beginning of
+    a name in a group of options for the name.
+
+    Args:
+        key: ``model`` or ``data``.
+        found: what it came to.
+        given: names of options on the command line.
 
     Raises:
         ArgumentError: naming the key.
@@ -176,10 +184,20 @@ def _expect_values(key: str, found: Namespace | None) -> None:
     for base in reversed(getattr(sys.modules.get(module), name, object).__mro__):
         with suppress(Exception):  # annotations of others may name what is not there
             hints |= get_type_hints(vars(base)["__init__"])
+    groups = {name: get_type_hints(hint) for name, hint in hints.items() if is_dataclass(hint)}
+    in_groups = {f"{name}.{option}": hint for name, options in groups.items() for option, hint in options.items()}
+    for option in given:
+        name = option.removeprefix(f"{key}.init_args.").removeprefix(f"{key}.")
+        if option.startswith(f"{key}.") and name.partition(".")[0] in groups and name not in groups and name not in in_groups:
+            raise ArgumentError(None, f"Option '{key}.{name}' is not accepted")
     for name, value in (found.get("init_args") or Namespace()).items(branches=True):
-        hint = hints.get(name)
+        hint = (hints | in_groups).get(name)
         if value is None and hint in (int, float, str, bool):
             raise ArgumentError(None, f'Key "{key}.{name}": Expected a {hint}. Got value: null')
+        if value is None and name in groups:
+            raise ArgumentError(None, f'Key "{key}.{name}": expected some of {", ".join(groups[name])}, found null')
+        if value is None and name in in_groups and NoneType not in get_args(hint):
+            raise ArgumentError(None, f'Key "{key}.{name}": expected a value, found null')
 
 
 def _behind(error: BaseException) -> str:

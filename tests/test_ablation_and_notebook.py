@@ -151,14 +151,14 @@ def with_options(stage: dict[str, object], **more: object) -> dict[str, object]:
 
 
 def test_a_failing_cell_is_told_at_the_end_and_stops_no_other(quick: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
-    failing = with_options(quick, **{"model.learning_rate": 1e30, "data.steps": 20})
+    failing = with_options(quick, **{"model.budget.learning_rate": 1e30, "data.steps": 20})
     assert main(["ablate", "--config", plan("a.yaml", failing, quick)]) == 2
     told = capsys.readouterr()
     assert "1 of 2 cells failed" in told.err
     # The failed one with its command, the other without.
     assert "[1/2, about" in told.out
     assert "invert object_rearrangement, seed 0: failed: " in told.out
-    assert "--model.learning_rate=1e+30" in told.out
+    assert "--model.budget.learning_rate=1e+30" in told.out
     assert told.out.count("python -m ftl_lightning") == 1
     assert (Path("logs") / "object_rearrangement" / "invert_object_rearrangement_seed_0_1" / "results.csv").is_file() is False
     assert "the loss became" in told.err
@@ -230,7 +230,7 @@ def test_a_ray_cluster_of_two_workers_measures_the_same(quick: dict[str, object]
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
         Path("b.yaml").write_text(Path("a.yaml").read_text().replace("r.csv", "s.csv"))
-        failing = with_options(quick, **{"model.learning_rate": 1e30, "data.steps": 20})
+        failing = with_options(quick, **{"model.budget.learning_rate": 1e30, "data.steps": 20})
         content = yaml.safe_load(Path("b.yaml").read_text())
         Path("b.yaml").write_text(yaml.safe_dump(content | {"stages": [*content["stages"], failing]}))
         assert main(["ablate", "--config", "b.yaml", "--executor", "ray"]) == 2  # the failing cell is told

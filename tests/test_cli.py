@@ -531,7 +531,7 @@ def test_sizes_of_baselines_out_of_their_ranges_are_one_line(method: str, option
 @pytest.mark.parametrize(
     "option",
     [
-        "--model.learning_rate=-1",
+        "--model.budget.learning_rate=-1",
         "--model.weights.learning_rate=.inf",
         "--model.adapter.learning_rate=-1",
         "--model.embeddings.initial_spread=-1",

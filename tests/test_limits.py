@@ -256,15 +256,18 @@ def test_who_has_larger_files_says_so(capsys: Told, monkeypatch: pytest.MonkeyPa
             (FIT, f"data.{key}")
             for key in ("batch_size", "horizon", "samples_per_concept", "steps_per_epoch", "validation_per_concept")
         ),
-        *((FIT, f"model.{key}") for key in ("diffusion_steps", "code_knots", "code_size", "timestep_power", "guidance")),
+        *((FIT, f"model.{key}") for key in ("diffusion_steps", "codes.knots", "codes.size", "loss.timestep_power", "guidance")),
         *((FIT, f"evaluation.{key}") for key in ("samples", "steps", "figures", "replan", "temperature")),
         *((FIT, f"trainer.{key}") for key in ("num_nodes", "devices")),
         *(([*INVERT, HERE], f"data.{key}") for key in ("steps", "demonstrations_per_concept")),
         *(
             ([*INVERT, HERE], f"model.{key}")
-            for key in ("samples", "components", "restarts", "mode_samples", "knots", "modes", "adapter")
+            for key in ("components", "budget.samples", "budget.restarts", "modes.samples", "modes.sets", "embeddings.knots")
         ),
-        *(([*INVERT, HERE], f"model.{key}") for key in ("omega", "initial_omega", "guidance_scale", "timestep_power")),
+        *(
+            ([*INVERT, HERE], f"model.{key}")
+            for key in ("omega", "weights.initial", "weights.scale", "loss.timestep_power", "adapter.rank")
+        ),
         *((SAMPLE, key) for key in ("count", "steps", "replan", "temperature")),
         (["generate", "driving"], "count"),
         (["generate", "driving"], "workers"),

@@ -70,9 +70,9 @@ STOPPING = "trainer.callbacks=[{class_path: lightning.pytorch.callbacks.EarlySto
         ("seed_everything=-1", "seed_everything"),
         *(
             (f"model.{key}=null", f"model.{key}")
-            for key in ("learning_rate", "weight_decay", "ema_decay", "condition_dropout", "seed")
+            for key in ("learning_rate", "weight_decay", "ema_decay", "loss.condition_dropout", "seed", "loss", "codes")
         ),
-        *((f"model.{key}=null", f"model.{key}") for key in ("timestep_power", "guidance", "loss_discount", "diffusion_steps")),
+        *((f"model.{key}=null", f"model.{key}") for key in ("loss.timestep_power", "guidance", "loss.discount", "diffusion_steps")),
         *(
             (f"data.{key}=null", f"data.{key}")
             for key in ("batch_size", "samples_per_concept", "steps_per_epoch", "encoder", "seed")
@@ -126,7 +126,7 @@ def test_options_of_fit(option: str, expected: str, capsys: Told) -> None:
         ("model.weights.initial=1e38", "model.weights.initial"),
         ("model.weights.training=1e38", "model.weights.training"),
         ("model.weights.scale=1e38", "model.weights.scale"),
-        ("model.learning_rate=1e38", "model.learning_rate"),
+        ("model.budget.learning_rate=1e38", "model.budget.learning_rate"),
         ("model.weights.learning_rate=-1", "model.weights.learning_rate"),
         ("model.loss.timestep_power=1e9", "model.loss.timestep_power: expected a number from 1 to 100"),
         ("model.loss.kind=foo", "model.loss.kind"),
@@ -134,6 +134,13 @@ def test_options_of_fit(option: str, expected: str, capsys: Told) -> None:
         ("model.budget.tolerance=nan", "tolerance"),
         ("model.adapter.rank=true", "adapter"),
         ("model.components=1.5", "components"),
+        ("model.budget=null", "key 'model.budget': expected some of samples, restarts, learning_rate, tolerance, found null"),
+        ("model.budget.samples=null", "key 'model.budget.samples': expected int, found null"),
+        ("model.samples=null", "key 'model.budget.samples': expected int, found null"),
+        ("model.modes.sets=null", "key 'model.modes.sets': expected a value, found null"),
+        ("model.budget.sample=3", "argument 'model.budget.sample' is not accepted"),
+        ("model.init_args.budget.sample=3", "argument 'model.budget.sample' is not accepted"),
+        ("model.budget={sample: 3}", "key 'sample' is not accepted"),
         ("model.embeddings.off_span=2", "model.embeddings.off_span"),
         ("evaluation.suites=[foo]", "evaluation.suites: expected some of training"),
         ("trainer.max_epochs=0", "trainer.max_epochs"),

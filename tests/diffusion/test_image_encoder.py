@@ -21,7 +21,7 @@ from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.methods.bc.pretraining import CloningPretraining
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
+from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.methods.in_context.pretraining import InContextPretraining
 from ftl_lightning.seeding import generator
 from ftl_lightning.trainer import Trainer
@@ -158,7 +158,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
         denoiser_args={"hidden_dim": 64, "depth": 2, "condition_dim": 32},
         diffusion_steps=20,
         prediction="clean",
-        loss="clean",
+        loss=LossOptions(kind="clean"),
         learning_rate=3e-3,
         warmup_steps=20,
         ema_decay=0.98,
