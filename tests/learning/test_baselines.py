@@ -86,7 +86,7 @@ def test_plans_are_unrolled_state_by_state_and_straight_between(stride: int, cal
         return torch.stack((torch.zeros(2, 13), torch.full((2, 13), 0.1 * stride)), dim=1)
 
     initial = torch.randn(2, 52)
-    plans = unroll(model, predict, {OBSERVED: initial})
+    plans = unroll(model, model.config, predict, {OBSERVED: initial})
     expected = initial[:, None, :13] + 0.1 * torch.arange(10)[None, :, None]
     assert torch.allclose(plans, expected, atol=1e-5)
     assert len(seen) == called
