@@ -28,7 +28,7 @@ from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
 from ftl_lightning.judging import judged, picture
 from ftl_lightning.learned_concept import LearnedConcept, concept_of
-from ftl_lightning.learning.concept_check import expect_concept
+from ftl_lightning.learning.concept_check import expect_concept, expect_sizes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.hub import download, save_with_card, upload
 from ftl_lightning.learning.learner import Learner
@@ -237,14 +237,16 @@ class FewShot(Shown):
         settings = replace(
             changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION), seed=int(seed)
         )
+        self.model.method.expect_settings(changes)
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         if told := longer_than_plans(own, self.model):
             warnings.warn(told, stacklevel=2)
         with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
             learn: Learner = self.model.method.learn()
             learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
+        expect_sizes(self.model, concept := learned[own.concepts[0]])
         self._examples.append(own)
-        return self._learned(learned[own.concepts[0]])
+        return self._learned(concept)
 
     def starts(self, goal: str, count: int = 10, seed: int = 0) -> InitialStates:
         """New initial states of a task, with scenes where there is an environment.

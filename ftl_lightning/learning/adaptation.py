@@ -44,8 +44,10 @@ class Adaptation(pl.LightningModule, ABC):
         self.model: ConceptModel = load_model(pretrained)
         kind = self.model.method.kind
         if not adapts(type(self), kind):
-            expected = " or ".join(kinds_for(type(self)))
-            raise UserError(f"model.pretrained: expected a model of kind {expected}, found {kind} in {pretrained}")
+            expected = " or ".join(kinds_for(type(self))) or "another"
+            told = f"expected a model of kind {expected}, found {kind} in {pretrained}"
+            module = self.model.method.adaptation.replace(":", ".")
+            raise UserError(f"model.pretrained: {told}, which model.class_path {module} adapts")
         self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()

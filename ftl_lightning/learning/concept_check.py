@@ -25,9 +25,18 @@ def expect_concept(model: ConceptModel, concept: Concept, path: str | Path) -> N
                 f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(found)!r}; learn it again"
             )
     with about(path):
-        if (width := concept.embeddings.shape[2]) != model.config.concept_dim:
-            raise UserError(f"key 'embeddings': expected {model.config.concept_dim} numbers each, found {width}")
-        if concept.knots > 1 and not model.over_time:
-            raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")
-        if concept.adapter is not None:
-            model.expect_adapter(concept.adapter)
+        expect_sizes(model, concept)
+
+
+def expect_sizes(model: ConceptModel, concept: Concept) -> None:
+    """Refuse a concept whose sizes are not those of a model.
+
+    Raises:
+        UserError: naming the key.
+    """
+    if (width := concept.embeddings.shape[2]) != model.config.concept_dim:
+        raise UserError(f"key 'embeddings': expected {model.config.concept_dim} numbers each, found {width}")
+    if concept.knots > 1 and not model.over_time:
+        raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")
+    if concept.adapter is not None:
+        model.expect_adapter(concept.adapter)

@@ -1,11 +1,14 @@
 """What a method is: one declaration that a package offers through the entry-point group ``ftl_lightning.methods``."""
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ftl_lightning.errors import UserError
+
+INVERSION = "ftl_lightning.learning.inversion:invert"
+"""The learner of methods whose concepts are learned by gradient descent."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,19 @@ class Method:
     adaptation: str = "ftl_lightning.learning.inversion_module:InversionModule"
     model: str = ""
     pretraining: str = ""
-    learner: str = "ftl_lightning.learning.inversion:invert"
+    learner: str = INVERSION
     forms: Sequence[Form] = ()
     configurations: str = ""
+
+    def expect_settings(self, names: Iterable[str]) -> None:
+        """Refuse settings of an inversion where concepts are not learned by gradient descent.
+
+        Raises:
+            UserError: naming the first.
+        """
+        if self.learner != INVERSION and (name := next(iter(names), None)) is not None:
+            told = f"as {self.name} learns without gradient descent, found {name}"
+            raise UserError(f"learn: expected no settings of an inversion, {told}")
 
     def model_class(self) -> Any:
         """The network's class."""

@@ -71,6 +71,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     """What tells it apart from others of the same method in tables."""
     concepts: tuple[str, ...] = ()
     """Names of learned concepts; pretraining learns none."""
+    unused: Tensor | None
+    """A parameter of nothing, where the model has none that could be learned."""
     stride: int = 1
     """States of a window from one that is learned from to the next."""
 
@@ -104,6 +106,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             expect_range(f"model.feature_dropout.{name}", share, 0, 1)
         self.seed = seed
         self.guidance = guidance
+        self.register_parameter("unused", None)
         self._validated = False
         self._random: Random | None = None
 
@@ -179,6 +182,9 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
             self.model.examples = data.examples
         self.raw = copy.deepcopy(self.model)
+        if not any(parameter.requires_grad for parameter in self.raw.parameters()):
+            # Of a model that memorises: steps are still counted, so there has to be something that they are of.
+            self.unused = torch.nn.Parameter(torch.zeros(()))
         self.model.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> Self:
@@ -211,14 +217,15 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                 "lower model.learning_rate"
             )
         self.log("train/loss", loss, prog_bar=True)
-        return loss
+        return loss if self.unused is None else loss + 0 * self.unused
 
     def optimizer_step(self, *arguments: Any, **options: Any) -> None:
         """Step, then update the running average; here, so that no checkpoint falls between the two."""
         super().optimizer_step(*arguments, **options)
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
+        if self.unused is None:
+            with torch.no_grad():
+                torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
         # The same noise every time, so that the curve shows the model and not the draw.
@@ -236,7 +243,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         total = int(self.trainer.estimated_stepping_batches)
         warmup = max(min(self.hparams["warmup_steps"], total // 10), 1)
         optimizer = torch.optim.AdamW(
-            self.raw.parameters(),
+            self.raw.parameters() if self.unused is None else [self.unused],
             lr=self.hparams["learning_rate"],
             weight_decay=self.hparams["weight_decay"],
             fused=True,
