@@ -456,7 +456,7 @@ def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told
     ],
 )
 def test_a_method_and_its_form_are_told_apart(tiny: Path, settings: dict[str, Any], told: tuple[str, str]) -> None:
-    module = InversionModule(str(tiny), **settings)
+    module = inversion_module(tiny, **settings)
     assert (module.method, module.form) == told
 
 
@@ -470,10 +470,8 @@ def test_modes_learn_from_noised_demonstrations_of_a_number_of_their_own(tiny: P
 
 
 def test_a_concept_that_is_not_finite_is_not_learned(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--data.suite=validation", "--data.steps=1", "--model.learning_rate=1e30", "--evaluation.samples=1"]
-    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
     options = ["--data.suite=validation", "--data.steps=1", "--model.budget.learning_rate=1e30", "--evaluation.samples=1"]
-    arguments = ["invert", "--config", str(CONF / "invert" / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
     for tolerance in ("null", "0.01"):
         more = [f"--model.budget.tolerance={tolerance}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
         assert main([*arguments, *options, *more]) == 2
