@@ -271,8 +271,8 @@ def test_a_run_with_a_former_name_says_one_line(told: Told) -> None:
 
 def test_settings_go_with_a_domain_by_its_name() -> None:
     assert settings_of("agent") == "conf/agent.yaml"
-    assert settings_of("agent", "in_context") == "conf/in_context/agent.yaml"
-    assert settings_of("object_rearrangement", "in_context") == settings_of("chess") == "conf/own.yaml"
+    assert settings_of("agent", "conf/in_context") == "conf/in_context/agent.yaml"
+    assert settings_of("object_rearrangement", "conf/in_context") == settings_of("chess") == "conf/own.yaml"
     write("conf/chess.yaml", "defaults: [conf/verb.yaml, conf/method/ftl_igm.yaml]\n")
     assert settings_of("chess") == "conf/own.yaml"  # for pretraining alone
     write(

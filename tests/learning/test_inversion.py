@@ -24,7 +24,7 @@ from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
-from tests.conftest import CONF, inversion_module
+from tests.conftest import CONF, ROOT, inversion_module
 
 
 def learn(tiny: Path, data: InversionData | None = None, **options: Any) -> InversionModule:
@@ -455,8 +455,8 @@ def test_a_table_tells_forms_with_modes_apart(tiny: Path, modes: int | str, told
         ({"adapter": 2, "adapter_scope": "all"}, ("LoRA fine-tuning", "")),
     ],
 )
-def test_a_method_and_its_form_are_told_apart(tiny: Path, settings: dict[str, Any], told: tuple[str, str]) -> None:
-    module = inversion_module(tiny, **settings)
+def test_a_method_and_its_form_are_told_apart(settings: dict[str, Any], told: tuple[str, str]) -> None:
+    module = inversion_module(ROOT / "pretrained" / "agent", **settings)
     assert (module.method, module.form) == told
 
 
