@@ -11,7 +11,7 @@ import argparse
 import importlib
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from ftl_lightning.learning.inversion_module import InversionModule
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
 from ftl_lightning.shipped import shipped
+from ftl_lightning.tuned import Tuned
 
 TEMPERATURES = (0.1, 0.3, 0.6, 1.0, 1.5)
 NOISE = (0.1, 0.2, 0.4, 0.6, 0.8)
@@ -50,7 +51,7 @@ class Form:
         method: its name in tables.
         variant: what tells it apart from others of the same method; may be empty.
         config: configuration file of ``invert``, where ``{domain}`` stands for the domain.
-        changes: of the module's arguments, for ours those of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
+        changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, by flat names.
         tempered: whether the temperature matters.
     """
 
@@ -72,12 +73,17 @@ FORMS = {
 """By name on the command line."""
 
 
-def adapted(form: Form, config: Mapping[str, Any], demonstrations: Demonstrations, seed: int) -> Adaptation:
-    """A method that has learned the concepts of some demonstrations, without a trainer."""
+def adapted(path: str, changes: Mapping[str, Any], demonstrations: Demonstrations, seed: int) -> Adaptation:
+    """A method, configured by a file, that has learned the concepts of some demonstrations, without a trainer."""
+    config = load(path, "invert")
     module_name, _, class_name = config["model"]["class_path"].rpartition(".")
-    arguments = {**config["model"]["init_args"], **form.changes, "seed": seed}
+    kind: type[Adaptation] = getattr(importlib.import_module(module_name), class_name)
+    arguments = {**config["model"]["init_args"], "seed": seed}
     arguments["pretrained"] = str(shipped(arguments["pretrained"]))
-    module: Adaptation = getattr(importlib.import_module(module_name), class_name)(**arguments)
+    if issubclass(kind, InversionModule):
+        settings = Tuned.read(path).inversion.changed(**changes, seed=seed)
+        arguments |= {one.name: getattr(settings, one.name) for one in fields(settings)}
+    module = kind(**arguments)
     module.demonstrations = demonstrations.fitted(module.domain.observed)
     module.concepts = tuple(dict.fromkeys(demonstrations.concepts))
     if isinstance(module, InversionModule):
@@ -130,10 +136,11 @@ def measure(domain: Domain, suite: str, form: Form, seed: int, samples: int, out
             missing.append(temperature)
     if not missing:
         return
-    config = load(form.config.format(domain=domain.name))
+    path = form.config.format(domain=domain.name)
+    config = load(path, "invert")
     drawn = InversionData(domain.name, suite, seed=seed).demonstrations
     learned = dict.fromkeys(name for task in tasks for name in task.learned)
-    module: Any = adapted(form, config, concatenate([drawn.select(concept) for concept in learned]), seed)
+    module: Any = adapted(path, form.changes, concatenate([drawn.select(concept) for concept in learned]), seed)
     sampling = {key: config["evaluation"][key] for key in ("sampler", "steps") if key in config["evaluation"]}
     for temperature in missing:
         evaluator = Evaluator([suite], samples, temperature=temperature or 0.0, seed=seed, **sampling)

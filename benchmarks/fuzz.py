@@ -40,6 +40,7 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
 from ftl_lightning.learning.checkpoint import read_checkpoint
+from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
@@ -317,7 +318,7 @@ class Fuzz:
         """A learned concept, checked against its model and sampled from."""
         path = self._written("concept.safetensors", odd_safetensors(draw.choice(self.concepts), draw))
         found = Concept.load(path)
-        self.model.check(found, path)
+        expect_concept(self.model, found, path)
         _sampled(self.model, found)
         found.save(self.folder / "again.safetensors")
 

@@ -22,6 +22,7 @@ from ftl_lightning.domains.mocap.measures import distances, diversity, learned_e
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.mocap.source import POSE, Recorded, pieces
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
+from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -96,7 +97,7 @@ def table(
         for place in places:
             path = place / f"{concept.replace(' ', '_')}.safetensors"
             learned = Concept.load(path)
-            model.check(learned, path)
+            expect_concept(model, learned, path)
             rows[name if len(places) == 1 else f"{name}, {place.name}"] = generated(model, learned.composition, starts, seed)
     halves = {**distances(real[::2], real[1::2], seed), "diversity": diversity(real, seed)}
     found = {name: {**distances(own, real, seed), "diversity": diversity(own, seed)} for name, own in rows.items()}

@@ -18,7 +18,7 @@ import platform
 import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean, median
 from typing import Any, TypeVar
@@ -265,7 +265,7 @@ def main() -> None:
     options = parser.parse_args()
     model, tuned = read_model(GenerativeModel, options.pretrained), Tuned.read(options.config)
     changes = {key: value for key in ("tolerance", "samples") if (value := getattr(options, key)) is not None}
-    settings = replace(tuned.inversion, seed=options.seed, modes=1, **changes)
+    settings = tuned.inversion.changed(seed=options.seed, modes=1, **changes)
     most = options.steps or tuned.learning_steps
     domain = load_domain(model.config.domain)
     suite = domain.concepts.suites[SUITE]
@@ -302,7 +302,12 @@ def main() -> None:
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
         },
-        "settings": {"samples": settings.samples, "tolerance": settings.tolerance, "steps": most, "seed": options.seed},
+        "settings": {
+            "samples": settings.budget.samples,
+            "tolerance": settings.budget.tolerance,
+            "steps": most,
+            "seed": options.seed,
+        },
         "seconds": {
             f"{PUBLISHED}{'' if options.full else f' (scaled from {steps} steps)'}": round(curves[PUBLISHED][-1].seconds, 1),
             ONE: round(curves[ONE][-1].seconds, 3),
