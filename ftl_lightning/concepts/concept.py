@@ -146,7 +146,7 @@ class Concept(Shown):
         Raises:
             UserError: naming ``where`` and the first of them.
         """
-        expect_finite(self.numbers, where, "lower model.learning_rate")
+        expect_finite(self.numbers, where, "lower model.budget.learning_rate")
         for name, value in self.numbers.items():
             if name != "loss" and value.numel() and not value.abs().max() <= LARGEST_FACTOR:
                 raise UserError(f"{where}: expected numbers up to {LARGEST_FACTOR:g}, found larger ones in {short(name)!r}")
