@@ -11,7 +11,7 @@ import argparse
 import importlib
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.learning.inversion_settings import GROUPS, InversionSettings
 from ftl_lightning.lightning_cli import parse
 from ftl_lightning.progress import bar
 from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
@@ -50,12 +51,7 @@ class Form:
         method: its name in tables, and its form.
         variant: what tells it apart from others of the same method and form; may be empty.
         configs: configuration files of ``invert``, added to one another, where ``{domain}`` stands for the domain.
-    =======
-        method: its name in tables.
-        variant: what tells it apart from others of the same method; may be empty.
-        configs: configuration files of ``invert``, added to one another, where ``{domain}`` stands for the domain.
-    >>>>>>> w-conf
-        changes: of the module's arguments, for ours those of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`.
+        changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, by flat names.
         tempered: whether the temperature matters.
     """
 
@@ -78,11 +74,17 @@ FORMS = {
 
 
 def adapted(form: Form, config: Mapping[str, Any], demonstrations: Demonstrations, seed: int) -> Adaptation:
-    """A method that has learned the concepts of some demonstrations, without a trainer."""
+    """A method, configured by files, that has learned the concepts of some demonstrations, without a trainer."""
     module_name, _, class_name = config["model"]["class_path"].rpartition(".")
-    arguments = {**config["model"]["init_args"], **form.changes, "seed": seed}
+    kind: type[Adaptation] = getattr(importlib.import_module(module_name), class_name)
+    arguments = {**config["model"]["init_args"], "seed": seed}
     arguments["pretrained"] = str(shipped(arguments["pretrained"]))
-    module: Adaptation = getattr(importlib.import_module(module_name), class_name)(**arguments)
+    if issubclass(kind, InversionModule):
+        options = {name: GROUPS[name](**value) if name in GROUPS else value for name, value in arguments.items()}
+        names = [field.name for field in fields(InversionSettings)]
+        settings = InversionSettings(**{name: options[name] for name in names}).changed(**form.changes)
+        arguments |= {name: getattr(settings, name) for name in names}
+    module = kind(**arguments)
     module.demonstrations = demonstrations.fitted(module.domain.observed)
     module.concepts = tuple(dict.fromkeys(demonstrations.concepts))
     if isinstance(module, InversionModule):

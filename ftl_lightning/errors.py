@@ -65,7 +65,7 @@ def mistake_of_machine(error: BaseException) -> str | None:
     if isinstance(error, MemoryError) or any(words in text for words in _NO_MEMORY):
         return (
             f"memory: this takes more than the machine has ({short(text, 100) or 'none is left'}); lower data.batch_size, "
-            "model.samples, evaluation.samples or count"
+            "model.budget.samples, evaluation.samples or count"
         )
     if isinstance(error, UnicodeEncodeError) or "null byte" in text or "null character" in text:
         return f"name of a file: expected letters that a file system takes, found others ({short(ascii(text), 100)})"
