@@ -119,6 +119,7 @@ def test_plans_of_driving_are_made_without_the_simulator_and_executed_with_it() 
 
 def test_what_needs_scikit_learn_says_so() -> None:
     calls = """
+from ftl_lightning.errors import UserError
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
 from ftl_lightning.reporting.figures import concept_map
 
