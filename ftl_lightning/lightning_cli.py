@@ -20,7 +20,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from ftl_lightning import log_folder, trust
-from ftl_lightning.configuration import configurations, expanded, parts
+from ftl_lightning.configuration import configurations, expanded, load, parts
 from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.inputs import options
@@ -278,6 +278,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
         logging.getLogger(name).setLevel(logging.WARNING)
+    files = [load(path, verb) for path in configurations(arguments)]
     try:
         return kind(
             pl.LightningModule,
@@ -288,7 +289,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(regrouped_arguments(arguments, verb), verb),
+            args=expanded(regrouped_arguments(arguments, verb, files), verb),
         )
     except OSError as error:
         raise UserError(

@@ -5,7 +5,7 @@ This is the only place that knows how they were called; what is older keeps work
 
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ftl_lightning.option_groups import groups_of
@@ -48,6 +48,10 @@ _INVERSIONS = (
     "ftl_lightning.learning.InversionModule",
     "ftl_lightning.learning.inversion_module.InversionModule",
     "ftl_lightning.methods.lora.adaptation.FineTuning",
+)
+_PRETRAININGS = (
+    "ftl_lightning.learning.PretrainingModule",
+    "ftl_lightning.methods.ftl_igm.pretraining.PretrainingModule",
 )
 _BASELINES = "ftl_lightning.learning.baselines"
 CLASSES: Mapping[str, str] = {
@@ -101,12 +105,21 @@ def _renamed(keys: Mapping[str, Any], named: str) -> tuple[dict[str, Any], list[
     if path in CLASSES:
         renamed["class_path"] = CLASSES[path]
         told.append(f"{path} is now {CLASSES[path]}")
-    places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if named in _INVERSIONS else {})
+    places = _places(named)
     options = model.get("init_args")
     if isinstance(options, Mapping):
         renamed["init_args"], names = _grouped(options, places)
         told += [f"model.{name} is now model.{places[name]}" for name in names]
     return {**keys, "model": renamed}, told
+
+
+def _places(named: str) -> Mapping[str, str]:
+    """Where flat options are of a class, of an unknown one those that are the same for both of ours; of others none."""
+    if named in _INVERSIONS:
+        return INVERSION
+    if named in _PRETRAININGS:
+        return PRETRAINING
+    return {} if named else _PLACES
 
 
 @functools.cache
@@ -159,14 +172,24 @@ def _inline(text: str, above: Sequence[str], named: str) -> tuple[str, list[str]
     return (json.dumps(found), told) if told else (text, [])
 
 
-def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
+def _pairs(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Every option with its value, as ``--option=value`` or ``--option value``."""
+    for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
+        option, equals, value = argument.partition("=")
+        yield option, value if equals else following
+
+
+def regrouped_arguments(arguments: Sequence[str], verb: str, files: Sequence[Mapping[str, Any]] = ()) -> list[str]:
     """A command line's options of ``model`` as they are called today; what is older is told in one line.
 
     Args:
         arguments: those of a verb, without it.
-        verb: ``invert`` has all of its options of the kind in groups.
+        verb: whose class they are of where nothing names one.
+        files: keys of the configuration files that the command line names, in order.
     """
-    places = dict(_PLACES) | ({_EITHER: INVERSION[_EITHER]} if verb == "invert" else {})
+    given = [value for option, value in _pairs(arguments) if option in ("--model", "--model.class_path") and "{" not in value]
+    named = CLASSES.get(given[-1], given[-1]) if given else class_of(files, verb)
+    places = _places(named)
     result, told, rest = [], [], list(arguments)
     while rest:
         argument = rest.pop(0)
@@ -177,7 +200,7 @@ def regrouped_arguments(arguments: Sequence[str], verb: str) -> list[str]:
         if not equals and rest and not rest[0].startswith("--"):
             equals, value = "=", rest.pop(0)
         if option in _INLINE and value.lstrip().startswith("{"):
-            value, more = _inline(value, _INLINE[option], class_of((), verb))
+            value, more = _inline(value, _INLINE[option], named)
             told += more
         name = option.removeprefix("--model.").removeprefix("init_args.")
         if name in places and not value.lstrip().startswith("{"):

@@ -12,7 +12,7 @@ from ftl_lightning.configuration import load
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.rows import config_hash, configuration
 from ftl_lightning.lightning_cli import build, parse
-from ftl_lightning.regrouped import CLASSES, INVERSION, regrouped_arguments
+from ftl_lightning.regrouped import CLASSES, INVERSION, class_of, regrouped_arguments
 from ftl_lightning.tuned import Tuned
 from tests.conftest import CONF, refused
 
@@ -239,3 +239,13 @@ def test_a_mistaken_value_under_an_older_name_is_one_line(capsys: Told) -> None:
     refused(capsys, ["invert", "--config=old.yaml"], "samples")
     write("old.yaml", OLD.replace("InversionModule", "Inversions"))
     refused(capsys, ["invert", "--config=old.yaml"], "Inversions")
+
+
+def test_options_of_a_plug_in_s_classes_are_its_own() -> None:
+    keys = {"model": {"class_path": "my_method.Pretraining", "init_args": {"samples": 3, "knots": 2, "loss": "huber"}}}
+    assert regrouped.regrouped(keys, "mine.yaml", class_of([keys], "fit")) == keys
+    options = ["--model.samples=3", "--model.loss", "huber"]
+    same = ["--model.samples=3", "--model.loss=huber"]
+    assert regrouped_arguments(["--model=my_method.Pretraining", *options], "fit")[1:] == same
+    assert regrouped_arguments(options, "invert", [keys]) == same
+    assert regrouped_arguments(options, "invert") == ["--model.budget.samples=3", "--model.loss.kind=huber"]
