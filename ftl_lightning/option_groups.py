@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ftl_lightning.errors import UserError, shown
+
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
@@ -27,9 +29,17 @@ def flat(groups: Mapping[str, object], places: Mapping[str, str]) -> dict[str, A
     Args:
         groups: by name.
         places: of each flat name where its option is, ``'group.option'``.
+
+    Raises:
+        UserError: for what is no group.
     """
-    split = {name: place.split(".") for name, place in places.items()}
-    return {name: getattr(groups[group], option) for name, (group, option) in split.items()}
+    options = {}
+    for name, place in places.items():
+        group, _, option = place.partition(".")
+        if not hasattr(groups[group], option):
+            raise UserError(f"model.{group}: expected a group of options with {option!r}, found {shown(groups[group])}")
+        options[name] = getattr(groups[group], option)
+    return options
 
 
 def replaced(settings: S, options: Mapping[str, Any], places: Mapping[str, str]) -> S:

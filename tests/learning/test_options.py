@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.inversion_settings import GROUPS, BudgetOptions, InversionSettings, LossOptions, ModeOptions
 from ftl_lightning.methods.ftl_igm import pretraining
@@ -111,3 +112,8 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
         "code_noise": 0.3,
     }
     assert not {"codes", "budget"} & fit.hparams.keys()
+
+
+def test_what_is_no_group_is_told_in_one_line() -> None:
+    with pytest.raises(UserError, match="^model.loss: expected a group of options with 'condition_dropout', found 'v'$"):
+        PretrainingModule(loss="v")
