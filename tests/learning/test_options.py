@@ -115,5 +115,5 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
 
 
 def test_what_is_no_group_is_told_in_one_line() -> None:
-    with pytest.raises(UserError, match="^model.loss: expected a group of options with 'condition_dropout', found 'v'$"):
+    with pytest.raises(UserError, match=r"^model\.loss: expected a group of options with 'condition_dropout', found 'v'$"):
         PretrainingModule(loss="v")
