@@ -217,6 +217,6 @@ def test_ablations_comparison_and_curves_are_not_mixed(results: Path, capsys: py
 def test_the_map_of_concepts_names_them_all() -> None:
     model = load_model(ROOT / "pretrained" / "agent")
     origin = Origin("go to green cone", "agent", "e", "p", "d", 5, "fixed", 0.1)
-    concept = Concept(torch.randn(2, model.config.concept_dim), torch.ones(2), origin)
+    concept = Concept(torch.randn(2, 1, model.config.concept_dim), torch.ones(2), origin)
     texts = {text.get_text() for text in concept_map(model, [concept]).axes[0].texts}
     assert texts == {*model.config.training_concepts, "go to green cone [1]", "go to green cone [2]"}
