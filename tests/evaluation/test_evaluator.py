@@ -135,7 +135,7 @@ def test_a_task_that_starts_in_demonstrations_needs_some(tiny: Path) -> None:
         domain = load_domain("driving")
 
         def composition(self, task: EvaluationTask) -> Composition | None:
-            return Composition(torch.zeros(1, 384), torch.ones(1))
+            return Composition(torch.zeros(1, 1, 384), torch.ones(1))
 
     task = EvaluationTask("s", "merge", learned=("merge",), initial="demonstrated")
     with pytest.raises(UserError, match="evaluation task 'merge': initial: expected demonstrations of 'merge', found none"):
