@@ -22,7 +22,12 @@ def method_names() -> tuple[str, ...]:
 def _offered() -> dict[str, str]:
     """Where the methods are, ``module:ATTRIBUTE`` by name; a name of ours is ours whatever another package offers."""
     offered = {point.name: point.value for point in reversed(entry_points(GROUP))}
-    return offered | {name: f"ftl_lightning.methods.{name}:METHOD" for name in SHIPPED}
+    return offered | _ours()
+
+
+def _ours() -> dict[str, str]:
+    """This package's, which are known without a look at what is installed."""
+    return {name: f"ftl_lightning.methods.{name}:METHOD" for name in SHIPPED}
 
 
 def load_method(name: str) -> Method:
@@ -31,10 +36,14 @@ def load_method(name: str) -> Method:
     Raises:
         UserError: if there is none of that name, or it is something else.
     """
-    offered = _offered()
+    offered = _ours() if name in SHIPPED else _offered()
     if name not in offered:
         raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")
-    module, _, attribute = offered[name].partition(":")
+    return _loaded(name, offered[name])
+
+
+def _loaded(name: str, reference: str) -> Method:
+    module, _, attribute = reference.partition(":")
     try:
         method = getattr(importlib.import_module(module), attribute)
     except Exception as error:  # whatever a module raises that is imported
@@ -46,7 +55,8 @@ def load_method(name: str) -> Method:
 
 def methods() -> Iterator[Method]:
     """All that installed packages offer, in the order of tables; each is imported when it is its turn."""
-    return (load_method(name) for name in method_names())
+    yield from (_loaded(name, reference) for name, reference in _ours().items())
+    yield from (_loaded(name, reference) for name, reference in sorted(_offered().items()) if name not in SHIPPED)
 
 
 def kinds() -> list[str]:

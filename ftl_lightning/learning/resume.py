@@ -1,5 +1,6 @@
 """Resuming exactly: a run that was interrupted ends with the same bytes as the unbroken one."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,7 +10,7 @@ from ftl_lightning.learning.checkpoint import check_parameters, check_restored, 
 from ftl_lightning.tensor_file import expect_finite
 
 
-class ExactResume(pl.LightningModule):
+class ExactResume(pl.LightningModule, ABC):
     """Signs checkpoints, refuses those of something else or with numbers that are not finite, and looks at what was restored."""
 
     prefix: ClassVar[str] = ""
@@ -19,9 +20,9 @@ class ExactResume(pl.LightningModule):
     resumed_from = 0
     """The step of the checkpoint that was loaded; 0 for none."""
 
+    @abstractmethod
     def signature(self) -> Mapping[str, Any]:
         """Settings that must match before a checkpoint is loaded."""
-        raise NotImplementedError
 
     def on_train_start(self) -> None:
         """Look at what was restored, if anything."""

@@ -11,6 +11,7 @@ from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_module import InversionModule
+from ftl_lightning.learning.inversion_settings import AdapterOptions
 from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
 from ftl_lightning.learning.method import Form, Method
 from ftl_lightning.learning.methods import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
@@ -160,3 +161,8 @@ def test_a_learner_refuses_the_model_of_another_method(shipped: Path) -> None:
         prompt(learner.model, shown, learner.tuned.inversion, 0)
     with pytest.raises(UserError, match=r"model\.pretrained: expected a model of kind in-context, found diffusion in"):
         LearnerAdaptation(str(shipped))
+
+
+def test_fine_tuning_changes_every_branch_whatever_the_adapter_s_options_say() -> None:
+    module = FineTuning(str(ROOT / "pretrained" / "agent"), adapter=AdapterOptions(rank=2))
+    assert (module.method, module.settings.adapter) == ("LoRA fine-tuning", AdapterOptions(rank=2, scope="all"))

@@ -1,5 +1,6 @@
 """Fine-tuning the whole denoiser by a low-rank adapter."""
 
+from dataclasses import replace
 from typing import Any
 
 from ftl_lightning.learning.inversion_module import InversionModule
@@ -18,4 +19,4 @@ class FineTuning(InversionModule):
     """
 
     def __init__(self, pretrained: str, adapter: AdapterOptions = _WHOLE, **options: Any) -> None:
-        super().__init__(pretrained, adapter=adapter, **options)
+        super().__init__(pretrained, adapter=replace(adapter, scope="all"), **options)
