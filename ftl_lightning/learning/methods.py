@@ -26,7 +26,7 @@ def _offered() -> dict[str, str]:
 
 
 def _ours() -> dict[str, str]:
-    """This package's, which are known without a look at what is installed."""
+    """Those of this package, which are known without a look at what is installed."""
     return {name: f"ftl_lightning.methods.{name}:METHOD" for name in SHIPPED}
 
 
