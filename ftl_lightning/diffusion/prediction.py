@@ -7,9 +7,10 @@ from torch import Tensor, nn
 
 from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar
+from ftl_lightning.diffusion.spectrum import Spectrum
 from ftl_lightning.errors import UserError
 
-PREDICTIONS = ("epsilon", "v", "clean", "displacement")
+PREDICTIONS = ("epsilon", "v", "clean", "displacement", "cosines")
 LOSSES = PREDICTIONS[:3]
 
 
@@ -19,13 +20,15 @@ class Prediction(nn.Module):
     ``'v'`` is the velocity ``sqrt(abar) eps - sqrt(1 - abar) x_0`` (Salimans & Ho, 2022), ``'clean'`` is ``x_0``,
     ``'displacement'`` is ``x_0`` less the state that the plan starts from. Clean plans are smooth, noise is not: a network that
     halves its input several times learns the one in a fraction of the steps. The displacement needs no copy of where the plan
-    starts, which a network blurs: the first states, which are those executed in closed loop, are the most exact.
+    starts, which a network blurs: the first states, which are those executed in closed loop, are the most exact. ``'cosines'`` are
+    those that ``x_0`` consists of over time, see :class:`~ftl_lightning.diffusion.spectrum.Spectrum`.
 
     Args:
         net: a denoiser.
-        kind: ``'v'``, ``'clean'`` or ``'displacement'``.
+        kind: ``'v'``, ``'clean'``, ``'displacement'`` or ``'cosines'``.
         diffusion_steps: T.
         state_columns: columns of the observed vectors that hold the state a plan starts from, on the plan's scale.
+        spectrum: of plans, for cosines; ``None`` for all others.
 
     Raises:
         UserError: for a displacement where they hold no state.
@@ -33,11 +36,13 @@ class Prediction(nn.Module):
 
     alpha_bar: Tensor
 
-    def __init__(self, net: nn.Module, kind: str, diffusion_steps: int, state_columns: Sequence[int] = ()) -> None:
+    def __init__(
+        self, net: nn.Module, kind: str, diffusion_steps: int, state_columns: Sequence[int] = (), spectrum: Spectrum | None = None
+    ) -> None:
         super().__init__()
         if kind == "displacement" and not state_columns:
             raise UserError("prediction: expected clean, found displacement: what this domain observes holds no state")
-        self.net, self.kind, self.state_columns = net, kind, list(state_columns)
+        self.net, self.kind, self.state_columns, self.spectrum = net, kind, list(state_columns), spectrum
         self.register_buffer("alpha_bar", cosine_alpha_bar(diffusion_steps), persistent=False)
 
     def observe(self, vector: Tensor | None) -> Context:
@@ -55,6 +60,8 @@ class Prediction(nn.Module):
         out: Tensor = self.net(x, t, concepts, index, context)
         if self.kind == "v":
             return alpha_bar.sqrt() * out + (1 - alpha_bar).sqrt() * x
+        if self.spectrum is not None:
+            out = self.spectrum(out)
         if start is not None:
             out = out + start[:, None]
         return (x - alpha_bar.sqrt() * out) / (1 - alpha_bar).sqrt()

@@ -186,6 +186,11 @@ class PretrainingData(pl.LightningDataModule):
         """Which training concept each of some demonstrations shows ``(window,)``."""
         return torch.tensor([self._number[demonstrations.concepts[row]] for row in rows.tolist()])
 
+    def some_windows(self, count: int) -> Batch:
+        """Windows as steps of pretraining see them, as many of each demonstration, at least ``count`` together."""
+        rows = torch.arange(len(self.training)).repeat(-(-count // len(self.training)))
+        return self._windows(self.training, rows, generator("cpu", self.seed))
+
     def every_window(self) -> Batch:
         """One window from each time of each demonstration."""
         lengths = self.training.lengths

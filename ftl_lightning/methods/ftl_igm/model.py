@@ -16,6 +16,7 @@ from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss, timesteps
+from ftl_lightning.diffusion.spectrum import Spectrum
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import Draws
 from ftl_lightning.learning.model_config import ModelConfig
@@ -33,7 +34,8 @@ class DiffusionConfig(ModelConfig):
         denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
         denoiser_args: its arguments other than the sizes.
         diffusion_steps: T.
-        prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'`` or ``'displacement'``.
+        prediction: what the network puts out, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'``, ``'displacement'`` or
+            ``'cosines'``.
     """
 
     denoiser: str = "MLPDenoiser"
@@ -55,12 +57,15 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     if config.prediction in ("epsilon", "v") and config.denoiser_args.get("smooth"):
         raise UserError(f"denoiser_args.smooth: expected 0 for a network that puts out {config.prediction}, which is not smooth")
     kind: type[nn.Module] = getattr(diffusion, config.denoiser)
+    if config.prediction == "cosines" and getattr(kind, "over_time", False):
+        raise UserError(f"prediction: expected clean for {config.denoiser}, whose output is smooth by itself, found cosines")
     denoiser = built(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
         return denoiser
     if config.state_columns and len(config.state_columns) != config.state_dim:
         raise UserError(f"observed, state: expected {config.state_dim} columns, found {len(config.state_columns)}")
-    return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns)
+    spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction == "cosines" else None
+    return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns, spectrum)
 
 
 class GenerativeModel(TextConceptModel):

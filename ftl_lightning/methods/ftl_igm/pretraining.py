@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.diffusion import PAPER_SIZE
-from ftl_lightning.diffusion.prediction import LOSSES, loss_weights
+from ftl_lightning.diffusion.prediction import LOSSES, Prediction, loss_weights
 from ftl_lightning.diffusion.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.errors import UserError, short
@@ -20,6 +20,9 @@ from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.option_groups import flat, groups_of
 from ftl_lightning.ranges import expect_count, expect_factor, expect_range
 from ftl_lightning.regrouped import PRETRAINING
+
+WINDOWS = 4096
+"""Of demonstrations, from which the scales of cosines are taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +62,8 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         denoiser_args: its arguments other than the sizes.
         paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
         diffusion_steps: T.
-        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'`` or ``'displacement'``, from
-            which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'``, ``'displacement'`` or
+            ``'cosines'``, from which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: what is minimised.
         codes: rough codes of behaviour that some samples are told, so that the network has seen concepts that vary over a plan, and
             concepts that no text names.
@@ -96,6 +99,9 @@ class PretrainingModule(Pretraining[GenerativeModel]):
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> GenerativeModel:
         network = {name: self.hparams[name] for name in ("denoiser", "diffusion_steps", "prediction")}
         model = GenerativeModel(prepared.configured(DiffusionConfig, denoiser_args=self.denoiser_args, **network))
+        if isinstance(model.denoiser, Prediction) and model.denoiser.spectrum is not None:
+            windows = data.some_windows(WINDOWS)
+            model.denoiser.spectrum.fit(model.encode(windows.states, windows.observed))
         if self.codes.share and self.codes.knots > 1 and not model.over_time:
             told = f"whose concepts do not vary over a plan, found {self.codes.knots}"
             raise UserError(f"model.codes.knots: expected 1 for {model.config.denoiser}, {told}")
