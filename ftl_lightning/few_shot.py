@@ -238,6 +238,7 @@ class FewShot(Shown):
             changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION), seed=int(seed)
         )
         self.model.method.expect_settings(changes)
+        settings = settings.for_own()
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         if told := longer_than_plans(own, self.model):
             warnings.warn(told, stacklevel=2)

@@ -54,6 +54,10 @@ class LowRank:
         """How many numbers it holds."""
         return sum(up.numel() + down.numel() for up, down in self.factors.values())
 
+    def detached(self) -> "LowRank":
+        """The same without gradients."""
+        return LowRank({name: (up.detach(), down.detach()) for name, (up, down) in self.factors.items()}, self.everywhere)
+
     def copied(self) -> "LowRank":
         """The same on the processor, apart from what is being learned, without factors that add nothing."""
         apart = {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, space_of
-from ftl_lightning.concepts.modes import Modes
+from ftl_lightning.concepts.modes import STRETCH, Modes
 from ftl_lightning.errors import UserError, about, short, shown
-from ftl_lightning.ranges import LARGEST_FACTOR
+from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor
 from ftl_lightning.representation import Shown, counted, numbers
 from ftl_lightning.schema import built, expect_type
 from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
@@ -54,6 +54,24 @@ class Origin:
     loss: float
 
 
+@dataclass(frozen=True)
+class Choice:
+    """How the form of a concept was chosen, see :mod:`ftl_lightning.learning.forms`.
+
+    Attributes:
+        form: its name.
+        because: why, in a sentence.
+        numbers: what was measured, by name.
+    """
+
+    form: str
+    because: str
+    numbers: Mapping[str, float]
+
+    def __str__(self) -> str:
+        return f"{self.form}: {self.because}"
+
+
 @dataclass(frozen=True, repr=False)
 class Concept(Shown):
     """K embeddings and their guidance weights.
@@ -66,6 +84,7 @@ class Concept(Shown):
         modes: several sets of embeddings, which samples are generated from where the concept stands alone; ``None`` for the paper's
             form. Composing uses ``embeddings``, unless the concept has several knots.
         adapter: what it changes of the denoiser; ``None`` for the paper's form.
+        choice: how its form was chosen; ``None`` where it was told.
 
     Raises:
         UserError: at construction, for tensors of other shapes or types.
@@ -76,6 +95,7 @@ class Concept(Shown):
     origin: Origin
     modes: Modes | None = None
     adapter: LowRank | None = None
+    choice: Choice | None = None
 
     def __post_init__(self) -> None:
         modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
@@ -170,6 +190,9 @@ class Concept(Shown):
         if self.modes is not None:
             tensors |= {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
             header |= {"mixed": self.modes.mixed}
+            header |= {} if self.modes.stretch == STRETCH else {"stretch": self.modes.stretch}
+        if self.choice is not None:
+            header |= {"choice": asdict(self.choice)}
         if self.adapter is not None and self.adapter.everywhere:
             header |= {"everywhere": True}
         if form in AXES:
@@ -207,9 +230,12 @@ class Concept(Shown):
             everywhere = expect_type(header.get("everywhere", False), bool, "everywhere") if form == 3 else False
             adapter = LowRank.from_tensors(factors, everywhere) if factors else None
             mixed = expect_type(header["mixed"], bool, "mixed") if several else False
-            modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed) if several else None
+            stretch = expect_type(header.get("stretch", STRETCH), float, "stretch")
+            expect_factor("key 'stretch'", stretch, 0)
+            modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed, stretch) if several else None
             origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
-            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter)
+            choice = built(Choice, header["choice"], "choice") if header.get("choice") else None
+            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
             concept.expect_finite("content")

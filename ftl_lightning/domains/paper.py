@@ -7,9 +7,10 @@ OURS = "FTL-IGM"
 """The name of the paper's method."""
 FINE_TUNED = "LoRA fine-tuning"
 """Learning a concept with an adapter that changes the whole network: what ours is compared with."""
-WITH_MODES, WITH_KNOTS, WITH_ADAPTER = "with modes", "over time", "with adapter"
-"""Forms of a method whose concepts have modes, several knots or an adapter, which the paper's have not."""
-FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER)
+WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN = "with modes", "over time", "with adapter", "form chosen"
+"""Forms of a method whose concepts have modes, several knots or an adapter, which the paper's have not, or whichever of these the
+demonstrations ask for."""
+FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN)
 """In the order in which several are joined, by one space: ``'with modes over time'``."""
 
 

@@ -22,6 +22,7 @@ LATER = (
     ("adapter", 0),
     ("adapter_learning_rate", 1e-3),
     ("adapter_scope", "concept"),
+    ("form", ""),
 )
 """Settings that came later, at the values under which everything is as before: they are left out, so that hashes stay."""
 

@@ -133,6 +133,8 @@ class Adaptation(pl.LightningModule, ABC):
             concept.save(path)
             weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
             say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
+            if concept.choice is not None:
+                say(f"  form: {concept.choice}")
 
     def on_train_end(self) -> None:
         self.find()

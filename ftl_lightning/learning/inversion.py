@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -49,7 +49,8 @@ class Inversion(nn.Module):
     """K embeddings and their weights for every concept of some demonstrations, all in one batch.
 
     Its only parameters are ``embeddings (run, K, knots, n)`` and, unless omega is fixed, ``weights (run, K)``; with an adapter,
-    its factors for each run too. A run is a concept, or a mode of one, and a restart. The model is frozen and no part of it.
+    its factors for each concept and restart too. A run is a concept, or a mode of one, and a restart. Modes are learned through
+    their concept's adapter and do not change it. The model is frozen and no part of it.
 
     Args:
         model: that concepts are learned through.
@@ -87,13 +88,14 @@ class Inversion(nn.Module):
             self.weights = nn.Parameter(torch.full(runs, float(settings.weights.initial)))
         else:
             self.register_buffer("weights", torch.full(runs, float(settings.omega)), persistent=False)
-        # Factors of an adapter for every run: of each weight ``up (run, outputs, rank)``, which starts at zero, and ``down``.
+        # Factors of an adapter of each concept and restart: of each weight ``up (adapter, outputs, rank)``, first 0, and ``down``.
         self.factors = nn.ParameterList()
         sizes = model.adaptable() if settings.adapter.rank else {}
         self._names = list(sizes)
+        adapted = [run for run in self.runs if not run.mode]
         for outputs, inputs in sizes.values():
-            down = torch.stack([torch.randn(settings.adapter.rank, inputs, generator=draws[run.concept]) for run in self.runs])
-            self.factors.append(torch.zeros(len(self.runs), outputs, settings.adapter.rank))
+            down = torch.stack([torch.randn(settings.adapter.rank, inputs, generator=draws[run.concept]) for run in adapted])
+            self.factors.append(torch.zeros(len(adapted), outputs, settings.adapter.rank))
             self.factors.append(down / inputs**0.5)
         self.stopping: Stopping | None = None
         if settings.budget.tolerance is not None:
@@ -121,13 +123,18 @@ class Inversion(nn.Module):
         inside = embeddings @ self.basis.T @ self.basis
         return inside + self.settings.embeddings.off_span * (embeddings - inside)
 
-    def adapter(self, run: int) -> LowRank | None:
-        """A run's adapter; ``None`` where there are none."""
-        factors = [factor[run] for factor in self.factors]
+    def adapter(self, number: int) -> LowRank | None:
+        """An adapter by its number, see :attr:`_adapter_of`; ``None`` where there are none."""
+        factors = [factor[number] for factor in self.factors]
         if not factors:
             return None
         named = dict(zip(self._names, zip(factors[::2], factors[1::2], strict=True), strict=True))
         return LowRank(named, self.settings.adapter.scope == "all")
+
+    def _adapter_of(self, run: int) -> int:
+        """The number of a run's adapter: concepts' one after another, those of a concept's restarts together."""
+        restarts = self.settings.budget.restarts
+        return self.runs[run].concept * restarts + run % restarts
 
     def _losses(self, samples: int, draw: torch.Generator, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
         """The model's loss (ours is Eq. 2) for every sample ``(run, samples)``. Runs share what is random in it and, as a share of
@@ -155,10 +162,14 @@ class Inversion(nn.Module):
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
         composition = Composition(self.parametrised(embeddings), weights)
         if self.factors:
-            own = torch.arange(len(self.runs), device=device) if chosen is None else chosen.nonzero()[:, 0]
-            adapters = tuple(adapter for run in own.tolist() if (adapter := self.adapter(run)))
-            number = torch.arange(1, len(own) + 1, device=device)[:, None].expand_as(weights)
-            composition = replace(composition, adapters=adapters, adapter=number)
+            own = range(len(self.runs)) if chosen is None else chosen.nonzero()[:, 0].tolist()
+            numbers = [self._adapter_of(run) for run in own]
+            different = list(dict.fromkeys(numbers))
+            adapters = [adapter for number in different if (adapter := self.adapter(number))]
+            if all(self.runs[run].mode for run in own):  # which learn through it and leave it as it is
+                adapters = [adapter.detached() for adapter in adapters]
+            number = torch.tensor([1 + different.index(number) for number in numbers], device=device)[:, None]
+            composition = replace(composition, adapters=tuple(adapters), adapter=number.expand_as(weights))
         return model.losses(states, seen, composition, draws, self.settings.loss.kind)
 
     def losses(self, samples: int, draw: torch.Generator, chosen: Tensor | None = None) -> Tensor:
@@ -243,7 +254,7 @@ class Inversion(nn.Module):
                 weights[whole].cpu(),
                 origin(self.model, self.demonstrations, name, kind, losses[whole].item()),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
-                adapter.copied() if (adapter := self.adapter(whole)) else None,
+                adapter.copied() if (adapter := self.adapter(self._adapter_of(whole))) else None,
             )
             found[name].expect_finite(f"inversion: concept {name!r}")
         return found
@@ -282,6 +293,27 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
         _LOG.warning(
             "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse", pretrained, settings.loss.kind
         )
+
+
+@torch.no_grad()
+def compared(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept]) -> dict[str, float]:
+    """The noise's squared error of concepts on some demonstrations, by name, as a share of the empty concept's; of a concept with
+    modes, that of its set for all demonstrations.
+
+    Args:
+        model: frozen.
+        demonstrations: of every concept one or more, which it need not have been learned from.
+        concepts: by name, without adapters.
+    """
+    inversion = Inversion(model, demonstrations, InversionSettings(components=1)).to(model.device)
+    inversion.settings = inversion.settings.changed(loss="epsilon")  # whatever the model was pretrained with
+    embeddings = torch.stack([concepts[name].embeddings for name in inversion.concepts]).to(model.device)
+    weights = torch.stack([concepts[name].weights for name in inversion.concepts]).to(model.device)
+    found, empty = (
+        inversion._losses(FINAL_SAMPLES, generator(model.device, 0, 4), embeddings, each, None).mean(dim=1)
+        for each in (weights, torch.zeros_like(weights))
+    )
+    return dict(zip(inversion.concepts, (found / empty).tolist(), strict=True))
 
 
 def origin(model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float) -> Origin:

@@ -7,11 +7,16 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.domains.paper import FINE_TUNED
+from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
+from ftl_lightning.learning.forms import first_settings, formed
 from ftl_lightning.learning.inversion import Inversion, check_settings
 from ftl_lightning.learning.inversion_settings import (
+    ADAPTED,
+    AUTO,
+    MIXED,
+    MODES,
     AdapterOptions,
     BudgetOptions,
     EmbeddingOptions,
@@ -25,6 +30,8 @@ from ftl_lightning.option_groups import flat, groups_of
 from ftl_lightning.regrouped import INVERSION
 
 _USUAL = InversionSettings()
+_FORMS = {AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}"}
+"""Words of tables for the forms that decide about modes and adapter."""
 
 
 class InversionModule(ExactResume, Adaptation):
@@ -45,6 +52,9 @@ class InversionModule(ExactResume, Adaptation):
         loss: what is minimised.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
         seed: decides starts, noise and timesteps.
+        form: of the concepts: ``paper`` for what the other options say, ``auto`` for the one that the demonstrations ask for, or
+            one of those that it is chosen from: ``one set``, ``modes``, ``adapter``, ``mixtures``. Empty for ``auto`` where
+            demonstrations come from a file and nothing is said of modes and adapter, else for ``paper``.
     """
 
     learns = True
@@ -65,6 +75,7 @@ class InversionModule(ExactResume, Adaptation):
         loss: LossOptions = _USUAL.loss,
         output: str | None = None,
         seed: int = 0,
+        form: str = "",
     ) -> None:
         super().__init__(pretrained, 1.0 if omega == "learned" else omega, output)
         groups = {
@@ -87,6 +98,7 @@ class InversionModule(ExactResume, Adaptation):
             budget=budget,
             loss=loss,
             seed=seed,
+            form=form,
         )
         check_settings(self.model, self.settings)
         self.inversion: Inversion
@@ -99,7 +111,9 @@ class InversionModule(ExactResume, Adaptation):
     @property
     def form(self) -> str:
         """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
-        return "" if self._fine_tuned else self.model.method.form(self.hparams)
+        if self._fine_tuned:
+            return ""
+        return " ".join(word for word in (self.model.method.form(self.hparams), _FORMS.get(self.settings.form)) if word)
 
     @property
     def _fine_tuned(self) -> bool:
@@ -122,7 +136,9 @@ class InversionModule(ExactResume, Adaptation):
         if "inversion" not in self._modules:
             with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
                 super().configure_model()
-                self.inversion = Inversion(self.model, self.demonstrations, self.settings)
+                if self.trainer.datamodule.hparams["demonstrations"]:  # type: ignore[attr-defined]
+                    self.settings = self.settings.for_own()
+                self.inversion = Inversion(self.model, self.demonstrations, first_settings(self.settings))
 
     def training_step(self, step: int) -> Tensor:
         losses = self.inversion.step_losses(self.global_step)
@@ -163,7 +179,7 @@ class InversionModule(ExactResume, Adaptation):
             "demonstrations": self.demonstrations.hash,
             "components": self.settings.components,
             "restarts": self.settings.budget.restarts,
-            **({} if self.settings.modes.sets == 1 else {"modes": self.settings.modes.sets}),
+            **({} if (modes := first_settings(self.settings).modes.sets) == 1 else {"modes": modes}),
             **({} if self.settings.embeddings.knots == 1 else {"knots": self.settings.embeddings.knots}),
             **({} if self.settings.adapter.rank == 0 else {"adapter": self.settings.adapter.rank}),
             **({} if self.settings.budget.tolerance is None else {"tolerance": self.settings.budget.tolerance}),
@@ -171,7 +187,12 @@ class InversionModule(ExactResume, Adaptation):
         }
 
     def learned(self) -> dict[str, Concept]:
-        return self.inversion.learned()
+        return formed(self.model, self.demonstrations, self.settings, self._steps, self.inversion.learned())
+
+    @property
+    def _steps(self) -> int:
+        """Of gradient descent, at most."""
+        return int(self.trainer.datamodule.hparams["steps"])  # type: ignore[attr-defined]
 
     def training_weight(self, task: EvaluationTask) -> float:
         omega = self.settings.weights.training if task.learned else None

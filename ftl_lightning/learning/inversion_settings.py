@@ -1,7 +1,7 @@
 """How concepts are learned: the settings of an inversion, in groups."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal, Self
 
@@ -16,6 +16,14 @@ EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
 MOST = 1000
 """Components, knots, restarts, or ranks of an adapter."""
+
+UNSAID, PAPER, AUTO = "", "paper", "auto"
+"""Of a concept's form: what goes with where demonstrations come from, see :meth:`InversionSettings.for_own`; what the other options
+say, the paper's unless they add to it; the one that the demonstrations ask for."""
+ONE, MODES, ADAPTED, MIXED = "one set", "modes", "adapter", "mixtures"
+"""Forms: one set of embeddings; one for each demonstration, of which one is drawn; one set and a small adapter of the denoiser; one
+for each demonstration and an adapter that they share, with samples from mixtures."""
+FORMS = (UNSAID, PAPER, AUTO, ONE, MODES, ADAPTED, MIXED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,6 +185,8 @@ class InversionSettings:
         budget: how much is computed.
         loss: what is minimised.
         seed: decides starts, noise and timesteps.
+        form: of concepts, one of :data:`FORMS`, see :mod:`ftl_lightning.learning.forms`. ``'auto'`` and the forms behind it decide
+            about modes and adapter; of an adapter that the options name, rank and learning rate are taken over.
 
     Raises:
         UserError: at construction, for a value that is none.
@@ -191,16 +201,22 @@ class InversionSettings:
     budget: BudgetOptions = field(default_factory=BudgetOptions)
     loss: LossOptions = field(default_factory=LossOptions)
     seed: int = 0
+    form: str = UNSAID
 
     def __post_init__(self) -> None:
+        if self.form not in FORMS:
+            raise UserError(f"model.form: expected one of {', '.join(FORMS[1:])}, found {self.form!r}")
         expect_count("model.components", self.components, 1, MOST)
         expect_range("model.seed", self.seed, 0)
         if self.omega != "learned":
             expect_factor("model.omega", self.omega)
-        if self.adapter.rank and (self.modes.sets != 1 or self.budget.tolerance is not None):
-            raise UserError(
-                "model.adapter.rank: expected model.modes.sets 1 and model.budget.tolerance null beside it, found others"
-            )
+        if self.form in (UNSAID, PAPER) and self.adapter.rank and self.budget.tolerance is not None:
+            raise UserError("model.adapter.rank: expected model.budget.tolerance null beside it, found a number")
+
+    def for_own(self) -> Self:
+        """The same for demonstrations of one's own: where nothing is said of form, modes and adapter, the form is chosen."""
+        unsaid = self.form == UNSAID and self.modes.sets == 1 and not self.adapter.rank
+        return replace(self, form=AUTO) if unsaid else self
 
     def changed(self, **options: Any) -> Self:
         """The same with some options changed, which are given by their flat names (:data:`ftl_lightning.regrouped.INVERSION`)."""

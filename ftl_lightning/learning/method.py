@@ -7,7 +7,7 @@ from typing import Any
 
 from ftl_lightning.errors import UserError
 
-INVERSION = "ftl_lightning.learning.inversion:invert"
+INVERSION = "ftl_lightning.learning.forms:learn"
 """The learner of methods whose concepts are learned by gradient descent."""
 
 

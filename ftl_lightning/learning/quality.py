@@ -1,0 +1,90 @@
+"""Does generated behaviour look like the demonstrations? Measures that need nothing but the two, and what they mean in words."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.domains.distances import path_distance
+
+COPIES, COLLAPSED, ROUGH = 0.2, 0.5, 1.5
+"""Novelty and spread below which, and roughness above which samples are called so."""
+SCATTERED = 2.0
+"""Spread above which samples are called so."""
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What samples of a concept are like beside the demonstrations that it was learned from.
+
+    Attributes:
+        novelty: how far a sample is from the nearest demonstration, as a share of how far demonstrations are from their nearest
+            others (mean over samples; means over demonstrations): 0 for copies, about 1 for behaviour that is as new as the
+            demonstrations are to each other.
+        spread: standard deviation over samples as a share of the demonstrations' own, unbiased, all columns and times together: 0
+            where all samples are the same.
+        roughness: second differences over time, relative to how much a plan varies, as a share of the demonstrations' (medians);
+            1 for plans of fewer than three states or which do not vary.
+    """
+
+    novelty: float
+    spread: float
+    roughness: float
+
+    @classmethod
+    def of(cls, samples: Tensor, demonstrations: Tensor) -> Self:
+        """Compare them.
+
+        Args:
+            samples: ``(sample, horizon, state)``, columns on comparable scales, such as a model's normalised ones.
+            demonstrations: ``(demo, horizon, state)``, two or more.
+
+        Raises:
+            ValueError: for fewer than two demonstrations.
+        """
+        if len(demonstrations) < 2:
+            raise ValueError(f"expected two demonstrations or more, found {len(demonstrations)}")
+        among = path_distance(demonstrations, demonstrations).fill_diagonal_(torch.inf).amin(dim=1).mean()
+        new = path_distance(samples, demonstrations).amin(dim=1).mean()
+        return cls(
+            novelty=_share(new, among),
+            spread=_share(samples.var(dim=0).mean().sqrt(), demonstrations.var(dim=0).mean().sqrt()),
+            roughness=_share(roughness(samples), roughness(demonstrations)) if samples.shape[1] > 2 else 1.0,
+        )
+
+    @property
+    def words(self) -> str:
+        """In plain words, such as ``'collapsed (spread 0.31)'``; what is fine is told as a number alone."""
+        told = [
+            f"spread {self.spread:.2f}{_remark(self.spread, COLLAPSED, 'collapsed', SCATTERED, 'scattered')}",
+            f"novelty {self.novelty:.2f}{_remark(self.novelty, COPIES, 'copies')}",
+            f"roughness {self.roughness:.2f}{_remark(self.roughness, 0, '', ROUGH, 'rougher than your demonstrations')}",
+        ]
+        return ", ".join(told)
+
+    @property
+    def numbers(self) -> Mapping[str, float]:
+        """By name."""
+        return asdict(self)
+
+
+def roughness(plans: Tensor) -> Tensor:
+    """Median over plans ``(plan, horizon, state)`` of root mean square second differences over time by that of the plan's
+    deviation from its mean; plans that do not vary do not count.
+    """
+    size = (plans - plans.mean(dim=1, keepdim=True)).square().mean(dim=(1, 2)).sqrt()
+    second = plans.diff(n=2, dim=1).square().mean(dim=(1, 2)).sqrt()
+    moving = size > _LEAST
+    return (second[moving] / size[moving]).median() if moving.any() else size.new_zeros(())
+
+
+def _share(value: Tensor, whole: Tensor) -> float:
+    """1 where both are nothing."""
+    return float(value / whole) if whole > _LEAST else 1.0 if value <= _LEAST else float(value / _LEAST)
+
+
+def _remark(value: float, least: float, below: str, most: float = torch.inf, above: str = "") -> str:
+    return f" ({below})" if value < least else f" ({above})" if value > most else ""
