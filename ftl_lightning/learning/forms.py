@@ -12,12 +12,14 @@ from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion import compared, invert
-from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
+from ftl_lightning.learning.inversion_settings import ADAPTED, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
 from ftl_lightning.learning.quality import Quality
 from ftl_lightning.seeding import generator, task_key
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Of adapters and of their learning, where the settings name none."""
+MODE_SAMPLES = 16
+"""Noised demonstrations a step of a mode that is learned without an adapter."""
 FOLDS, FOLD_SAMPLES = 5, 16
 """Concepts that leave a demonstration out, at most, and noised demonstrations a step of each."""
 GENERATED = 40
@@ -54,10 +56,10 @@ def learn(
 
 
 def first_settings(settings: InversionSettings) -> InversionSettings:
-    """What is learned first: what the settings say in the paper's form, else one set and the modes, without an adapter."""
+    """What is learned first: what the settings say in the paper's form, else one set without an adapter."""
     if settings.form in (UNSAID, PAPER):
         return settings
-    return replace(settings, form=PAPER).changed(modes=1 if settings.form == ONE else "each", adapter=0)
+    return replace(settings, form=PAPER).changed(modes=1, adapter=0)
 
 
 def formed(
@@ -74,33 +76,49 @@ def formed(
         model, demonstrations, settings, steps, tell: as of :func:`learn`.
         first: what was learned by :func:`first_settings`.
     """
-    if settings.form in (UNSAID, PAPER, ONE, MODES):
+    if settings.form in (UNSAID, PAPER, ONE):
         return first
-    adapted: Mapping[str, Concept] = {}
-    if model.adaptable():
-        adapted = invert(model, demonstrations, _adapter_settings(settings), min(steps, ADAPTER_STEPS), tell)
-    forms = {name: _forms(concept, adapted.get(name)) for name, concept in first.items()}
-    if settings.form != AUTO:
-        return {name: one[settings.form] for name, one in forms.items()}
+    if settings.form == MODES:
+        return _with_modes(model, demonstrations, settings, steps, tell)
+    if settings.form in (ADAPTED, MIXED):
+        adapted = _adapted(model, demonstrations, settings, steps, tell)
+        return {name: forms[settings.form] for name, forms in adapted.items()}
     shares = _loss_shares(model, demonstrations, settings, steps, first, tell)
+    enough = [name for name, share in shares.items() if share.suffices]
+    forms = {name: {ONE: concept} for name, concept in first.items()}
+    if enough and model.adaptable():
+        some = demonstrations.rows([row for row, name in enumerate(demonstrations.concepts) if name in enough])
+        for name, more in _adapted(model, some, settings, steps, tell).items():
+            forms[name] |= more
+    if len(enough) < len(shares):
+        some = demonstrations.rows([row for row, name in enumerate(demonstrations.concepts) if name not in enough])
+        for name, concept in _with_modes(model, some, settings, steps, tell).items():
+            forms[name] |= {MODES: concept}
     return _chosen(model, demonstrations, settings, forms, shares)
 
 
-def _adapter_settings(settings: InversionSettings) -> InversionSettings:
+def _with_modes(
+    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell
+) -> dict[str, Concept]:
+    """Concepts of one set for each demonstration, learned in all steps: what a sample is like depends on them alone."""
+    changes = {"modes": "each", "mode_samples": MODE_SAMPLES, "adapter": 0, "tolerance": None, "restarts": 1}
+    return invert(model, demonstrations, replace(settings, form=PAPER).changed(**changes), steps, tell)
+
+
+def _adapted(
+    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell
+) -> dict[str, dict[str, Concept]]:
+    """Of every concept the forms with an adapter, by name. Of a single demonstration there are no modes to mix."""
     own = settings.adapter
     rank, rate = (own.rank, own.learning_rate) if own.rank else (RANK, RATE)
     changes = {"modes": "each", "adapter": rank, "adapter_learning_rate": rate, "tolerance": None, "restarts": 1}
-    return replace(settings, form=PAPER).changed(**changes)
-
-
-def _forms(first: Concept, adapted: Concept | None) -> dict[str, Concept]:
-    """A concept's forms by name; of a model without adapters, those without. Of a single demonstration there are no modes."""
-    found = {ONE: replace(first, modes=None), MODES: first}
-    if adapted is None:
-        return found
-    modes = adapted.modes
-    mixed = modes and replace(modes, mixed=True, stretch=even_stretch(len(modes)))
-    return found | {ADAPTED: replace(adapted, modes=None), MIXED: replace(adapted, modes=mixed)}
+    adapted = replace(settings, form=PAPER).changed(**changes)
+    found = {}
+    for name, concept in invert(model, demonstrations, adapted, min(steps, ADAPTER_STEPS), tell).items():
+        modes = concept.modes
+        mixed = modes and replace(modes, mixed=True, stretch=even_stretch(len(modes)))
+        found[name] = {ADAPTED: replace(concept, modes=None), MIXED: replace(concept, modes=mixed)}
+    return found
 
 
 @dataclass(frozen=True)
