@@ -86,7 +86,7 @@ def _part(
     advance: Advance | Callable[..., None],
 ) -> Tensor:
     """Some ``rows (n,)`` of the plans of :func:`sampled` ``(n, horizon, state)``: all noise is drawn, and theirs is taken."""
-    draw = generator("cpu", seed)
+    concept, draw = concept.uncomposed, generator("cpu", seed)
     whole, own = concept.draw(count, draw)
     shape = (count, model.config.horizon, model.config.state_dim)
 

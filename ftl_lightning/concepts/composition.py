@@ -47,6 +47,7 @@ class Composition(Shown):
             all of it on every column.
         adapters: changes of the denoiser, each for the concepts that ``adapter`` says.
         adapter: ``(..., K)`` int64, the number from 1 of each concept's adapter, 0 for the denoiser as it is; ``None`` for zeros.
+        alone: what samples are generated from where the concept is not composed; ``None`` for the same as where it is.
         space: of which model's concepts it is made, see :func:`space_of`; empty where nobody said.
 
     Raises:
@@ -59,6 +60,7 @@ class Composition(Shown):
     columns: Tensor | None = field(default=None, kw_only=True)
     adapters: tuple[Adapter, ...] = field(default=(), kw_only=True)
     adapter: Tensor | None = field(default=None, kw_only=True)
+    alone: "Composition | None" = field(default=None, kw_only=True)
     space: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
@@ -86,6 +88,8 @@ class Composition(Shown):
             yield "on some columns"
         if self.adapters:
             yield counted(len(self.adapters), "adapter")
+        if self.alone is not None:
+            yield "another form where it stands alone"
         yield f"of {self.space or 'any model'}"
 
     def __add__(self, other: "Composition") -> "Composition":
@@ -127,7 +131,8 @@ class Composition(Shown):
         if not isinstance(factor, Real | Tensor) or isinstance(factor, bool):
             raise UserError(f"compose: expected a number to multiply a concept with, found {shown(factor)}")
         expect_range("compose: weight", float(factor))
-        return self._with(weights=factor * self.weights, modes=self.modes and self.modes * factor)
+        alone = self.alone and self.alone * factor
+        return self._with(weights=factor * self.weights, modes=self.modes and self.modes * factor, alone=alone)
 
     __rmul__ = __mul__
 
@@ -141,7 +146,7 @@ class Composition(Shown):
         """The same with weight on some columns of a state alone, of ``state`` columns."""
         chosen = torch.zeros(state, device=self.weights.device)
         chosen[list(columns)] = 1
-        return self._with(columns=self.shares(state) * chosen)
+        return self._with(columns=self.shares(state) * chosen, alone=self.alone and self.alone.on(columns, state))
 
     def shares(self, state: int) -> Tensor:
         """The share of its weight that each concept has on each column of a state ``(..., K, state)``, of ``state`` columns."""
@@ -168,12 +173,18 @@ class Composition(Shown):
             modes=self.modes and self.modes.to(device),
             columns=None if self.columns is None else self.columns.to(device),
             adapter=None if self.adapter is None else self.adapter.to(device),
+            alone=self.alone and self.alone.to(device),
         )
+
+    @property
+    def uncomposed(self) -> "Composition":
+        """What samples are generated from where nothing is added to it."""
+        return self if self.alone is None else self.alone
 
     def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
         """What ``count`` samples are generated from: a composition ``(row, K, ...)``, and each sample's row ``(count,)``.
 
-        Where there are no modes the generator stays as it is.
+        Where there are no modes the generator stays as it is. To be called on what is :attr:`uncomposed`.
         """
         if self.modes is None:
             embeddings, weights = self.embeddings[None], self.weights[None]
@@ -195,9 +206,9 @@ class Composition(Shown):
 
     def drawn(self, generator: torch.Generator) -> "Composition":
         """The composition ``(K, ...)`` of a single sample, without modes."""
-        if self.modes is None:
-            return self
-        rows, row = self.draw(1, generator)
+        if self.uncomposed.modes is None:
+            return self.uncomposed
+        rows, row = self.uncomposed.draw(1, generator)
         return rows.row(int(row[0]))
 
 
@@ -245,6 +256,7 @@ def batched(compositions: Sequence[Composition], count: int, generators: Sequenc
     Raises:
         UserError: for concepts of different numbers of knots, neither of which is 1.
     """
+    compositions = [composition.uncomposed for composition in compositions]
     knots, state = _common([composition.knots for composition in compositions]), _columns_of(compositions)
     # Episodes that are run side by side ask for one composition many times: it has its adapters once.
     adapters = tuple(dict.fromkeys(adapter for composition in compositions for adapter in composition.adapters))

@@ -18,13 +18,15 @@ from ftl_lightning.schema import built, expect_type
 from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
 
 KIND = "concept"
-VERSIONS = (FORMAT, 2, 3)
-"""Of the file's form: 3 for a concept with knots or an adapter, 2 for one with modes, 1 for the paper's. Each is written in the
-first form that can hold it."""
-AXES = {2: "mode component n", 3: "mode component knot n"}
+VERSIONS = (FORMAT, 2, 3, 4)
+"""Of the file's form: 4 for a concept that is composed from another set, 3 for one with knots or an adapter, 2 for one with modes,
+1 for the paper's. Each is written in the first form that can hold it."""
+AXES = {2: "mode component n", 3: "mode component knot n", 4: "mode component knot n"}
 """What the dimensions of the modes' embeddings are in each form; those of a concept lack the first."""
 EMBEDDINGS = ("embeddings", "mode_embeddings")
 """Names of the tensors that have an axis of knots, but in files of the first two forms, whose concepts have one knot."""
+COMPOSING = ("composing_embeddings", "composing_weights")
+"""Names of the tensors of a set that a concept is composed from."""
 ADAPTER = "adapter/"
 """Names of an adapter's tensors begin so."""
 
@@ -85,6 +87,8 @@ class Concept(Shown):
             form. Composing uses ``embeddings``, unless the concept has several knots.
         adapter: what it changes of the denoiser; ``None`` for the paper's form.
         choice: how its form was chosen; ``None`` where it was told.
+        composing: embeddings ``(K, knots, n)`` and weights ``(K,)`` that take the place of all others, and of the adapter, where
+            the concept is composed; ``None`` for the same as alone.
 
     Raises:
         UserError: at construction, for tensors of other shapes or types.
@@ -96,10 +100,20 @@ class Concept(Shown):
     modes: Modes | None = None
     adapter: LowRank | None = None
     choice: Choice | None = None
+    composing: tuple[Tensor, Tensor] | None = None
 
     def __post_init__(self) -> None:
-        modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
-        _expect_shapes({"embeddings": self.embeddings, "weights": self.weights, **modes}, ("K", "knots", "n"))
+        _expect_shapes(self._sets, ("K", "knots", "n"))
+
+    @property
+    def _sets(self) -> dict[str, Tensor]:
+        """Embeddings and weights, by the names of a file's tensors."""
+        found = {"embeddings": self.embeddings, "weights": self.weights}
+        if self.modes is not None:
+            found |= {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
+        if self.composing is not None:
+            found |= dict(zip(COMPOSING, self.composing, strict=True))
+        return found
 
     @property
     def knots(self) -> int:
@@ -125,14 +139,15 @@ class Concept(Shown):
         """What it is generated from, alone or composed with others."""
         space = space_of(self.origin.domain, self.origin.pretrained)
         plain = Composition(self.embeddings, self.weights, modes=self.modes, space=space)
-        if self.adapter is None:
-            return plain
-        return replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
+        if self.adapter is not None:
+            plain = replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
+        return plain if self.composing is None else Composition(*self.composing, alone=plain, space=space)
 
     def component(self, number: int) -> Composition:
         """One of its components alone, by its number from 1."""
         chosen = slice(number - 1, number)
-        return replace(self, embeddings=self.embeddings[chosen], weights=self.weights[chosen], modes=None).composition
+        one = replace(self, embeddings=self.embeddings[chosen], weights=self.weights[chosen], modes=None, composing=None)
+        return one.composition
 
     def parts(self) -> dict[str, tuple[float, Tensor]]:
         """Weight and embedding ``(n,)`` of every knot of every component, and of those of every mode, by names such as
@@ -172,10 +187,8 @@ class Concept(Shown):
     @property
     def numbers(self) -> dict[str, Tensor]:
         """All that it holds, by name."""
-        modes = {} if self.modes is None else {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
         factors = {} if self.adapter is None else self.adapter.tensors()
-        loss = torch.tensor(float(self.origin.loss))
-        return {"loss": loss, "embeddings": self.embeddings, "weights": self.weights, **modes, **factors}
+        return {"loss": torch.tensor(float(self.origin.loss)), **self._sets, **factors}
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.
@@ -184,11 +197,11 @@ class Concept(Shown):
             UserError: for numbers that are not finite.
         """
         self.expect_finite(str(path))
-        tensors = {"embeddings": self.embeddings, "weights": self.weights}
+        tensors = dict(self._sets)
         header = {**asdict(self.origin), "components": len(self.weights)}
         form = 3 if self.knots > 1 or self.adapter is not None else FORMAT if self.modes is None else 2
+        form = form if self.composing is None else 4
         if self.modes is not None:
-            tensors |= {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
             header |= {"mixed": self.modes.mixed}
             header |= {} if self.modes.stretch == STRETCH else {"stretch": self.modes.stretch}
         if self.choice is not None:
@@ -197,7 +210,7 @@ class Concept(Shown):
             header |= {"everywhere": True}
         if form in AXES:
             header |= {"axes": AXES[form]}
-        if form == 3:
+        if form >= 3:
             tensors |= {f"{ADAPTER}{name}": factor for name, factor in (self.adapter.tensors() if self.adapter else {}).items()}
         else:
             tensors |= {name: values.flatten(-2) for name, values in tensors.items() if name in EMBEDDINGS}
@@ -215,6 +228,7 @@ class Concept(Shown):
         several = form == 2 or "mixed" in header
         keys = [*(field.name for field in fields(Origin)), *(("axes",) if form in AXES else ()), *(("mixed",) if several else ())]
         names = ["embeddings", "weights", *(("mode_embeddings", "mode_weights") if several else ())]
+        names += COMPOSING if form == 4 else ()
         missing = [key for key in keys if key not in header] + [name for name in names if name not in tensors]
         with about(path):
             if missing:
@@ -222,12 +236,12 @@ class Concept(Shown):
             if form in AXES and header["axes"] != AXES[form]:
                 raise UserError(f"key 'axes': expected {AXES[form]!r}, found {shown(header['axes'])}; a newer version may read it")
             factors = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
-            if unknown := set(tensors) - set(names) - ({f"{ADAPTER}{name}" for name in factors} if form == 3 else set()):
+            if unknown := set(tensors) - set(names) - ({f"{ADAPTER}{name}" for name in factors} if form >= 3 else set()):
                 raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
-            _expect_shapes({name: tensors[name] for name in names}, ("K", "knots", "n") if form == 3 else ("K", "n"))
-            if form != 3:  # one knot, which has no axis
+            _expect_shapes({name: tensors[name] for name in names}, ("K", "knots", "n") if form >= 3 else ("K", "n"))
+            if form < 3:  # one knot, which has no axis
                 tensors |= {name: tensors[name].unsqueeze(-2) for name in names if name in EMBEDDINGS}
-            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere") if form == 3 else False
+            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere") if form >= 3 else False
             adapter = LowRank.from_tensors(factors, everywhere) if factors else None
             mixed = expect_type(header["mixed"], bool, "mixed") if several else False
             stretch = expect_type(header.get("stretch", STRETCH), float, "stretch")
@@ -235,7 +249,8 @@ class Concept(Shown):
             modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed, stretch) if several else None
             origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
             choice = built(Choice, header["choice"], "choice") if header.get("choice") else None
-            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice)
+            composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if form == 4 else None
+            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
             concept.expect_finite("content")
@@ -246,7 +261,7 @@ def _expect_shapes(tensors: Mapping[str, Tensor], axes: Sequence[str]) -> None:
     """Refuse a concept's tensors whose shapes or types are not those of one.
 
     Args:
-        tensors: ``embeddings``, ``weights`` and, with modes, ``mode_embeddings`` and ``mode_weights``.
+        tensors: ``embeddings``, ``weights`` and, with modes, ``mode_embeddings`` and ``mode_weights``; what it is composed from.
         axes: names of the embeddings' axes, the components' first.
 
     Raises:
@@ -256,7 +271,9 @@ def _expect_shapes(tensors: Mapping[str, Tensor], axes: Sequence[str]) -> None:
     if len(shape) != len(axes) or not all(shape):
         raise UserError(f"key 'embeddings': expected shape ({', '.join(axes)}), found {shape}")
     modes = max((*tensors.get("mode_embeddings", torch.empty(0)).shape, 0)[0], 1)
+    composing = (*tuple(tensors.get(COMPOSING[1], tensors["weights"]).shape)[:1], *shape[1:])
     expected = {"embeddings": shape, "weights": shape[:1], "mode_embeddings": (modes, *shape), "mode_weights": (modes, shape[0])}
+    expected |= {COMPOSING[0]: composing, COMPOSING[1]: composing[:1]}
     for name, values in tensors.items():
         if values.shape != expected[name] or values.dtype != torch.float32:
             told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from ftl_lightning.concepts.concept import Choice, Concept
 from ftl_lightning.concepts.modes import even_stretch
@@ -14,10 +15,13 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion import compared, invert
 from ftl_lightning.learning.inversion_settings import ADAPTED, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
 from ftl_lightning.learning.quality import Quality
+from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.seeding import generator, task_key
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Of adapters and of their learning, where the settings name none."""
+SPAN = "span"
+"""One set in the span of the training concepts, which composes best."""
 MODE_SAMPLES = 16
 """Noised demonstrations a step of a mode that is learned without an adapter."""
 FOLDS, FOLD_SAMPLES = 5, 16
@@ -31,6 +35,12 @@ LEFT_OUT, OWN = 1.17, 0.8
 the empty concept's. Chosen on relations that pretraining does not show, see docs/experiments-forms.md."""
 NARROW = 0.7
 """Mixtures take the place of one set whose samples spread less than this share of the demonstrations."""
+
+STRAY = 1.65
+"""A concept is composed from its set in the span of the training concepts, unless samples of that stray farther than so many
+standard deviations from those of the chosen form, in root mean square, in any column at any time."""
+LEAST = 0.05
+"""Standard deviation that is told apart, of columns between -1 and 1."""
 
 Tell = Callable[[float], None]
 
@@ -84,6 +94,10 @@ def formed(
         adapted = _adapted(model, demonstrations, settings, steps, tell)
         return {name: forms[settings.form] for name, forms in adapted.items()}
     shares = _loss_shares(model, demonstrations, settings, steps, first, tell)
+    span: Mapping[str, Concept] = {}
+    if isinstance(model, TextConceptModel):
+        changes = {"modes": 1, "adapter": 0, "off_span": 0.0, "restarts": 1}
+        span = invert(model, demonstrations, replace(settings, form=PAPER).changed(**changes), steps, tell)
     enough = [name for name, share in shares.items() if share.suffices]
     forms = {name: {ONE: concept} for name, concept in first.items()}
     if enough and model.adaptable():
@@ -94,7 +108,7 @@ def formed(
         some = demonstrations.rows([row for row, name in enumerate(demonstrations.concepts) if name not in enough])
         for name, concept in _with_modes(model, some, settings, steps, tell).items():
             forms[name] |= {MODES: concept}
-    return _chosen(model, demonstrations, settings, forms, shares)
+    return _chosen(model, demonstrations, settings.seed, forms, shares, span)
 
 
 def _with_modes(
@@ -176,22 +190,41 @@ def _named(demonstrations: Demonstrations, rows: Sequence[int], text: str) -> De
 def _chosen(
     model: ConceptModel,
     demonstrations: Demonstrations,
-    settings: InversionSettings,
+    seed: int,
     forms: Mapping[str, Mapping[str, Concept]],
     shares: Mapping[str, _Shares],
+    span: Mapping[str, Concept],
 ) -> dict[str, Concept]:
-    """Of every concept the form that its demonstrations ask for, with what was measured."""
+    """Of every concept the form that its demonstrations ask for, with what was measured, and what it is composed from."""
     found = {}
     for name, candidates in forms.items():
         own = demonstrations.select(name)
-        qualities = measured(model, own, candidates, settings.seed) if len(own) > 1 else {}
-        form, because = _choice(shares[name], qualities) if qualities else (ONE, "there is a single demonstration")
+        if len(own) < 2:
+            found[name] = replace(candidates[ONE], choice=Choice(ONE, "there is a single demonstration", {}))
+            continue
+        inside = {SPAN: span[name]} if name in span else {}
+        samples, known = generated(model, own, {**candidates, **inside}, seed)
+        qualities = {form: Quality.of(samples[form], known) for form in candidates}
+        form, because = _choice(shares[name], qualities)
         numbers = {"loss, own": shares[name].own}
         numbers |= {} if (left := shares[name].left_out) is None else {"loss, left out": left}
         numbers |= {f"{key}, {kind}": value for kind, one in qualities.items() for key, value in one.numbers.items()}
-        rounded = {key: round(value, 4) for key, value in numbers.items()}
-        found[name] = replace(candidates[form], choice=Choice(form, because, rounded))
+        composing = None
+        if inside:
+            numbers["stray, span"] = stray(samples[SPAN], samples[form])
+            if numbers["stray, span"] <= STRAY:
+                composing, because = (span[name].embeddings, span[name].weights), f"{because}; composed in the training span"
+        choice = Choice(form, because, {key: round(value, 4) for key, value in numbers.items()})
+        found[name] = replace(candidates[form], choice=choice, composing=composing)
     return found
+
+
+def stray(samples: Tensor, others: Tensor) -> float:
+    """How far samples ``(sample, horizon, state)`` are at most, in any column at any time, from the mean of others, in the others'
+    standard deviations, in root mean square; 1 for samples that are like the others.
+    """
+    spread = others.std(dim=0).clamp(min=LEAST)
+    return float(((samples - others.mean(dim=0)).square().mean(dim=0).sqrt() / spread).max())
 
 
 def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str]:
@@ -210,24 +243,28 @@ def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str
     return ADAPTED, f"{because}; samples spread {spread:.2f} of what the demonstrations do"
 
 
-def measured(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int) -> dict[str, Quality]:
-    """What samples of some concepts are like beside demonstrations, by name.
+def generated(
+    model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Samples of some concepts by name, and demonstrations, as the model's network sees them, which compares columns of any unit.
 
     Args:
         model: that generates them.
-        demonstrations: two or more, which samples are compared with and from whose initial states they start.
+        demonstrations: from whose initial states samples start.
         concepts: by name.
         seed: of the samples.
+
+    Returns:
+        ``(GENERATED, horizon, state)`` each, and ``(demo, horizon, state)``.
     """
-    names = list(concepts)
-    window = model.config.horizon
+    names, horizon = list(concepts), model.config.horizon
     rows = torch.arange(GENERATED) % len(demonstrations)
-    seen = moved(demonstrations.rows(rows.tolist()).initial_states.observed, model.device) if demonstrations.observed else {}
+    seen = moved(demonstrations.rows(rows.tolist()).initial_states.observed, model.device)
     together = {key: value.repeat(len(names), *(1,) * (value.dim() - 1)) for key, value in seen.items()}
     draws = [generator("cpu", seed, 4, task_key(name)) for name in names]
     sampling = replace(SAMPLING, steps=min(SAMPLING.steps, model.max_steps or SAMPLING.steps))
     plans = model.sample([concepts[name].composition.to(model.device) for name in names], GENERATED, sampling, draws, together)
     every = torch.arange(len(demonstrations))
-    states, observed = demonstrations.windows(every, torch.zeros_like(every), window)
+    states, observed = demonstrations.windows(every, torch.zeros_like(every), horizon)
     known = model.encode(states.to(model.device), moved(observed, model.device)).cpu()
-    return {name: Quality.of(model.encode(own, seen).cpu(), known) for name, own in zip(names, plans, strict=True)}
+    return {name: model.encode(own, seen).cpu() for name, own in zip(names, plans, strict=True)}, known
