@@ -210,7 +210,7 @@ NAN = torch.full((2, 384), float("nan"))
         ([], PLAIN, "file of other software"),
         ({}, PLAIN, "file of other software"),
         (ORIGIN | {"kind": ["concept"]}, PLAIN, "expected a concept file"),
-        (ORIGIN | {"format": "1"}, PLAIN, "key 'format': expected 1 or 2 or 3, found '1'"),
+        (ORIGIN | {"format": "1"}, PLAIN, "key 'format': expected 1 or 2 or 3 or 4, found '1'"),
         (ORIGIN | {"format": [1]}, PLAIN, "key 'format'"),
         (ORIGIN | {"name": nested(100)}, PLAIN, "deep"),
         (ORIGIN | {"name": {"a": 1}}, PLAIN, "key 'name': expected a text"),

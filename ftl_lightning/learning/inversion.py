@@ -296,17 +296,17 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
 
 
 @torch.no_grad()
-def compared(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept]) -> dict[str, float]:
-    """The noise's squared error of concepts on some demonstrations, by name, as a share of the empty concept's; of a concept with
-    modes, that of its set for all demonstrations.
+def compared(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], loss: str) -> dict[str, float]:
+    """Losses of concepts on some demonstrations, by name, as shares of the empty concept's; of a concept with modes, that of its
+    set for all demonstrations.
 
     Args:
         model: frozen.
         demonstrations: of every concept one or more, which it need not have been learned from.
         concepts: by name, without adapters.
+        loss: whose squared error.
     """
-    inversion = Inversion(model, demonstrations, InversionSettings(components=1)).to(model.device)
-    inversion.settings = inversion.settings.changed(loss="epsilon")  # whatever the model was pretrained with
+    inversion = Inversion(model, demonstrations, InversionSettings(components=1).changed(loss=loss)).to(model.device)
     embeddings = torch.stack([concepts[name].embeddings for name in inversion.concepts]).to(model.device)
     weights = torch.stack([concepts[name].weights for name in inversion.concepts]).to(model.device)
     found, empty = (

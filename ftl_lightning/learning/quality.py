@@ -1,18 +1,28 @@
 """Does generated behaviour look like the demonstrations? Measures that need nothing but the two, and what they mean in words."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates, moved
+from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.distances import path_distance
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.seeding import generator, task_key
 
 COPIES, COLLAPSED, ROUGH = 0.2, 0.5, 1.5
 """Novelty and spread below which, and roughness above which samples are called so."""
 SCATTERED = 2.0
 """Spread above which samples are called so."""
+GENERATED = 40
+"""Samples that are looked at."""
+SAMPLING = Sampling("dpm_solver", 10, 1.0)
+"""How they are generated: quickly, and as widely as the model does."""
 _LEAST = 1e-9
 
 
@@ -88,3 +98,41 @@ def _share(value: Tensor, whole: Tensor) -> float:
 
 def _remark(value: float, least: float, below: str, most: float = torch.inf, above: str = "") -> str:
     return f" ({below})" if value < least else f" ({above})" if value > most else ""
+
+
+def measured(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int) -> dict[str, Quality]:
+    """The quality of some concepts by name, in what the model's network sees, which compares columns of any unit.
+
+    Args:
+        model: that generates them.
+        demonstrations: two or more, which samples are compared with and from whose initial states they start.
+        concepts: by name.
+        seed: of the samples.
+    """
+    known = _encoded(model, *first_windows(demonstrations, model.config.horizon))
+    plans, starts = generated(model, demonstrations, concepts, seed)
+    return {name: Quality.of(_encoded(model, own, starts), known) for name, own in plans.items()}
+
+
+def generated(
+    model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int
+) -> tuple[dict[str, Tensor], InitialStates]:
+    """Samples of some concepts ``(GENERATED, horizon, state)`` by name, and where each starts; arguments as of :func:`measured`."""
+    names = list(concepts)
+    starts = demonstrations.initial_states.take(torch.arange(GENERATED) % len(demonstrations))
+    seen = {key: value.repeat(len(names), *(1,) * (value.dim() - 1)) for key, value in starts.observed.items()}
+    draws = [generator("cpu", seed, 4, task_key(name)) for name in names]
+    sampling = replace(SAMPLING, steps=min(SAMPLING.steps, model.max_steps or SAMPLING.steps))
+    together = [concepts[name].composition.to(model.device) for name in names]
+    plans = model.sample(together, GENERATED, sampling, draws, moved(seen, model.device)).cpu()
+    return dict(zip(names, plans, strict=True)), starts
+
+
+def first_windows(demonstrations: Demonstrations, horizon: int) -> tuple[Tensor, InitialStates]:
+    """The first states of demonstrations ``(demo, horizon, state)``, and where they start."""
+    rows = torch.arange(len(demonstrations))
+    return demonstrations.windows(rows, torch.zeros_like(rows), horizon)[0], demonstrations.initial_states
+
+
+def _encoded(model: ConceptModel, plans: Tensor, starts: InitialStates) -> Tensor:
+    return model.encode(plans.to(model.device), moved(starts.observed, model.device)).cpu()

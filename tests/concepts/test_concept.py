@@ -87,7 +87,7 @@ def written(form: int, without: str = "", **changes: object) -> str:
             {"form": 2, "axes": "mode time component n"},
             "key 'axes': expected 'mode component n', found 'mode time component n'; a newer version may read it",
         ),
-        ({"form": 4}, "key 'format': expected 1 or 2 or 3, found 4; it is of another version"),
+        ({"form": 5}, "key 'format': expected 1 or 2 or 3 or 4, found 5; it is of another version"),
         ({"form": 2, "without": "axes"}, "expected the keys of a concept, found none of axes"),
         ({"form": 2, "without": "mode_weights"}, "expected the keys of a concept, found none of mode_weights"),
         ({"form": 1, "without": "embeddings"}, "expected the keys of a concept, found none of embeddings"),
