@@ -162,11 +162,14 @@ class Show:
         film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is not a motion.
         wireframe: ``states (horizon, state) -> moving points and lines``, from which a web page draws the same film in a twentieth
             of its size; ``None`` where a plan cannot be drawn in this way.
+        beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title) -> figure`` of both on one scale;
+            ``None`` for one picture above the other.
     """
 
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
     wireframe: Callable[[Tensor], "Wireframe"] | None = None
+    beside: Callable[[Tensor, Tensor, str], "Figure"] | None = None
 
 
 def line_drawings(plans: Plans) -> Show:
@@ -174,7 +177,8 @@ def line_drawings(plans: Plans) -> Show:
 
     Paths in two or three dimensions are also filmed.
     """
-    return Show(line_plots.picture(plans.columns), line_plots.film if len(plans.columns) in (2, 3) else None)
+    film = line_plots.film if len(plans.columns) in (2, 3) else None
+    return Show(line_plots.picture(plans.columns), film, beside=line_plots.beside(plans.columns))
 
 
 Policy = Callable[[Observed, list[int], int], Tensor]

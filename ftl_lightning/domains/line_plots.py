@@ -1,9 +1,10 @@
 """Pictures and films of behaviour known by its columns alone: paths in two or three dimensions, or lines over time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,39 +23,68 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
     """A renderer of plans with these columns, see :class:`ftl_lightning.domains.domain.Show`."""
 
     def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> "Figure":
-        from matplotlib.figure import Figure
+        return _drawn(names, {"": states}, right, title)
 
-        columns = min(len(states), MAX_COLUMNS)
-        rows = -(-len(states) // columns)
-        figure = Figure(figsize=(1.6 * columns, 1.6 * rows + 0.5), layout="constrained")
-        figure.suptitle(figure_text(title), fontsize=9)
-        spatial = states.shape[2] == 3 and states.shape[1] > 1
-        grid = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"} if spatial else {}).flat
-        colours = [PLAIN] * len(states) if right is None else [RIGHT if good else WRONG for good in right]
-        flat = states.flatten(0, 1)
-        low, high = flat.amin(dim=0).tolist(), flat.amax(dim=0).tolist()
-        for axes, plan, colour in zip(grid, states.numpy(), colours, strict=False):
+    return render
+
+
+def beside(names: Sequence[str]) -> Callable[[Tensor, Tensor, str], "Figure"]:
+    """A renderer of demonstrations above samples on one scale, see :class:`ftl_lightning.domains.domain.Show`."""
+
+    def render(demonstrations: Tensor, samples: Tensor, title: str) -> "Figure":
+        return _drawn(names, {"demonstrations": demonstrations, "samples": samples}, None, title)
+
+    return render
+
+
+def _drawn(names: Sequence[str], groups: Mapping[str, Tensor], right: Sequence[bool] | None, title: str) -> "Figure":
+    """Plans on one scale, those of each group from a new row on.
+
+    Args:
+        names: of columns.
+        groups: plans ``(plan, time, state)`` by what stands beside their first row.
+        right: whether each plan of a single group is right; ``None`` if not judged.
+        title: of the figure.
+    """
+    from matplotlib.figure import Figure
+
+    states = torch.cat(list(groups.values()))
+    columns = min(max(len(plans) for plans in groups.values()), MAX_COLUMNS)
+    rows = {name: -(-len(plans) // columns) for name, plans in groups.items()}
+    every = sum(rows.values())
+    figure = Figure(figsize=(1.6 * columns, 1.6 * every + 0.5), layout="constrained")
+    figure.suptitle(figure_text(title), fontsize=9)
+    spatial = states.shape[2] == 3 and states.shape[1] > 1
+    grid = figure.subplots(every, columns, squeeze=False, subplot_kw={"projection": "3d"} if spatial else {})
+    colours = [PLAIN] * len(states) if right is None else [RIGHT if good else WRONG for good in right]
+    flat = states.flatten(0, 1)
+    low, high = flat.amin(dim=0).tolist(), flat.amax(dim=0).tolist()
+    first = 0
+    for name, plans in groups.items():
+        panels = grid[first : first + rows[name]].flatten()
+        for axes, plan, colour in zip(panels, plans.numpy(), colours, strict=False):
             if states.shape[2] in (2, 3) and states.shape[1] > 1:
                 axes.plot(*plan.T, color=PATH, linewidth=1.2)
                 axes.plot(*plan[:1].T, "o", color=START, markersize=3)
                 axes.set(**_limits(low, high), box_aspect=None if spatial else 1)
             else:
                 axes.set_ylim(_room(min(low), max(high)))  # one scale for all
-                for column, name in enumerate(names):
-                    axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=figure_text(name))
+                for column, label in enumerate(names):
+                    axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=figure_text(label))
             lines = states.shape[2] not in (2, 3) or states.shape[1] == 1
             axes.set(xticks=[])
             if not lines or axes is not figure.axes[0]:  # the first panel tells the scale
                 axes.set(yticks=[])
             for spine in axes.spines.values():
                 spine.set(color=colour, linewidth=2.0)
-        for axes in figure.axes[len(states) :]:
+        for axes in panels[len(plans) :]:
             axes.set_axis_off()
-        if states.shape[2] not in (2, 3) and len(names) <= MAX_COLUMNS:
-            figure.axes[0].legend(fontsize=6)
-        return figure
-
-    return render
+        if name:
+            panels[0].set_ylabel(name, fontsize=8)
+        first += rows[name]
+    if states.shape[2] not in (2, 3) and len(names) <= MAX_COLUMNS:
+        figure.axes[0].legend(fontsize=6)
+    return figure
 
 
 def _room(low: float, high: float) -> tuple[float, float]:

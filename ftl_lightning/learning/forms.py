@@ -24,7 +24,7 @@ the empty concept's. Chosen on relations that pretraining does not show, see doc
 NARROW = 0.85
 """Mixtures take the place of one set whose samples spread less than this share of the demonstrations."""
 
-SPAN_LOSS = 1.05
+SPAN_LOSS = 1.03
 """A concept is composed from a set in the span of the training concepts if sets there have at most so many times the loss of free
 ones on left-out demonstrations."""
 
