@@ -221,7 +221,8 @@ class FewShot(Shown):
             steps: of gradient descent; ``None`` for the tuned number.
             seed: decides starts, noise and timesteps.
             progress: show a bar.
-            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``components=1``.
+            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``components=1``. Unless
+                they or the model's settings name modes or an adapter, the form is chosen; ``form="paper"`` is one set.
 
         Warns:
             UserWarning: where demonstrations are longer than the model's plans, and says what is learned from then.
@@ -234,11 +235,9 @@ class FewShot(Shown):
             told = short(", ".join(sorted(found)), 150)
             raise UserError(f"states: expected demonstrations of one concept, found those of {told}; choose with select(name)")
         expect_whole("seed", seed, 0, None)
-        settings = replace(
-            changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION), seed=int(seed)
-        )
+        chosen = changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION)
+        settings = replace(chosen, seed=int(seed)).for_own()
         self.model.method.expect_settings(changes)
-        settings = settings.for_own()
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         if told := longer_than_plans(own, self.model):
             warnings.warn(told, stacklevel=2)
@@ -247,7 +246,7 @@ class FewShot(Shown):
             learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
         expect_sizes(self.model, concept := learned[own.concepts[0]])
         self._examples.append(own)
-        return self._learned(concept)
+        return replace(self._learned(concept), demonstrations=own, judging=self._judging)
 
     def starts(self, goal: str, count: int = 10, seed: int = 0) -> InitialStates:
         """New initial states of a task, with scenes where there is an environment.

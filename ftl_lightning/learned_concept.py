@@ -1,5 +1,6 @@
 """A learned concept as a user of the Python API holds it."""
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +9,11 @@ from ftl_lightning.arguments import expect_whole
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import Explanation, explain
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.quality import Inspection, inspected
 
 
 @dataclass(frozen=True, repr=False)
@@ -19,13 +23,28 @@ class LearnedConcept(Composition):
     Attributes:
         concept: embeddings, weights and where they come from.
         model: it was learned through.
+        demonstrations: that it was learned from, where this happened here.
+        judging: the domain that judges its samples, then.
     """
 
     concept: Concept
     model: ConceptModel
+    demonstrations: Demonstrations | None = None
+    judging: Domain | None = None
 
     def _words(self) -> Iterator[str]:
         return self.concept._words()
+
+    @functools.cached_property
+    def quality(self) -> Inspection:
+        """What samples of it are like beside the demonstrations: recognised, spread, novelty, roughness, and both to look at.
+
+        Raises:
+            UserError: for a concept that was not learned here from two demonstrations or more.
+        """
+        if self.demonstrations is None or self.judging is None or len(self.demonstrations) < 2:
+            raise UserError("quality: expected a concept that was learned here from two demonstrations or more, found another")
+        return inspected(self.model, self.judging, self.demonstrations, self.concept, 0)
 
     def explain(self, nearest: int = 3) -> Explanation:
         """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 import lightning.pytorch as pl
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from ftl_lightning import log_folder
@@ -21,6 +22,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.methods import adapts, kinds_for
 from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.learning.quality import inspected
 from ftl_lightning.printing import say
 from ftl_lightning.targets import expect_writable_file
 
@@ -135,6 +137,26 @@ class Adaptation(pl.LightningModule, ABC):
             say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
             if concept.choice is not None:
                 say(f"  form: {concept.choice}")
+            if self._own_file:
+                self._show_quality(name, concept)
+
+    @property
+    def _own_file(self) -> bool:
+        """Whether somebody's own demonstrations are learned from, not a domain's tasks."""
+        return bool(self.trainer.datamodule.hparams["demonstrations"])  # type: ignore[attr-defined]
+
+    def _show_quality(self, name: str, concept: Concept) -> None:
+        """Say what samples of a concept are like beside its demonstrations, and draw them into TensorBoard."""
+        own = self.demonstrations.select(name)
+        if len(own) < 2:
+            return
+        seen = inspected(self.model, self.domain, own, concept, self.hparams["seed"])
+        say(f"  quality: {seen}")
+        for logger in self.trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                tag = f"quality/{file_name(name)}"
+                logger.experiment.add_figure(tag, seen.figure(), self.trainer.global_step)
+                logger.experiment.add_text(tag, str(seen), self.trainer.global_step)
 
     def on_train_end(self) -> None:
         self.find()

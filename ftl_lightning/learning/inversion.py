@@ -1,13 +1,11 @@
 """Inversion: learning concepts from a few demonstrations by gradient descent through the frozen model (Eq. 2 of the paper)."""
 
 import logging
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam
 
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
@@ -16,6 +14,7 @@ from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.errors import UserError
+from ftl_lightning.learning.adam import Group
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.stopping import Stopping
@@ -356,7 +355,7 @@ def invert(
         tell: called with the mean loss after each step.
     """
     inversion = Inversion(model, demonstrations, settings).to(model.device)
-    groups = [_Group(parameter, rate) for parameter, rate in inversion.rates]
+    groups = [Group(parameter, rate) for parameter, rate in inversion.rates]
     for step in range(steps):
         losses = inversion.step_losses(step)
         # A sum over runs: each run's gradient is what it would be if it were learned alone.
@@ -368,43 +367,3 @@ def invert(
         if not inversion.stepped(step):
             break
     return inversion.learned()
-
-
-class _Group:
-    """A parameter and its state of Adam with cosine decay, the same arithmetic as :meth:`Inversion.optimizer`'s.
-
-    torch's optimiser classes import its compiler when they are used first, which takes longer than some concepts take to learn.
-    """
-
-    def __init__(self, parameter: nn.Parameter, rate: float) -> None:
-        self.parameter, self.rate = parameter, rate
-        self._mean, self._square = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        self._count = torch.zeros(())
-
-    @torch.no_grad()
-    def step(self, gradient: Tensor, decay: tuple[int, int] | None) -> None:
-        """Follow the gradient of a step; the rate for the next is the decay's recursion in torch's order of arithmetic.
-
-        Args:
-            gradient: like the parameter.
-            decay: the step's number from 0 and the number of steps, or ``None`` for a constant rate.
-        """
-        adam(
-            [self.parameter],
-            [gradient],
-            [self._mean],
-            [self._square],
-            [],
-            [self._count],
-            amsgrad=False,
-            beta1=0.9,
-            beta2=0.999,
-            lr=self.rate,
-            weight_decay=0.0,
-            eps=1e-8,
-            maximize=False,
-        )
-        if decay is not None:
-            step, steps = decay
-            after, before = (1 + math.cos(math.pi * done / steps) for done in (step + 1, step))
-            self.rate = after / before * self.rate

@@ -136,7 +136,7 @@ class InversionModule(ExactResume, Adaptation):
         if "inversion" not in self._modules:
             with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
                 super().configure_model()
-                if self.trainer.datamodule.hparams["demonstrations"]:  # type: ignore[attr-defined]
+                if self._own_file:
                     self.settings = self.settings.for_own()
                 self.inversion = Inversion(self.model, self.demonstrations, first_settings(self.settings))
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
@@ -11,16 +11,21 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.beside import beside
 from ftl_lightning.domains.distances import path_distance
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.seeding import generator, task_key
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COPIES, COLLAPSED, ROUGH = 0.2, 0.5, 1.5
 """Novelty and spread below which, and roughness above which samples are called so."""
 SCATTERED = 2.0
 """Spread above which samples are called so."""
-GENERATED = 40
-"""Samples that are looked at."""
+GENERATED, SHOWN = 40, 16
+"""Samples that are looked at, and those that are drawn."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
 """How they are generated: quickly, and as widely as the model does."""
 _LEAST = 1e-9
@@ -136,3 +141,57 @@ def first_windows(demonstrations: Demonstrations, horizon: int) -> tuple[Tensor,
 
 def _encoded(model: ConceptModel, plans: Tensor, starts: InitialStates) -> Tensor:
     return model.encode(plans.to(model.device), moved(starts.observed, model.device)).cpu()
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Samples of a learned concept beside its demonstrations.
+
+    Attributes:
+        quality: what they are like.
+        right: name and value of the domain's first metric that tells how many are right; ``None`` where none can.
+        demonstrations: ``(demo, horizon, state)``, in the domain's units.
+        samples: ``(GENERATED, horizon, state)``.
+        starts: where each sample starts.
+        domain: whose pictures they are drawn with.
+        name: of the concept.
+    """
+
+    quality: Quality
+    right: tuple[str, float] | None
+    demonstrations: Tensor
+    samples: Tensor
+    starts: InitialStates
+    domain: Domain
+    name: str
+
+    def __str__(self) -> str:
+        told = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}, "
+        return f"{told}{self.quality.words} ({len(self.samples)} samples)"
+
+    def figure(self) -> "Figure":
+        """Demonstrations above some of the samples."""
+        shown = slice(0, SHOWN)
+        starts = self.starts.take(shown) if self.domain.observed else None
+        return beside(self.domain.show, self.demonstrations, self.samples[shown], f"{self.name}: {self}", starts)
+
+
+def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstrations, concept: Concept, seed: int) -> Inspection:
+    """Look at samples of a learned concept.
+
+    Args:
+        model: that generates them.
+        domain: whose first metric that says so tells how many are right, where it can judge by the concept's name.
+        demonstrations: two or more, that it was learned from.
+        concept: the learned one.
+        seed: of the samples.
+    """
+    name = concept.origin.name
+    every, starts = generated(model, demonstrations, {name: concept}, seed)
+    plans, (known, first) = every[name], first_windows(demonstrations, model.config.horizon)
+    right = None
+    if domain.metrics and domain.concepts.reads(name):
+        measured = domain.measure(name, plans, starts if domain.observed else None)
+        right = next(((key, float(own.float().mean())) for key, own in measured.items() if own.dtype == torch.bool), None)
+    quality = Quality.of(_encoded(model, plans, starts), _encoded(model, known, first))
+    return Inspection(quality, right, known, plans, starts, domain, name)
