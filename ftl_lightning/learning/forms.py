@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from ftl_lightning.concepts.concept import Choice, Concept
 from ftl_lightning.concepts.modes import even_stretch
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
@@ -16,8 +18,8 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Of adapters and of their learning, where the settings name none."""
 MODE_SAMPLES = 16
 """Noised demonstrations a step of a mode that is learned without an adapter."""
-FOLDS, FOLD_SAMPLES = 5, 16
-"""Concepts that leave a demonstration out, at most, and noised demonstrations a step of each."""
+FOLDS, FOLD_SAMPLES, FOLD_STEPS = 5, 16, 150
+"""Concepts that leave a demonstration out, at most, and noised demonstrations a step and steps of each."""
 LEFT_OUT, OWN = 1.17, 0.8
 """One set suffices if its loss on left-out demonstrations is at most the first, or that on its own at most the second, as shares of
 the empty concept's. Chosen on relations that pretraining does not show, see docs/experiments-forms.md."""
@@ -58,6 +60,7 @@ def first_settings(settings: InversionSettings) -> InversionSettings:
     return replace(settings, form=PAPER).changed(modes=1, adapter=0)
 
 
+@torch.enable_grad()
 def formed(
     model: ConceptModel,
     demonstrations: Demonstrations,
@@ -67,6 +70,8 @@ def formed(
     tell: Tell = lambda loss: None,
 ) -> dict[str, Concept]:
     """Concepts in the form that the settings name, and where that is to be chosen, in the one that the demonstrations ask for.
+
+    Gradients are made here, whatever the caller's mode is: a trainer turns them off at the end of learning.
 
     Args:
         model, demonstrations, settings, steps, tell: as of :func:`learn`.
@@ -173,7 +178,8 @@ def _loss_shares(
     left_out: list[dict[str, float]] = []
     for off_span in (settings.embeddings.off_span, 0.0)[: 1 + isinstance(model, TextConceptModel)] if known else ():
         changes = {"modes": 1, "adapter": 0, "samples": FOLD_SAMPLES, "restarts": 1, "off_span": off_span}
-        folds = invert(model, concatenate(known), replace(settings, form=PAPER).changed(**changes), steps, tell)
+        learning = replace(settings, form=PAPER).changed(**changes)
+        folds = invert(model, concatenate(known), learning, min(steps, FOLD_STEPS), tell)
         left_out.append(compared(model, concatenate(held), folds, settings.loss.kind))
     own_shares = compared(model, demonstrations, first, settings.loss.kind)
     return {

@@ -102,6 +102,7 @@ class InversionModule(ExactResume, Adaptation):
         )
         check_settings(self.model, self.settings)
         self.inversion: Inversion
+        self._formed: tuple[int, dict[str, Concept]] | None = None
 
     @property
     def method(self) -> str:
@@ -187,7 +188,10 @@ class InversionModule(ExactResume, Adaptation):
         }
 
     def learned(self) -> dict[str, Concept]:
-        return formed(self.model, self.demonstrations, self.settings, self._steps, self.inversion.learned())
+        if self._formed is None or self._formed[0] != self.global_step:
+            first = self.inversion.learned()
+            self._formed = self.global_step, formed(self.model, self.demonstrations, self.settings, self._steps, first)
+        return self._formed[1]
 
     @property
     def _steps(self) -> int:
