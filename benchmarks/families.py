@@ -4,6 +4,7 @@ Paths, pictures and series are data of one's own, pretrained on with ``conf/own.
 object rearrangement, which pretraining does not show. Reaches and beats are looked at once.
 """
 
+import itertools
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -102,7 +103,7 @@ def _pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
         change = np.array(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))) @ np.array(((1, slant), (0, 1)))
         own = (own - middle) @ (change * rng.uniform(0.85, 1.1)).T + middle + rng.normal(0, 0.03, 2)
         width, far = rng.uniform(0.05, 0.1), np.full(len(pixels), 9.0)
-        for start, end in zip(own[:-1], own[1:], strict=True):
+        for start, end in itertools.pairwise(own):
             way = end - start
             along = np.clip(((pixels - start) @ way) / (way @ way + 1e-9), 0, 1)
             far = np.minimum(far, np.linalg.norm(pixels - start - along[:, None] * way, axis=1))
@@ -223,14 +224,9 @@ RULES: Mapping[str, Callable[[Tensor, float], Tensor]] = {
     "circle in the corner": lambda p, m: p[:, 0].amax(dim=-1) < 0.7 + 0.2 * m,
     "square in the middle": lambda p, m: (p[:, 2] - 2.5).norm(dim=-1) < 0.3 * m,
     "at a distance": lambda p, m: (_between(p, 0, 2) - 2.5).abs() < 0.12 * m,
-    "mirrored": lambda p, m: (
-        ((p[:, 0, 0] + p[:, 2, 0] - 5).abs() < 0.25 * m) & ((p[:, 0, 1] - p[:, 2, 1]).abs() < 0.25 * m)
-    ),
+    "mirrored": lambda p, m: ((p[:, 0, 0] + p[:, 2, 0] - 5).abs() < 0.25 * m) & ((p[:, 0, 1] - p[:, 2, 1]).abs() < 0.25 * m),
     "opposite corners": lambda p, m: (
-        (p[:, 0, 0] < 0.8 + 0.2 * m)
-        & (p[:, 0, 1] > 4.2 - 0.2 * m)
-        & (p[:, 2, 0] > 4.2 - 0.2 * m)
-        & (p[:, 2, 1] < 0.8 + 0.2 * m)
+        (p[:, 0, 0] < 0.8 + 0.2 * m) & (p[:, 0, 1] > 4.2 - 0.2 * m) & (p[:, 2, 0] > 4.2 - 0.2 * m) & (p[:, 2, 1] < 0.8 + 0.2 * m)
     ),
     "right angle": lambda p, m: (_angle(p, 0, 1, 2) - 90).abs() < 5 * m,
     "left of both": lambda p, m: (p[:, 1, 0] < p[:, 0, 0] - 1.2 + 0.2 * m) & (p[:, 1, 0] < p[:, 2, 0] - 1.2 + 0.2 * m),
