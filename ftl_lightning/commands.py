@@ -141,6 +141,10 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         how = "a random mixture of them" if learned.modes.mixed else "one of them"
         composed = "composed too" if learned.knots > 1 else "composed, from the components that have no mode"
         say(f"alone it generates from {how}: {len(learned.modes)} modes; {composed}")
+    if learned.choice is not None:
+        say(f"form: {learned.choice}")
+    if learned.composing is not None:
+        say("composed it is another set of embeddings, in the span of the training concepts")
     parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
     if len(learned.weights) > 1:
         whole = learned.at_knots(learned.weighted_sum)

@@ -236,7 +236,7 @@ class FewShot(Shown):
             raise UserError(f"states: expected demonstrations of one concept, found those of {told}; choose with select(name)")
         expect_whole("seed", seed, 0, None)
         chosen = changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION)
-        settings = replace(chosen, seed=int(seed)).for_own()
+        settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()))
         self.model.method.expect_settings(changes)
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         if told := longer_than_plans(own, self.model):

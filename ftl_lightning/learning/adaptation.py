@@ -148,7 +148,7 @@ class Adaptation(pl.LightningModule, ABC):
     def _show_quality(self, name: str, concept: Concept) -> None:
         """Say what samples of a concept are like beside its demonstrations, and draw them into TensorBoard."""
         own = self.demonstrations.select(name)
-        if len(own) < 2:
+        if len(own) < 2 or self.model.config.horizon != self.domain.plans.horizon:  # some methods plan a step at a time
             return
         seen = inspected(self.model, self.domain, own, concept, self.hparams["seed"])
         say(f"  quality: {seen}")

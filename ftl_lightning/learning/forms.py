@@ -9,7 +9,7 @@ from ftl_lightning.concepts.concept import Choice, Concept
 from ftl_lightning.concepts.modes import even_stretch
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import compared, invert
+from ftl_lightning.learning.inversion import check_settings, compared, invert
 from ftl_lightning.learning.inversion_settings import ADAPTED, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
 from ftl_lightning.learning.quality import Quality, measured
 from ftl_lightning.learning.text_concept_model import TextConceptModel
@@ -49,6 +49,7 @@ def learn(
         steps: of gradient descent.
         tell: called with the mean loss after each step.
     """
+    check_settings(model, settings)
     first = invert(model, demonstrations, first_settings(settings), steps, tell)
     return formed(model, demonstrations, settings, steps, first, tell)
 
@@ -92,7 +93,7 @@ def formed(
         inside = replace(settings, form=PAPER).changed(**changes)
         span = invert(model, _of(demonstrations, composable), inside, steps, tell)
     forms = {name: {ONE: concept} for name, concept in first.items()}
-    if enough and model.adaptable():
+    if enough:
         for name, more in _adapted(model, _of(demonstrations, enough), settings, steps, tell).items():
             forms[name] |= more
     if rest := [name for name in shares if name not in enough]:
@@ -233,8 +234,6 @@ def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str
     if not shares.suffices:
         return MODES, f"one set of embeddings does not explain the demonstrations (loss {told}), so samples stay close to them"
     because = f"one set of embeddings explains the demonstrations (loss {told})"
-    if ADAPTED not in qualities:
-        return ONE, because
     spread, mixed = qualities[ADAPTED].spread, qualities[MIXED].spread
     if spread < min(NARROW, mixed):
         return MIXED, f"{because}; its samples spread {spread:.2f} of what the demonstrations do, mixtures {mixed:.2f}"

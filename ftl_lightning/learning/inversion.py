@@ -16,7 +16,7 @@ from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adam import Group
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
+from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, EXPLAINED, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.learning.stopping import Stopping
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.seeding import generator, task_key
@@ -285,6 +285,8 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
     if (knots := settings.embeddings.knots) > 1 and not model.over_time:
         told = f"expected 1 for this model, whose concepts do not vary over a plan, found {knots}"
         raise UserError(f"model.embeddings.knots: {told}")
+    if settings.form in (AUTO, ADAPTED, MIXED) and not model.adaptable():
+        raise UserError(f"model.form: expected {PAPER}, {ONE} or {MODES} for {model.method.name}, found {settings.form}")
     if settings.adapter.rank and not model.adaptable():
         raise UserError(f"model.adapter.rank: expected 0 (none) for {model.method.name}, found {settings.adapter.rank}")
     pretrained = model.config.training.get("model", {}).get("loss", settings.loss.kind)

@@ -138,7 +138,7 @@ class InversionModule(ExactResume, Adaptation):
             with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
                 super().configure_model()
                 if self._own_file:
-                    self.settings = self.settings.for_own()
+                    self.settings = self.settings.for_own(bool(self.model.adaptable()))
                 self.inversion = Inversion(self.model, self.demonstrations, first_settings(self.settings))
 
     def training_step(self, step: int) -> Tensor:
