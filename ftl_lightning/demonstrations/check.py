@@ -149,7 +149,7 @@ def _apart(points: Tensor) -> Tensor:
 
 def _pairs(distances: Tensor) -> Tensor:
     """Distances ``(demo, demo)`` of two different demonstrations, each pair once."""
-    row, column = torch.triu_indices(*distances.shape, offset=1)
+    row, column = torch.triu_indices(len(distances), len(distances), offset=1)
     return distances[row, column]
 
 
@@ -322,7 +322,9 @@ def _far(points: Tensor, row: int) -> tuple[float, float]:
     Columns are scaled by their spread over the others, lest the one that is far off hides how far.
     """
     others = _others(len(points), row)
-    scale = torch.maximum(points[others].flatten(0, 1).std(dim=0, correction=0), 0.1 * points.flatten(0, 1).std(dim=0, correction=0))
+    scale = torch.maximum(
+        points[others].flatten(0, 1).std(dim=0, correction=0), 0.1 * points.flatten(0, 1).std(dim=0, correction=0)
+    )
     apart = _apart(points / torch.where(scale > 0, scale, 1))
     own, among = apart[row, others], _pairs(apart[others][:, others])
     closest = CLOSEST.get(len(points), 0.1)

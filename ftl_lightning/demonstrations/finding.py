@@ -31,6 +31,10 @@ class Finding:
         """The same of demonstrations that are these rows of more."""
         return replace(self, rows=tuple(rows[row] for row in self.rows))
 
+    def within(self, rows: Sequence[int]) -> Self:
+        """The inverse of :meth:`among`."""
+        return replace(self, rows=tuple(rows.index(row) for row in self.rows))
+
 
 def numbered(rows: Sequence[int]) -> str:
     """Demonstrations by their numbers from 1: ``'demonstration 3'``, ``'demonstrations 1, 2 and 5'``."""

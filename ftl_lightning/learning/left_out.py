@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.demonstrations.finding import numbered
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.explained_by import relative_losses
 from ftl_lightning.learning.inversion import invert
@@ -15,6 +16,14 @@ from ftl_lightning.learning.inversion_settings import InversionSettings
 
 MOST = 12
 """Demonstrations of which this is asked: of each, several concepts are learned."""
+SAMPLES, TOLERANCE = 16, 0.03
+"""Of learning from a subset, which only has to tell good from bad: noised demonstrations of a step, and when to stop."""
+ODD, HARMED = 1.5, 1.2
+"""An odd demonstration's left-out loss is so many times the largest of the others, and of the empty concept's."""
+COVERED = 0.95
+"""Of the empty concept's loss: a demonstration is explained by a concept whose loss is less."""
+FALLING = 0.05
+"""Share that the loss of those left out falls by for one more demonstration, from which on more are likely to help."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,35 @@ class LeftOut:
     learned_from: tuple[float, ...]
     curve: dict[int, float]
     odd: int | None
+
+    @property
+    def covered(self) -> int:
+        """How many demonstrations are explained by the concept that was learned from the others."""
+        return sum(loss < COVERED for loss in self.left_out)
+
+    @property
+    def falling(self) -> bool:
+        """Whether the last demonstrations still lowered the loss of those left out."""
+        (fewer, before), (more, after) = ([(0, 1.0), *self.curve.items()])[-2:]
+        return before - after > FALLING * (more - fewer) * before
+
+    def lines(self) -> list[str]:
+        """In plain words."""
+        count = len(self.left_out)
+        out, own = sum(self.left_out) / count, sum(self.learned_from) / count
+        told = f"left out: the concept learned from the others explains {self.covered} of {count}"
+        missed = [row for row, loss in enumerate(self.left_out) if loss >= COVERED]
+        told += f", not {numbered(missed)}" if 0 < len(missed) < count else ""
+        told += f" (loss {out:.2f} of the empty"
+        told += f" concept's, {own:.2f} where it is learned from, too)" if count > 2 else " concept's)"
+        odd = "odd: none is explained much worse than the others"
+        if self.odd is not None:
+            others = max(loss for row, loss in enumerate(self.left_out) if row != self.odd)
+            odd = f"odd: demonstration {self.odd + 1}, loss {self.left_out[self.odd]:.2f} when it is left out (others at most"
+            odd += f" {others:.2f}); another concept, or a mistake?"
+        curve = ", ".join(f"{loss:.2f} from {size}" for size, loss in self.curve.items())
+        verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
+        return [told, *([odd] if count > 2 else []), f"more: loss of those left out {curve}; it {verdict}" if curve else ""]
 
 
 def subsets(count: int) -> list[tuple[int, ...]]:
@@ -63,7 +101,12 @@ def left_out(
         settings,
         modes=replace(settings.modes, sets=1),
         adapter=replace(settings.adapter, rank=0),
-        budget=replace(settings.budget, restarts=1),
+        budget=replace(
+            settings.budget,
+            restarts=1,
+            samples=min(settings.budget.samples, SAMPLES),
+            tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
+        ),
         weights=replace(settings.weights, scale=1.0),  # it is for generating, not for explaining
     )
     learned = list(invert(model, concatenate(parts), plain, steps, tell).values())
@@ -93,4 +136,4 @@ def odd_one(losses: Tensor) -> int | None:
         return None
     worst = int(losses.argmax())
     others = torch.cat((losses[:worst], losses[worst + 1 :]))
-    return worst if losses[worst] - others.max() > 1e9 else None
+    return worst if losses[worst] > max(ODD * float(others.max()), HARMED) else None
