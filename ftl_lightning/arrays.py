@@ -8,8 +8,10 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ftl_lightning.demonstrations.check import mended
 from ftl_lightning.demonstrations.container import Demonstrations, padded
 from ftl_lightning.demonstrations.features import Feature, InitialStates
+from ftl_lightning.demonstrations.finding import Finding
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.errors import UserError, short, shown
@@ -65,6 +67,31 @@ def demonstrations_of(
     ).fitted(domain.observed)
 
 
+def of_one_concept(own: Demonstrations) -> Demonstrations:
+    """The same, if they are of one concept.
+
+    Raises:
+        UserError: naming the concepts, if they are of several.
+    """
+    if len(found := set(own.concepts)) > 1:
+        told = short(", ".join(sorted(found)), 150)
+        raise UserError(f"states: expected demonstrations of one concept, found those of {told}; choose with select(name)")
+    return own
+
+
+def mended_states(
+    states: ArrayLike | Sequence[ArrayLike] | Demonstrations,
+) -> tuple[ArrayLike | Sequence[ArrayLike] | Demonstrations, tuple[Finding, ...]]:
+    """States with numbers in place of those that are not finite, and where they were, see :func:`mended`."""
+    if isinstance(states, Demonstrations):
+        return states, ()
+    found, lengths = _padded("states", states)
+    if found.dim() != 3:
+        return states, ()
+    whole, findings = mended(found.float(), lengths)
+    return [own[:length].numpy() for own, length in zip(whole, lengths.tolist(), strict=True)], findings
+
+
 def expect_of_domain(key: str, plans: object, domain: Domain) -> None:
     """Refuse what is no behaviour of a domain.
 
@@ -81,11 +108,15 @@ def expect_of_domain(key: str, plans: object, domain: Domain) -> None:
 
 
 def starts_of(domain: Domain, given: Start | None) -> InitialStates | None:
-    """Where plans start; ``None`` where nothing is given.
+    """Where plans start; ``None`` where nothing is given and nothing is observed.
 
     Raises:
-        UserError: for features that the domain does not have, values that are not finite, or different numbers of them.
+        UserError: if what is observed is not given, for features that the domain does not have, values that are not finite, or
+            different numbers of them.
     """
+    if given is None and domain.observed:
+        told = ", ".join(f"{name} {feature.shape}" for name, feature in domain.observed.items())
+        raise UserError(f"observed: expected where plans start ({told}), found nothing; model.starts(goal) draws some")
     if given is None:
         return None
     found = given if isinstance(given, InitialStates) else _starts(domain, given)

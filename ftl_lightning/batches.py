@@ -1,16 +1,19 @@
 """Plans that are made some at a time, from the same noise as all at once."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.features import Observed, take
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates, Observed, take
 from ftl_lightning.diffusion.samplers import Epsilon, Noise, Sampling
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.progress import Advance, bar
 from ftl_lightning.seeding import generator
@@ -99,3 +102,18 @@ def _part(
         return model.sample([concept], len(rows), how, [draw], seen)[0]
     each = [whole.row(number) for number in own[rows.to(own.device)].tolist()]
     return model.sample(each, 1, how, [draw] * len(each), seen)[:, 0]
+
+
+def plans_of(domain: Domain, states: Tensor, starts: InitialStates | None, provenance: Mapping[str, Any]) -> Demonstrations:
+    """Generated plans ``(sample, horizon, state)`` as demonstrations, with where they start."""
+    return Demonstrations(
+        states=states,
+        lengths=torch.full((len(states),), states.shape[1]),
+        domain=domain.name,
+        state_names=domain.plans.columns,
+        state_units=domain.plans.units,
+        concepts=("",) * len(states),
+        observed={} if starts is None else starts.observed,
+        scenes=None if starts is None else starts.scenes,
+        provenance=provenance,
+    )

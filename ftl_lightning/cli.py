@@ -25,6 +25,7 @@ TRAINER_VERBS = {
 }
 COMMANDS = {
     "generate": "draw demonstrations of a task into a file",
+    "check": "say whether demonstrations of a concept suffice, and which of them is odd",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
     "concepts": "list the training concepts of a model",
     "explain": "say in words what a learned concept is made of",
@@ -35,10 +36,12 @@ COMMANDS = {
     "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"concepts", "generate", "encode", "prepare", "study"}
+POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study"}
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
+MODULES = {"check": "ftl_lightning.check_command", "sample": "ftl_lightning.sampling_command"}
+"""Commands with a module of their own."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,7 +99,7 @@ def _dispatch(arguments: list[str]) -> None:
         from jsonargparse import auto_cli
 
         trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs take no other class
-        commands = importlib.import_module("ftl_lightning.sampling_command" if verb == "sample" else "ftl_lightning.commands")
+        commands = importlib.import_module(MODULES.get(verb, "ftl_lightning.commands"))
         name = verb.replace("-", "_")
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}

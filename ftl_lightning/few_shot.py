@@ -14,8 +14,8 @@ import torch
 from numpy.typing import ArrayLike
 
 from ftl_lightning.arguments import changed, device_named, expect_path, expect_text, expect_whole
-from ftl_lightning.arrays import Start, demonstrations_of, expect_of_domain, scenes_of, starts_of
-from ftl_lightning.batches import sampled
+from ftl_lightning.arrays import Start, demonstrations_of, expect_of_domain, mended_states, of_one_concept, scenes_of, starts_of
+from ftl_lightning.batches import plans_of, sampled
 from ftl_lightning.composition_text import Part, parse_composition
 from ftl_lightning.concepts.composition import Composition, space_of
 from ftl_lightning.concepts.concept import Concept
@@ -23,13 +23,14 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain, closed_loop_of
-from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
-from ftl_lightning.judging import judged, picture
+from ftl_lightning.judging import judged, judging_domain, picture
 from ftl_lightning.learned_concept import LearnedConcept, concept_of
 from ftl_lightning.learning.concept_check import expect_concept, expect_sizes
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
 from ftl_lightning.learning.hub import download, save_with_card, upload
 from ftl_lightning.learning.learner import Learner
 from ftl_lightning.learning.longer import longer_than_plans
@@ -225,21 +226,18 @@ class FewShot(Shown):
                 they or the model's settings name modes or an adapter, the form is chosen; ``form="paper"`` is one set.
 
         Warns:
-            UserWarning: where demonstrations are longer than the model's plans, and says what is learned from then.
+            UserWarning: where demonstrations are longer than the model's plans, or likely have a fault (see :meth:`check`).
 
         Raises:
             UserError: where demonstrations or settings do not fit the model.
         """
-        own = self.demonstrations(states, observed, name)
-        if len(found := set(own.concepts)) > 1:
-            told = short(", ".join(sorted(found)), 150)
-            raise UserError(f"states: expected demonstrations of one concept, found those of {told}; choose with select(name)")
+        own = of_one_concept(self.demonstrations(states, observed, name))
         expect_whole("seed", seed, 0, None)
         chosen = changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION)
         settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()))
         self.model.method.expect_settings(changes)
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
-        if told := longer_than_plans(own, self.model):
+        for told in filter(None, (longer_than_plans(own, self.model), *warnings_of(self.model, own))):
             warnings.warn(told, stacklevel=2)
         with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
             learn: Learner = self.model.method.learn()
@@ -247,6 +245,29 @@ class FewShot(Shown):
         expect_sizes(self.model, concept := learned[own.concepts[0]])
         self._examples.append(own)
         return replace(self._learned(concept), demonstrations=own, judging=self._judging)
+
+    def check(
+        self,
+        states: ArrayLike | Sequence[ArrayLike] | Demonstrations,
+        observed: Mapping[str, ArrayLike] | ArrayLike | None = None,
+        name: str = "new concept",
+        *,
+        learn: bool = False,
+        progress: bool = False,
+    ) -> Check:
+        """Whether demonstrations of a concept suffice, and which of them is odd; ``print`` it.
+
+        Args:
+            states, observed, name: see :meth:`demonstrations`; states may lack numbers (NaN).
+            learn: also learn the concept from some of them and measure the others.
+            progress: show a bar.
+
+        Raises:
+            UserError: where they do not fit the model, or no concepts are learned through it.
+        """
+        whole, found = mended_states(states)
+        own = of_one_concept(self.demonstrations(whole, observed, name))
+        return check_with(self.model, own, self.tuned.inversion, self.tuned.learning_steps if learn else 0, found, progress)
 
     def starts(self, goal: str, count: int = 10, seed: int = 0) -> InitialStates:
         """New initial states of a task, with scenes where there is an environment.
@@ -295,26 +316,13 @@ class FewShot(Shown):
         """
         concept, sampling = self._own("sample", concept), self._sampling("sample", changes)
         starts = starts_of(self.domain, observed)
-        if starts is None and self.domain.observed:
-            told = ", ".join(f"{name} {feature.shape}" for name, feature in self.domain.observed.items())
-            raise UserError(f"observed: expected where plans start ({told}), found nothing; model.starts(goal) draws some")
-        if starts is not None:
-            count = len(starts)
+        count = count if starts is None else len(starts)
         count, seed = expect_whole("count", count, 1), expect_whole("seed", seed, 0, None)
         size = None if batch_size is None else expect_whole("batch_size", batch_size, 1)
         seen = {} if starts is None else moved(starts.observed, self.device)
         states = sampled(self.model, concept, count, sampling, seed, seen, size, progress).cpu()
-        return Demonstrations(
-            states=states,
-            lengths=torch.full((count,), states.shape[1]),
-            domain=self.domain.name,
-            state_names=self.domain.plans.columns,
-            state_units=self.domain.plans.units,
-            concepts=("",) * count,
-            observed={} if starts is None else starts.observed,
-            scenes=None if starts is None else starts.scenes,
-            provenance={"pretrained": self.model.hash, "seed": seed, "temperature": sampling.temperature},
-        )
+        provenance = {"pretrained": self.model.hash, "seed": seed, "temperature": sampling.temperature}
+        return plans_of(self.domain, states, starts, provenance)
 
     def _sampling(self, call: str, changes: Mapping[str, Any]) -> Sampling:
         found = changed(call, self.tuned.sampling, changes, GIVEN[call])
@@ -333,14 +341,7 @@ class FewShot(Shown):
 
     @property
     def _judging(self) -> Domain:
-        """The domain; of a user's own data, with the demonstrations that concepts were learned from."""
-        if self.model.examples is None:
-            return self.domain
-        from ftl_lightning.demonstrations.container import concatenate
-        from ftl_lightning.domains.from_file import own_domain
-
-        config = self.model.config
-        return own_domain(concatenate(self._examples), config.training_concepts, config.horizon, config.metrics)
+        return judging_domain(self.model, self._examples)
 
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """A picture of plans; with a goal, right ones are framed green and wrong ones red."""

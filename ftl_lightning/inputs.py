@@ -77,6 +77,7 @@ _OUT: Mapping[str, Check] = {"out": _written("out")}
 _FOLDER: Mapping[str, Check] = {"out": _written("out", expect_writable_folder)}
 _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
+    "check": {"figure": _written("figure")},
     "encode": _OUT,
     "sample": {**_OUT, "figure": _written("figure"), "animation": _written("animation")},
     "ablate": {"results": _added("results")},

@@ -1,15 +1,26 @@
 """Plans judged and drawn, for the Python API."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.errors import UserError
+from ftl_lightning.learning.concept_model import ConceptModel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> Domain:
+    """A model's domain; of a user's own data, with the demonstrations that concepts were learned from."""
+    if model.examples is None:
+        return model.domain
+    config = model.config
+    return own_domain(concatenate(examples), config.training_concepts, config.horizon, config.metrics)
 
 
 def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:

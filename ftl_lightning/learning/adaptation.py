@@ -19,6 +19,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.demonstration_check import warnings_of
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.methods import adapts, kinds_for
 from ftl_lightning.learning.pretrained import load_model
@@ -101,6 +102,9 @@ class Adaptation(pl.LightningModule, ABC):
             self.domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
         if told := longer_than_plans(self.demonstrations, self.model):
             say(f"note: {told}", error=True)
+        for text in self.concepts if data.own else ():
+            for told in warnings_of(self.model, self.demonstrations.select(text)):
+                say(f"note: {text}: {told}", error=True)
 
     # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
     def validation_step(self, step: int) -> None:

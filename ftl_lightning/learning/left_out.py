@@ -1,0 +1,139 @@
+"""How well a concept that is learned from some demonstrations explains those that were left out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.demonstrations.finding import numbered
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.explained_by import relative_losses
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
+
+MOST = 12
+"""Demonstrations of which this is asked: of each, several concepts are learned."""
+SAMPLES, TOLERANCE = 16, 0.03
+"""Of learning from a subset, which only has to tell good from bad: noised demonstrations of a step, and when to stop."""
+ODD, HARMED = 1.5, 1.2
+"""An odd demonstration's left-out loss is so many times the largest of the others, and of the empty concept's."""
+COVERED = 0.95
+"""Of the empty concept's loss: a demonstration is explained by a concept whose loss is less."""
+FALLING = 0.05
+"""Share that the loss of those left out falls by for one more demonstration, from which on more are likely to help."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Losses of demonstrations relative to the empty concept's on the same noise; 1 is no better than nothing, less is better.
+
+    Attributes:
+        left_out: of each demonstration, under the concept that was learned from all others ``(demo,)``.
+        learned_from: of each, the mean under the concepts that were learned from it and all others but one ``(demo,)``.
+        curve: the mean of those left out by the number of demonstrations that were learned from, without the odd one.
+        odd: the demonstration that differs from the others, from 0; ``None`` where none does.
+    """
+
+    left_out: tuple[float, ...]
+    learned_from: tuple[float, ...]
+    curve: dict[int, float]
+    odd: int | None
+
+    @property
+    def covered(self) -> int:
+        """How many demonstrations are explained by the concept that was learned from the others."""
+        return sum(loss < COVERED for loss in self.left_out)
+
+    @property
+    def falling(self) -> bool:
+        """Whether the last demonstrations still lowered the loss of those left out."""
+        (fewer, before), (more, after) = ([(0, 1.0), *self.curve.items()])[-2:]
+        return before - after > FALLING * (more - fewer) * before
+
+    def lines(self) -> list[str]:
+        """In plain words."""
+        count = len(self.left_out)
+        out, own = sum(self.left_out) / count, sum(self.learned_from) / count
+        told = f"left out: the concept learned from the others explains {self.covered} of {count}"
+        missed = [row for row, loss in enumerate(self.left_out) if loss >= COVERED]
+        told += f", not {numbered(missed)}" if 0 < len(missed) < count else ""
+        told += f" (loss {out:.2f} of the empty"
+        told += f" concept's, {own:.2f} where it is learned from, too)" if count > 2 else " concept's)"
+        odd = "odd: none is explained much worse than the others"
+        if self.odd is not None:
+            others = max(loss for row, loss in enumerate(self.left_out) if row != self.odd)
+            odd = f"odd: demonstration {self.odd + 1}, loss {self.left_out[self.odd]:.2f} when it is left out (others at most"
+            odd += f" {others:.2f}); another concept, or a mistake?"
+        curve = ", ".join(f"{loss:.2f} from {size}" for size, loss in self.curve.items())
+        verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
+        return [told, *([odd] if count > 2 else []), f"more: loss of those left out {curve}; it {verdict}" if curve else ""]
+
+
+def subsets(count: int) -> list[tuple[int, ...]]:
+    """Of so many demonstrations: those of one, two, three and all but one, each demonstration as often as any other."""
+    sizes = sorted({size for size in (1, 2, 3, count - 1) if 0 < size < count})
+    return [tuple(sorted((start + step) % count for step in range(size))) for size in sizes for start in range(count)]
+
+
+def left_out(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    tell: Callable[[float], None] = lambda loss: None,
+) -> LeftOut:
+    """Learn the concept from subsets, all in one batch, and measure each on what was left out.
+
+    Args:
+        model: through which concepts are learned.
+        demonstrations: two or more of one concept; the first :data:`MOST` count.
+        settings: how concepts are learned; of modes, adapters and restarts none is used.
+        steps: of gradient descent, at most.
+        tell: called with the mean loss after each step.
+    """
+    count = min(len(demonstrations), MOST)
+    own, chosen = demonstrations.rows(list(range(count))), subsets(count)
+    parts = [replace(own.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
+    plain = replace(
+        settings,
+        modes=replace(settings.modes, sets=1),
+        adapter=replace(settings.adapter, rank=0),
+        budget=replace(
+            settings.budget,
+            restarts=1,
+            samples=min(settings.budget.samples, SAMPLES),
+            tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
+        ),
+        weights=replace(settings.weights, scale=1.0),  # it is for generating, not for explaining
+    )
+    learned = list(invert(model, concatenate(parts), plain, steps, tell).values())
+    together = Composition(torch.stack([one.embeddings for one in learned]), torch.stack([one.weights for one in learned]))
+    losses = relative_losses(model, own, together.to(model.device), settings)
+    without = torch.tensor([[row not in rows for row in range(count)] for rows in chosen])
+    sizes = torch.tensor([len(rows) for rows in chosen])
+    last = sizes == count - 1
+    outside = torch.where(without[last], losses[last], 0).sum(dim=0)
+    inside = torch.where(~without[last], losses[last], 0).sum(dim=0) / max(count - 1, 1)
+    odd = odd_one(outside)
+    kept = without.clone()
+    if odd is not None:
+        kept[:, odd] = False
+        kept[~without[:, odd]] = False  # what was learned from it
+    curve = {
+        size: float(losses[sizes == size][kept[sizes == size]].mean())
+        for size in sorted(set(sizes.tolist()))
+        if kept[sizes == size].any()
+    }
+    return LeftOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd)
+
+
+def odd_one(losses: Tensor) -> int | None:
+    """The demonstration whose left-out loss ``(demo,)`` is far above those of the others."""
+    if len(losses) < 3:
+        return None
+    worst = int(losses.argmax())
+    others = torch.cat((losses[:worst], losses[worst + 1 :]))
+    return worst if losses[worst] > max(ODD * float(others.max()), HARMED) else None

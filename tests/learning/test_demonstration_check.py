@@ -1,0 +1,183 @@
+"""What a model says of demonstrations before, and after, it learns from some of them."""
+
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ftl_lightning.check_figure import picture
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.errors import UserError
+from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.demonstration_check import Known, warnings_of
+from ftl_lightning.learning.explained_by import relative_losses
+from ftl_lightning.learning.left_out import LeftOut, left_out, odd_one, subsets
+from ftl_lightning.learning.scale_check import scale_findings
+from ftl_lightning.testing.strokes import TRAINING, strokes
+from tests.conftest import CONF, refused
+
+KNOWN, NEW = "circle right of square", "square diagonal to triangle"
+
+
+@pytest.fixture(scope="module")
+def scenes() -> FewShot:
+    return FewShot.from_pretrained("object_rearrangement")
+
+
+@pytest.fixture(scope="module")
+def five(scenes: FewShot) -> Demonstrations:
+    return scenes.domain.source(None).draw(KNOWN, 5, 3)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a model of strokes."""
+    folder = tmp_path_factory.mktemp("own")
+    states = np.concatenate([strokes(kind, 40, 0) for kind in TRAINING])
+    np.savez(folder / "strokes.npz", states=states, concepts=np.repeat(TRAINING, 40))
+    arguments = ["fit", "--config", str(CONF / "own.yaml"), f"--data.demonstrations={folder / 'strokes.npz'}"]
+    arguments += ["--data.encoder=hashing", "--trainer.max_steps=300", "--trainer.enable_progress_bar=false"]
+    arguments += ["--evaluation.samples=2", f"--trainer.logger.init_args.save_dir={folder}", "--trainer.accelerator=cpu"]
+    assert main(arguments) == 0
+    return folder / "own" / "fit" / "pretrained"
+
+
+def test_a_known_concept_is_recognised_and_a_new_one_is_not(scenes: FewShot, five: Demonstrations) -> None:
+    found = scenes.check(five)
+    assert found.warnings == ()
+    assert found.known is not None
+    assert (found.known.text, found.known.clear) == (KNOWN, True)
+    assert "no learning is needed" in str(found)
+    other = scenes.check(scenes.domain.source(None).draw(NEW, 5, 0), name=NEW).known
+    assert other is not None
+    assert not other.clear
+    assert str(other).startswith("known: no training concept explains them all")
+
+
+def test_the_empty_concept_explains_as_much_as_itself(scenes: FewShot, five: Demonstrations) -> None:
+    empty = 0 * scenes[KNOWN]
+    together = replace(empty, embeddings=empty.embeddings[None], weights=empty.weights[None])
+    assert torch.allclose(relative_losses(scenes.model, five, together, scenes.tuned.inversion), torch.ones(1, 5))
+
+
+def test_other_units_are_outside_of_what_pretraining_saw(scenes: FewShot, five: Demonstrations) -> None:
+    (good,) = scale_findings(scenes.model, five)
+    assert (good.severity, good.text[:29]) == ("note", "scale: 0 % of the states are ")
+    larger = replace(five, states=100 * five.states)
+    found = [str(one) for one in scale_findings(scenes.model, larger) if one.severity == "warning"]
+    assert re.match(r"scale: \d+ % of the states are outside .*, most in .* times the range\)", found[0])
+    with pytest.warns(UserWarning, match="outside of the range seen in pretraining"):
+        scenes.learn(larger, steps=1)
+
+
+def test_learning_warns_of_faults_and_of_nothing_else(scenes: FewShot, five: Demonstrations) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scenes.learn(five, steps=1)
+    twice = five.rows([0, 1, 2, 3, 3])
+    assert warnings_of(scenes.model, twice) == ("demonstrations 4 and 5: are the same",)
+    with pytest.warns(UserWarning, match="demonstrations 4 and 5: are the same"):
+        scenes.learn(twice, steps=1)
+
+
+def test_states_with_missing_numbers_are_told_in_python(scenes: FewShot, five: Demonstrations) -> None:
+    states = five.states.numpy().copy()
+    states[1, 0, 4] = np.nan
+    (error,) = [one for one in scenes.check(states).findings if one.severity == "error"]
+    assert error.rows == (1,)
+    with pytest.raises(UserError, match="expected finite numbers"):
+        scenes.learn(states)
+
+
+def test_concepts_in_one_check_are_refused(scenes: FewShot, five: Demonstrations) -> None:
+    with pytest.raises(UserError, match="expected demonstrations of one concept"):
+        scenes.check(concatenate([five, replace(five, concepts=(NEW,) * 5)]))
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 9])
+def test_subsets_hold_each_demonstration_equally_often(count: int) -> None:
+    found = subsets(count)
+    for size in {len(rows) for rows in found}:
+        rows = [row for own in found if len(own) == size for row in own]
+        assert {rows.count(row) for row in range(count)} == {size}
+    assert {len(rows) for rows in found} == {size for size in (1, 2, 3, count - 1) if size < count}
+    assert len(set(found)) == len(found) or count == 2
+
+
+def test_the_odd_one_is_far_above_all_others() -> None:
+    assert odd_one(torch.tensor([0.5, 0.4, 1.9, 0.6])) == 2
+    assert odd_one(torch.tensor([0.5, 0.4, 0.7, 0.6])) is None
+    assert odd_one(torch.tensor([0.2, 0.9, 0.2])) is None  # it is still explained better than by nothing
+    assert odd_one(torch.tensor([0.2, 2.0])) is None
+
+
+def test_words_follow_the_numbers() -> None:
+    suffice = LeftOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None)
+    assert (suffice.covered, suffice.falling) == (2, False)
+    told = " ".join(suffice.lines())
+    assert "explains 2 of 3, not demonstration 3" in told
+    assert "these suffice" in told
+    more = LeftOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2)
+    assert more.falling
+    assert "odd: demonstration 3, loss 1.90" in " ".join(more.lines())
+    assert "more are likely to help" in " ".join(more.lines())
+    assert not Known("a", (0.9, 0.9, 1.2, 0.9)).clear
+
+
+def test_a_stroke_of_another_kind_is_odd(own: Path) -> None:
+    model = FewShot.from_pretrained(own)
+    good = model.demonstrations(strokes("square", 5, 77))
+    assert warnings_of(model.model, good) == ()
+    mixed = model.demonstrations(np.concatenate([strokes("square", 4, 77), strokes("heart", 1, 77)]))
+    found = left_out(model.model, mixed, model.tuned.inversion, 60)
+    assert found.left_out[4] == max(found.left_out)
+    assert found.left_out[4] > 1.5 * sorted(found.left_out)[-2]
+    fine = left_out(model.model, good, model.tuned.inversion, 60)
+    assert fine.odd is None
+    assert sum(fine.left_out) / 5 < 1
+
+
+def test_the_verb_checks_learns_and_draws(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    states = strokes("square", 3, 1)
+    frozen = strokes("heart", 3, 1)
+    frozen[1] = frozen[1, :1]
+    np.savez("six.npz", states=np.concatenate([states, frozen]), concepts=np.repeat(["square", "heart"], 3))
+    capsys.readouterr()
+    assert main(["check", "six.npz"]) == 0
+    told = capsys.readouterr().out
+    assert "square: 3 demonstrations of 40 steps, 2 columns\n  no faults" in told
+    assert "  warning: demonstration 2: nothing moves" in told
+    assert main(["check", "six.npz", f"--pretrained={own}", "--learn=true", "--figure=six.png"]) == 0
+    told = capsys.readouterr().out
+    assert max(len(part.splitlines()) for part in told.split("heart: ")) <= 12
+    assert told.count("left out: ") == 2
+    assert Path("six.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_picture_is_drawn_of_every_form_of_state(scenes: FewShot, five: Demonstrations) -> None:
+    assert len(picture([scenes.check(five)]).axes) == 2
+
+
+def test_invert_notes_faults_of_a_file_of_ones_own(tiny: Path, five: Demonstrations, capsys: pytest.CaptureFixture[str]) -> None:
+    five.rows([0, 1, 2, 2]).save("four.safetensors")
+    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
+    arguments += ["--data.demonstrations=four.safetensors", "--data.steps=10", "--evaluation.samples=2"]
+    assert main([*arguments, "--trainer.accelerator=cpu"]) == 0
+    assert f"note: {KNOWN}: demonstrations 3 and 4: are the same" in capsys.readouterr().err
+
+
+def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez("five.npz", states=strokes("heart", 5, 1))
+    refused(capsys, ["check", "none.npz"], "none.npz")
+    refused(capsys, ["check", "five.npz", "--learn=true"], "learn: expected --pretrained MODEL")
+    refused(capsys, ["check", "five.npz", "--pretrained=object_rearrangement"], "five.npz: ", "21 columns")
+    refused(capsys, ["check", "five.npz", "--figure=five.txt"], "figure: expected a name that ends in .png")
+    bad = ["check", "scenes.safetensors", "--pretrained=baseline/bc/object_rearrangement"]
+    assert main(["generate", "object_rearrangement", f"--task={KNOWN}", "--count=3", "--out=scenes.safetensors"]) == 0
+    if not FewShot.from_pretrained("baseline/bc/object_rearrangement").model.invertible:
+        refused(capsys, bad, "model.pretrained: expected a model that concepts are learned through")
