@@ -25,7 +25,7 @@ STILL = 0.05
 """Behaviour that moves by less than this share of what examples move by counts as still: it has no shape."""
 VARIANCE = 4e-4
 """Least variance of a place or size, in a column's spread: a fiftieth of it is no difference."""
-EVEN = 0.02
+EVEN = 0.1
 """Share of the mean variance that every coefficient of a shape has at least."""
 SHAPE_VARIANCE = 1e-4
 """Least variance of a whole shape, which is of root mean square 1."""
@@ -97,7 +97,8 @@ class _Concept:
         shape: mean.
         precision: of shapes, without what ``inverse`` takes off: ``(coefficient,)``.
         loadings, inverse: ``(k, coefficient)`` and ``(k, k)``, the directions in which examples differ (Woodbury's identity).
-        volume: logarithm of the determinant of both covariances.
+        volume: logarithm of the determinant of both covariances, as if means were known: else concepts of many examples would be
+            favoured, as coefficients of a shape vary together.
         roughness: ``(columns,)``.
     """
 
@@ -116,18 +117,19 @@ class _Concept:
         count, coefficients = known.shape.shape
         own, wider = _Within.of(known), 1 + 1 / count  # the mean is not known better
         common = within.position / max(within.freedom, 1)
-        variance = ((own.position + PRIOR * common) / (count - 1 + PRIOR)).clamp(min=VARIANCE) * wider
+        variance = ((own.position + PRIOR * common) / (count - 1 + PRIOR)).clamp(min=VARIANCE)
         even = within.shape / max(within.freedom, 1)
         even = even + EVEN * even.mean() + SHAPE_VARIANCE / coefficients
         weight = 1 / (count - 1 + SHAPE_PRIOR)
         scale = weight * (own.shape.sum() / even.sum() + SHAPE_PRIOR)  # a concept may vary more or less than others do
-        diagonal = even * scale * SHAPE_PRIOR * weight * wider
-        loadings = (known.shape - known.shape.mean(dim=0)) * math.sqrt(weight * wider)
+        diagonal = even * scale * SHAPE_PRIOR * weight
+        loadings = (known.shape - known.shape.mean(dim=0)) * math.sqrt(weight)
         scaled = loadings / diagonal
         inner = torch.eye(count, dtype=diagonal.dtype) + scaled @ loadings.T
         volume = variance.log().sum() + diagonal.log().sum() + torch.linalg.slogdet(inner).logabsdet
         mean = known.position.mean(dim=0), known.shape.mean(dim=0), known.roughness.mean(dim=0)
-        return cls(mean[0], variance, mean[1], 1 / diagonal, scaled, torch.linalg.inv(inner), float(volume), mean[2])
+        inverse = torch.linalg.inv(inner) / wider
+        return cls(mean[0], variance * wider, mean[1], 1 / (diagonal * wider), scaled, inverse, float(volume), mean[2])
 
     def distances(self, found: _Features, resting: float) -> tuple[Tensor, Tensor]:
         """How unlikely behaviour is ``(n,)``, and how far off in place, size, shape, roughness and rest: ``(n, 5)``, 1 is usual."""
