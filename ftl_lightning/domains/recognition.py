@@ -41,8 +41,8 @@ ENDS = 8
 """Lengths that behaviour may have, of plans that are longer than some examples."""
 LEFT_OUT = 200
 """Examples that are left out at most."""
-FEW = 2.0
-"""Limits grow by this over the number of examples that were left out: few say little about the rarest."""
+FEW = 1.0
+"""Limits grow by this over the number of concepts that examples were left out of: few say little about how concepts differ."""
 ROUGHER = 2.0
 """Root mean square roughness over the example's where no concept has two examples."""
 
@@ -219,7 +219,7 @@ class Recognition:
         far = torch.cat(found)
         limits = far.quantile(self.share, dim=0).clamp(min=1)
         together = (far / limits).amax(dim=1).quantile(self.share)  # of all five at once
-        return (limits * together * (1 + FEW / len(far))).clamp(min=1)
+        return (limits * together * (1 + FEW / len({concept for concept, _ in pairs}))).clamp(min=1)
 
     def _fitted(self, states: Tensor) -> Tensor:
         """As long as plans are, ``(n, horizon, state)``; what is shorter stays where it ends."""
