@@ -3,6 +3,9 @@
 Its training concepts are the texts, in the order in which they first appear. Plans are as long as the longest demonstration, or as
 ``horizon`` says. What it is judged by is named in a configuration, a name and a number each:
 
+``recognised: P``
+    right if, of all concepts with demonstrations, the goal is the likeliest, and the plan is as typical of it as the share P of real
+    demonstrations: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
 ``nearest_demonstration: K``
     right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
 ``end_point_within: R``
@@ -19,7 +22,7 @@ import importlib.util
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -28,6 +31,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
+from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.errors import UserError
 from ftl_lightning.inputs import MINARI
 from ftl_lightning.seeding import generator
@@ -213,6 +217,18 @@ def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:
     return rows
 
 
+def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    if not 0 < number <= 1:
+        raise UserError(f"data.metrics.recognised: expected a share of real demonstrations above 0, at most 1, found {number:g}")
+    known = cache(lambda: Recognition(examples, horizon, number))  # only where something is judged
+
+    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        _goal_rows(examples, goal)
+        return known().recognised(goal, states)
+
+    return Metric(measure, identity=examples.hash)
+
+
 def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float) -> Metric:
     count = int(number)
     if count < 1:
@@ -252,6 +268,7 @@ def _dtw_to_demonstrations(examples: Demonstrations, horizon: int, number: float
 
 
 METRICS: dict[str, Callable[[Demonstrations, int, float], Metric]] = {
+    "recognised": _recognised,
     "nearest_demonstration": _nearest_demonstration,
     "end_point_within": _end_point_within,
     "dtw_within": _dtw_within,

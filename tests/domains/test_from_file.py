@@ -120,7 +120,7 @@ def test_files_that_are_no_domain_are_told(tmp_path: Path, file: str) -> None:
     ):
         with pytest.raises(UserError, match=message):
             domain_from_file(path, None, {}, 0.1)
-    with pytest.raises(UserError, match=r"data\.metrics: expected some of nearest_demonstration, .*, found accuracy"):
+    with pytest.raises(UserError, match=r"data\.metrics: expected some of recognised, nearest_demonstration, .*, found accuracy"):
         domain_from_file(file, None, {"accuracy": 1}, 0.1)
 
 
