@@ -241,12 +241,11 @@ HARD = ("in a line", "equilateral", "far apart", "at a distance", "right angle")
 
 
 def _scenes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    found, round_ = [], 0
-    while sum(map(len, found)) < count:
-        proposed = random_scenes(200_000, zlib.crc32(f"{kind} {seed} {round_}".encode()))
+    found: list[Tensor] = []
+    while sum(len(some) for some in found) < count:
+        proposed = random_scenes(200_000, zlib.crc32(f"{kind} {seed} {len(found)}".encode()))
         fitting = proposed[RULES[kind](_points(proposed), 1.0)]
         found.append(fitting[~overlap(fitting)])
-        round_ += 1
     return np.asarray(torch.cat(found)[:count, None].numpy(), dtype=np.float32)
 
 

@@ -166,8 +166,8 @@ def rank_correlation(pairs: Sequence[Sequence[float]]) -> float:
     """Spearman's, ties at their mean rank."""
     import pandas as pd
 
-    table = pd.DataFrame(pairs).rank()
-    return round(float(table.corr().iloc[0, 1]), 3)
+    ranks = pd.DataFrame(pairs).rank().to_numpy()
+    return round(float(np.corrcoef(ranks.T)[0, 1]), 3)
 
 
 def draw(found: Mapping[str, list[list[float]]], path: str) -> None:

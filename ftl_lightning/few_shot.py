@@ -222,8 +222,7 @@ class FewShot(Shown):
             steps: of gradient descent; ``None`` for the tuned number.
             seed: decides starts, noise and timesteps.
             progress: show a bar.
-            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``components=1``. Unless
-                they or the model's settings name modes or an adapter, the form is chosen; ``form="paper"`` is one set.
+            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``form="paper"``; see there.
 
         Warns:
             UserWarning: where demonstrations are longer than the model's plans, or likely have a fault (see :meth:`check`).
