@@ -20,12 +20,13 @@ MODE_SAMPLES = 16
 """Noised demonstrations a step of a mode that is learned without an adapter."""
 FOLDS, FOLD_SAMPLES, FOLD_STEPS = 5, 16, 150
 """Concepts that leave a demonstration out, at most, and noised demonstrations a step and steps of each."""
-LEFT_OUT, OWN = 1.17, 0.8
-"""One set suffices if its loss on left-out demonstrations is at most the first, or that on its own at most the second, as shares of
-the empty concept's. Chosen on relations that pretraining does not show, see docs/experiments-forms.md."""
-NARROW = 0.85
-"""Mixtures take the place of one set whose samples spread less than this share of the demonstrations."""
-
+BOTH, OWN = 2.03, 0.8
+"""One set suffices if its losses on its own and on left-out demonstrations, as shares of the empty concept's, are together at most
+the first, or that on its own at most the second. Chosen on relations that pretraining does not show, see docs/experiments-forms.md.
+"""
+NARROW, WIDE = 0.85, 0.9
+"""Mixtures take the place of one set whose samples spread less than the first of what the demonstrations do; those that spread more
+than the second are stretched less."""
 SPAN_LOSS = 1.03
 """A concept is composed from a set in the span of the training concepts if sets there have at most so many times the loss of free
 ones on left-out demonstrations."""
@@ -143,7 +144,7 @@ class _Shares:
     @property
     def suffices(self) -> bool:
         """Whether one set says enough of what the demonstrations have in common."""
-        return self.own <= OWN or (self.left_out is not None and self.left_out <= LEFT_OUT)
+        return self.own <= OWN or (self.left_out is not None and self.own + self.left_out <= BOTH)
 
     @property
     def composes(self) -> bool:
@@ -215,6 +216,9 @@ def _chosen(
             found[name] = replace(candidates[ONE], choice=Choice(ONE, "there is a single demonstration", {}))
             continue
         qualities = measured(model, own, candidates, seed)
+        if MIXED in candidates and (wide := qualities[MIXED].spread) > WIDE:
+            candidates = {**candidates, MIXED: _stretched(candidates[MIXED], WIDE / wide)}
+            qualities |= measured(model, own, {MIXED: candidates[MIXED]}, seed)
         form, because = _choice(shares[name], qualities)
         numbers = shares[name].numbers
         numbers |= {f"{key}, {kind}": value for kind, one in qualities.items() for key, value in one.numbers.items()}
@@ -224,6 +228,12 @@ def _chosen(
         choice = Choice(form, because, {key: round(value, 4) for key, value in numbers.items()})
         found[name] = replace(candidates[form], choice=choice, composing=composing)
     return found
+
+
+def _stretched(concept: Concept, factor: float) -> Concept:
+    """A concept of modes whose mixtures are stretched so many times as much, though not below plain ones."""
+    modes = concept.modes
+    return replace(concept, modes=modes and replace(modes, stretch=max(factor * modes.stretch, 1.0)))
 
 
 def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str]:
