@@ -233,7 +233,7 @@ class FewShot(Shown):
         own = of_one_concept(self.demonstrations(states, observed, name))
         expect_whole("seed", seed, 0, None)
         chosen = changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION)
-        settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()))
+        settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()) and not {"modes", "adapter"} & {*changes})
         self.model.method.expect_settings(changes)
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         for told in filter(None, (longer_than_plans(own, self.model), *warnings_of(self.model, own))):

@@ -122,12 +122,12 @@ def test_a_concept_is_learned_from_arrays_as_it_is_from_a_file(scenes: FewShot, 
     settings = replace(scenes.tuned.inversion, seed=3)
     expected = invert(scenes.model, shown, settings, 4)[NEW]
     for states in (shown, shown.states, shown.states.numpy(), list(shown.states), shown.states.tolist()):
-        found = scenes.learn(states, name=NEW, steps=4, seed=3)
+        found = scenes.learn(states, name=NEW, steps=4, seed=3, form="paper")
         assert isinstance(found, LearnedConcept)
         assert torch.equal(found.embeddings, expected.embeddings)
         assert torch.equal(found.weights, expected.weights)
         assert found.concept.origin == expected.origin
-    other = scenes.learn(shown, steps=4, seed=4)
+    other = scenes.learn(shown, steps=4, seed=4, form="paper")
     assert not torch.equal(other.embeddings, expected.embeddings)
 
 
@@ -431,7 +431,7 @@ def test_a_concept_with_modes_is_learned_kept_and_told_of(scenes: FewShot, shown
     again = scenes.load("mine.safetensors")
     assert torch.equal(scenes.sample(again, 3, **QUICK).states, scenes.sample(learned, 3, **QUICK).states)
     assert scenes.learn(shown, steps=1, modes=1).modes is None
-    assert "modes" not in repr(scenes.learn(shown, steps=1))
+    assert "modes" not in repr(scenes.learn(shown, steps=1, form="paper"))
 
 
 def test_modes_generate_alone_and_the_centre_in_company(scenes: FewShot, shown: Demonstrations) -> None:
@@ -453,7 +453,7 @@ def test_modes_generate_alone_and_the_centre_in_company(scenes: FewShot, shown: 
 def test_a_learner_with_a_tolerance_stops_by_itself(
     scenes: FewShot, shown: Demonstrations, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = scenes.learn(shown, steps=150, progress=True, tolerance=0.5, samples=8)
+    found = scenes.learn(shown, steps=150, progress=True, tolerance=0.5, samples=8, form="paper")
     told = capsys.readouterr().err
     assert f"learning '{NEW}'" in told
     settings = scenes.tuned.inversion.changed(tolerance=0.5, samples=8)

@@ -213,14 +213,14 @@ class InversionSettings:
         if self.form in (UNSAID, PAPER) and self.adapter.rank and self.budget.tolerance is not None:
             raise UserError("model.adapter.rank: expected model.budget.tolerance null beside it, found a number")
 
-    def for_own(self, adaptable: bool) -> Self:
+    def for_own(self, choose: bool) -> Self:
         """The same for demonstrations of one's own: where nothing is said of form, modes and adapter, the form is chosen.
 
         Args:
-            adaptable: whether the model takes adapters; the form of others is the paper's.
+            choose: whether the model takes adapters, and nobody says otherwise.
         """
         unsaid = self.form == UNSAID and self.modes.sets == 1 and not self.adapter.rank
-        return replace(self, form=AUTO) if unsaid and adaptable else self
+        return replace(self, form=AUTO) if unsaid and choose else self
 
     def changed(self, **options: Any) -> Self:
         """The same with some options changed, which are given by their flat names (:data:`ftl_lightning.regrouped.INVERSION`)."""

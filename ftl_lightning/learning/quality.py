@@ -28,6 +28,8 @@ GENERATED, SHOWN = 40, 16
 """Samples that are looked at, and those that are drawn."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
 """How they are generated: quickly, and as widely as the model does."""
+SMOOTH = 0.01
+"""Second differences by the size of a plan, of which nobody sees less."""
 _LEAST = 1e-9
 
 
@@ -42,7 +44,7 @@ class Quality:
         spread: standard deviation over samples as a share of the demonstrations' own, unbiased, all columns and times together: 0
             where all samples are the same.
         roughness: second differences over time, relative to how much a plan varies, as a share of the demonstrations' (medians);
-            1 for plans of fewer than three states or which do not vary.
+            less than :data:`SMOOTH` cannot be seen and counts as that. 1 for plans of fewer than three states.
     """
 
     novelty: float
@@ -67,7 +69,7 @@ class Quality:
         return cls(
             novelty=_share(new, among),
             spread=_share(samples.var(dim=0).mean().sqrt(), demonstrations.var(dim=0).mean().sqrt()),
-            roughness=_share(roughness(samples), roughness(demonstrations)) if samples.shape[1] > 2 else 1.0,
+            roughness=_roughness_share(samples, demonstrations) if samples.shape[1] > 2 else 1.0,
         )
 
     @property
@@ -94,6 +96,11 @@ def roughness(plans: Tensor) -> Tensor:
     second = plans.diff(n=2, dim=1).square().mean(dim=(1, 2)).sqrt()
     moving = size > _LEAST
     return (second[moving] / size[moving]).median() if moving.any() else size.new_zeros(())
+
+
+def _roughness_share(samples: Tensor, demonstrations: Tensor) -> float:
+    one, other = (roughness(plans).clamp(min=SMOOTH) for plans in (samples, demonstrations))
+    return float(one / other)
 
 
 def _share(value: Tensor, whole: Tensor) -> float:

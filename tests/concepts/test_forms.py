@@ -248,7 +248,7 @@ def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeMo
     learner = FewShot(model, Tuned(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
     before = {name: parameter.clone() for name, parameter in model.named_parameters()}
     demonstrations = learner.demonstrations(strokes("heart", 3, 0), name="heart")
-    short, long = (learner.learn(demonstrations, name="heart", steps=steps, **options) for steps in (1, 40))
+    short, long = (learner.learn(demonstrations, name="heart", steps=steps, form="paper", **options) for steps in (1, 40))
     assert long.concept.origin.loss < short.concept.origin.loss
     assert long.knots == options.get("knots", 1)
     assert (long.concept.adapter is None) == ("adapter" not in options)
@@ -284,10 +284,7 @@ def test_what_is_learned_with_an_adapter_does_not_depend_on_what_is_learned_besi
     [
         ({"knots": 0}, "model.embeddings.knots: expected 1 or more, found 0"),
         ({"adapter": -1}, "model.adapter.rank: expected 0 \\(none\\) or a rank, found -1"),
-        (
-            {"adapter": 2, "tolerance": 0.1},
-            "model.adapter.rank: expected model.modes.sets 1 and model.budget.tolerance null beside it",
-        ),
+        ({"adapter": 2, "tolerance": 0.1}, "model.adapter.rank: expected model.budget.tolerance null beside it"),
     ],
 )
 def test_settings_that_are_none_are_told(options: dict[str, int], message: str) -> None:

@@ -240,11 +240,11 @@ def test_images_are_read_once_a_plan_and_concepts_are_learned_through_them(fitte
     assert calls == [40]
     calls.clear()
     file = write(fitted.parent / "new.npz", ways("away", 5, 11))
-    module = InversionModule(str(fitted), budget=BudgetOptions(samples=16), components=1, output="concepts")
+    module = InversionModule(str(fitted), budget=BudgetOptions(samples=16), components=1, output="concepts", form="paper")
     trainer(max_epochs=1).invert(module, InversionData("own", demonstrations=file, steps=4))
-    # Once a step; the rest is where the learned concept is judged.
+    # Once a step; the rest is where demonstrations are checked, and the learned concept and its samples are looked at.
     assert calls.count(16) == 4
-    assert set(calls) == {16, 128}
+    assert set(calls) == {5, 16, 40, 128}
     assert Path("concepts/away.safetensors").is_file()
 
 

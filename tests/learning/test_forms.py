@@ -85,8 +85,8 @@ def test_options_that_name_a_form_are_followed_without_a_choice(model: FewShot) 
     five = scenes(model)
     for options in ({"modes": "each"}, {"adapter": 1, "tolerance": None}, {"form": "paper"}):
         assert model.learn(five, steps=2, **options).concept.choice is None
-    assert InversionSettings().for_own(adaptable=True).form == AUTO
-    assert InversionSettings().for_own(adaptable=False).form == ""
+    assert InversionSettings().for_own(choose=True).form == AUTO
+    assert InversionSettings().for_own(choose=False).form == ""
 
 
 def test_a_chosen_form_comes_back_from_its_file_and_composes_as_before(model: FewShot, tmp_path: Path) -> None:

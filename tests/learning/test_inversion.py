@@ -130,7 +130,7 @@ def test_what_is_learned_does_not_depend_on_what_is_learned_beside_it(tiny: Path
     file = Path("one.safetensors")
     together.demonstrations.select(name).save(file)
     alone = InversionData("object_rearrangement", demonstrations=str(file), steps=6)
-    one, other = (learn(tiny, data).learned()[name] for data in (together, alone))
+    one, other = (learn(tiny, data, form="paper").learned()[name] for data in (together, alone))
     assert one.origin.demonstrations == other.origin.demonstrations
     assert torch.allclose(one.embeddings, other.embeddings, atol=2e-4)
 
@@ -141,7 +141,9 @@ def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
     file = Path("one.safetensors")
     everything.demonstrations.select(name).save(file)
     data = [InversionData("object_rearrangement", demonstrations=str(file), steps=6) for _ in range(2)]
-    one, four = learn(tiny, data[0], initial_spread=1.0), learn(tiny, data[1], initial_spread=1.0, restarts=4)
+    one, four = (
+        learn(tiny, own, initial_spread=1.0, form="paper", restarts=restarts) for own, restarts in zip(data, (1, 4), strict=True)
+    )
     assert torch.allclose(
         four.inversion.embeddings[:1], one.inversion.embeddings, atol=2e-4
     )  # the first restart is what there is without restarts

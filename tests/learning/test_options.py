@@ -69,7 +69,7 @@ def test_every_flat_name_is_an_option_of_a_group_and_every_option_has_one(
 def test_the_groups_are_those_of_the_settings() -> None:
     settings = InversionSettings()
     assert {name: type(value) for name, value in of_groups(settings).items()} == dict(GROUPS)
-    assert {one.name for one in fields(settings)} == {*GROUPS, "components", "omega", "seed"}
+    assert {one.name for one in fields(settings)} == {*GROUPS, "components", "omega", "seed", "form"}
 
 
 def test_options_go_from_flat_names_into_groups_and_back() -> None:
@@ -102,7 +102,7 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
     options = {**OTHER, "off_span": 0.5, "knots": 1}
     module = inversion_module(tiny, **options, components=3, seed=2)
     assert {name: module.hparams[name] for name in INVERSION} == options
-    assert set(module.hparams) == {*INVERSION, "pretrained", "components", "omega", "output", "seed"}
+    assert set(module.hparams) == {*INVERSION, "pretrained", "components", "omega", "output", "seed", "form"}
     fit = PretrainingModule(loss=pretraining.LossOptions(kind="v", discount=0.9), codes=Codes(share=0.5, knots=2))
     found = {"loss": "v", "timestep_power": 1.0, "loss_discount": 0.9, "condition_dropout": 0.1}
     assert {name: fit.hparams[name] for name in PRETRAINING} == found | {

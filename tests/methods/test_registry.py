@@ -9,7 +9,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.forms import learn
 from ftl_lightning.learning.inversion_module import InversionModule
 from ftl_lightning.learning.inversion_settings import AdapterOptions
 from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
@@ -80,7 +80,7 @@ def test_a_kind_that_no_package_offers_has_no_method() -> None:
 
 
 def test_the_others_adapt_by_gradient_descent_and_in_context_learning_reads() -> None:
-    assert {name: load_method(name).learn() for name in SHIPPED} == dict.fromkeys(SHIPPED, invert) | {"in_context": prompt}
+    assert {name: load_method(name).learn() for name in SHIPPED} == dict.fromkeys(SHIPPED, learn) | {"in_context": prompt}
 
 
 @pytest.mark.parametrize(
