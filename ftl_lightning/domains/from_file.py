@@ -4,8 +4,8 @@ Its training concepts are the texts, in the order in which they first appear. Pl
 ``horizon`` says. What it is judged by is named in a configuration, a name and a number each:
 
 ``recognised: P``
-    right if, of all concepts with demonstrations, the goal is the likeliest, and the plan is as typical of it as the share P of real
-    demonstrations: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
+    right if, of all concepts with demonstrations, the goal is the likeliest, and the plan is as typical of it as a share P of real
+    demonstrations is: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
 ``nearest_demonstration: K``
     right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
 ``end_point_within: R``

@@ -1,13 +1,16 @@
-"""Recognising behaviour by examples alone: is a plan of the concept that it shall be of, and as typical as real behaviour is?
+"""Recognising behaviour by examples alone: whether a plan is of a concept, and as typical of it as real behaviour.
 
 A plan is described by its place (mean over time of each column), its size (root mean square about that), its shape (what is left,
 as coefficients of the discrete cosine transform over time) and its roughness (mean squared second difference over time); columns
-are first brought on one scale. A concept is a Gaussian of place, size and shape (regularised discriminant analysis; Friedman, 1989):
-variances are those within all concepts, drawn towards the concept's own the more examples it has, and directions in which its own
-examples differ from one another (size of a part, pace) are known from these.
+are first brought on one scale. A single state has a size and a shape, its columns.
+
+A concept is a Gaussian of place, size and shape (regularised discriminant analysis; Friedman, 1989). Variances are those within all
+concepts, drawn towards the concept's own the more examples it has. Directions in which its own examples differ from one another,
+such as the size of a part or pace, are known from these. The likeliest concept is what a plan is of.
 
 How far from its concept real behaviour may be is measured by leaving examples out, with as many examples as the concept has: five
-cover less of it than twenty.
+cover less of it than twenty. Only too much roughness counts, smooth plans are right. Where no concept has two examples, nothing is
+known of how real behaviour varies: then the likeliest concept decides, and roughness.
 """
 
 import math

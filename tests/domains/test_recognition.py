@@ -2,6 +2,7 @@
 
 import time as clock
 import zlib
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -156,7 +157,9 @@ def test_behaviour_of_other_kinds_is_not_recognised(family: tuple[str, Demonstra
         pytest.param(lambda real: frozen_after(real, real.shape[1] // 3), id="frozen after a third"),
     ],
 )
-def test_what_real_behaviour_never_does_is_not_recognised(family: tuple[str, Demonstrations, dict[str, Array]], change) -> None:  # type: ignore[no-untyped-def]
+def test_what_real_behaviour_never_does_is_not_recognised(
+    family: tuple[str, Demonstrations, dict[str, Array]], change: Callable[[Array], Array]
+) -> None:
     name, examples, fresh = family
     if name == "states":
         pytest.skip("single states have no time")
