@@ -238,6 +238,7 @@ class Recognition:
         last = scaled.gather(1, (lengths - 1)[:, None, None].expand(-1, 1, scaled.shape[2]))
         after = (torch.arange(scaled.shape[1]) >= lengths[:, None])[..., None]
         rest = ((scaled - last) ** 2 * after).sum(dim=(1, 2)) / (after.sum(dim=(1, 2)) * scaled.shape[2]).clamp(min=1)
+        rest = rest.sqrt()
         if self.horizon == 1:
             size = (scaled.square().mean(dim=(1, 2)) + STILL**2).log() / 2
             return _Features(size[:, None], scaled[:, 0], scaled[:, 0, :0], rest)
@@ -248,7 +249,7 @@ class Recognition:
         shape = _cosines(self.horizon) @ (moved / size[:, None, None]) / math.sqrt(self.horizon)
         bends = scaled.diff(n=2, dim=1) if self.horizon > 2 else scaled[:, :0]
         roughness = bends.square().sum(dim=1) / max(bends.shape[1], 1)
-        return _Features(torch.cat((place, size.log()[:, None]), dim=1), shape.flatten(1), roughness, rest.sqrt())
+        return _Features(torch.cat((place, size.log()[:, None]), dim=1), shape.flatten(1), roughness, rest)
 
 
 def _scatter(values: Tensor) -> Tensor:
