@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -10,7 +11,7 @@ from ftl_lightning.concepts.modes import even_stretch
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.inversion import check_settings, compared, invert
-from ftl_lightning.learning.inversion_settings import ADAPTED, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
+from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
 from ftl_lightning.learning.quality import Quality, measured
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 
@@ -20,6 +21,8 @@ MODE_SAMPLES = 16
 """Noised demonstrations a step of a mode that is learned without an adapter."""
 FOLDS, FOLD_SAMPLES, FOLD_STEPS = 5, 16, 150
 """Concepts that leave a demonstration out, at most, and noised demonstrations a step and steps of each."""
+TOLERANCE = 0.01
+"""Of the stopping rule, where the settings have none."""
 BOTH, OWN = 2.03, 0.8
 """One set suffices if its losses on its own and on left-out demonstrations, as shares of the empty concept's, are together at most
 the first, or that on its own at most the second. Chosen on relations that pretraining does not show, see docs/experiments-forms.md.
@@ -59,7 +62,7 @@ def first_settings(settings: InversionSettings) -> InversionSettings:
     """What is learned first: what the settings say in the paper's form, else one set without an adapter."""
     if settings.form in (UNSAID, PAPER):
         return settings
-    return replace(settings, form=PAPER).changed(modes=1, adapter=0)
+    return _one_set(settings)
 
 
 @torch.enable_grad()
@@ -90,8 +93,7 @@ def formed(
     enough = [name for name, share in shares.items() if share.suffices]
     span: Mapping[str, Concept] = {}
     if composable := [name for name, share in shares.items() if share.composes]:
-        changes = {"modes": 1, "adapter": 0, "off_span": 0.0, "restarts": 1}
-        inside = replace(settings, form=PAPER).changed(**changes)
+        inside = _one_set(settings, off_span=0.0, restarts=1)
         span = invert(model, _of(demonstrations, composable), inside, steps, tell)
     forms = {name: {ONE: concept} for name, concept in first.items()}
     if enough:
@@ -101,6 +103,13 @@ def formed(
         for name, concept in _with_modes(model, _of(demonstrations, rest), settings, steps, tell).items():
             forms[name] |= {MODES: concept}
     return _chosen(model, demonstrations, settings.seed, forms, shares, span)
+
+
+def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
+    """One set without an adapter; where the form is to be chosen it is learned for its loss alone, and stops by itself."""
+    if settings.form == AUTO and settings.budget.tolerance is None:
+        changes["tolerance"] = TOLERANCE
+    return replace(settings, form=PAPER).changed(modes=1, adapter=0, **changes)
 
 
 def _with_modes(
@@ -179,8 +188,7 @@ def _loss_shares(
             texts[name].append(text)
     left_out: list[dict[str, float]] = []
     for off_span in (settings.embeddings.off_span, 0.0)[: 1 + isinstance(model, TextConceptModel)] if known else ():
-        changes = {"modes": 1, "adapter": 0, "samples": FOLD_SAMPLES, "restarts": 1, "off_span": off_span}
-        learning = replace(settings, form=PAPER).changed(**changes)
+        learning = _one_set(settings, samples=FOLD_SAMPLES, restarts=1, off_span=off_span)
         folds = invert(model, concatenate(known), learning, min(steps, FOLD_STEPS), tell)
         left_out.append(compared(model, concatenate(held), folds, settings.loss.kind))
     own_shares = compared(model, demonstrations, first, settings.loss.kind)
