@@ -25,6 +25,8 @@ WRAPPED = 0.8
 """Share of its range that a column goes through in a step where an angle begins anew."""
 STILL = 1e-3
 """Of the usual step: less is none."""
+FEW = 3
+"""Steps: fewer without a movement are no fault, and behaviour that has no more may stand still."""
 LONG = 0.4
 """Share of a demonstration that it stands still at a time."""
 SAME, ALIKE = 1e-6, 0.02
@@ -208,7 +210,7 @@ def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
     paths = _paths(demonstrations)
     moved = [steps.square().mean(dim=1).sqrt() for steps in _steps(paths)]
     every = torch.cat(moved)
-    if not len(every):
+    if max(map(len, moved)) < FEW:
         return
     usual = float(every[every > 0].median()) if (every > 0).any() else 0.0
     if not usual:
@@ -218,7 +220,7 @@ def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
     shares = [run / max(len(own), 1) for own, (run, _) in zip(moved, runs, strict=True)]
     for row, (own, (run, start)) in enumerate(zip(moved, runs, strict=True)):
         others = [shares[other] for other in _others(len(paths), row)]
-        if not len(own) or run < 3 or shares[row] < LONG:
+        if run < FEW or shares[row] < LONG:
             continue
         if run == len(own):
             yield Finding(f"nothing moves in its {len(own) + 1} steps", rows=(row,))

@@ -122,6 +122,12 @@ def test_a_length_far_from_the_others_and_columns_that_never_change_are_told() -
     assert "demonstration 3: has 9 steps, the others 40 to 40" in faults(short)
 
 
+def test_where_nothing_moves_at_all_it_is_told_unless_behaviour_has_hardly_any_steps() -> None:
+    placed = torch.randn(5, 1, 3, generator=torch.Generator().manual_seed(0))
+    assert faults(demonstrations(placed.expand(5, 40, 3))) == ["nothing moves in any of them"]
+    assert faults(demonstrations(placed.expand(5, 2, 3))) == []
+
+
 def test_angles_that_wrap_are_noted() -> None:
     angle = (np.linspace(0, 12, 60) + np.linspace(0, 2, 5)[:, None]) % (2 * np.pi)
     found = check(demonstrations(np.stack((angle, np.random.default_rng(0).normal(size=(5, 60)).cumsum(1)), axis=-1)))
