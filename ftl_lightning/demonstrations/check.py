@@ -297,7 +297,11 @@ def _shapes(points: Tensor) -> Tensor:
     centred = points / _spread(points)
     centred = centred - centred.mean(dim=1, keepdim=True)
     size = centred.square().mean(dim=(1, 2), keepdim=True).sqrt()
-    return centred / size.clamp(min=1e-9)
+    return centred / size.clamp(min=SAME)
+
+
+_View = tuple[Callable[[Tensor], Tensor], float, str]
+"""How points are seen, from how far on one is far off, and words for it."""
 
 
 def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -305,7 +309,7 @@ def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return
-    views: list[tuple[Callable[[Tensor], Tensor], float, str]] = [(lambda own: own, APART_PLACES, "is far from the others")]
+    views: list[_View] = [(lambda own: own / _spread(own), APART_PLACES, "is far from the others")]
     if points.shape[1] > 1:
         views.append((_shapes, APART_SHAPES, "moves otherwise than the others"))
     told: set[int] = set()
@@ -327,7 +331,7 @@ def _far(points: Tensor, row: int) -> tuple[float, float]:
     scale = torch.maximum(
         points[others].flatten(0, 1).std(dim=0, correction=0), 0.1 * points.flatten(0, 1).std(dim=0, correction=0)
     )
-    apart = _apart(points / torch.where(scale > 0, scale, 1))
+    apart = _apart(points / torch.where(scale > SAME, scale, 1))
     own, among = apart[row, others], _pairs(apart[others][:, others])
     closest = CLOSEST.get(len(points), 0.1)
     return float(own.median() / among.median().clamp(min=closest)), float(own.min() / among.max().clamp(min=closest))
