@@ -18,7 +18,7 @@ MOST = 12
 """Demonstrations of which this is asked: of each, several concepts are learned."""
 SAMPLES, TOLERANCE = 16, 0.03
 """Of learning from a subset, which only has to tell good from bad: noised demonstrations of a step, and when to stop."""
-ODD, HARMED = 1.5, 1.2
+ODD, HARMED = 1.7, 1.2
 """An odd demonstration's left-out loss is so many times the largest of the others, and of the empty concept's."""
 COVERED = 0.95
 """Of the empty concept's loss: a demonstration is explained by a concept whose loss is less."""
@@ -69,6 +69,8 @@ class LeftOut:
             odd += f" {others:.2f}); another concept, or a mistake?"
         curve = ", ".join(f"{loss:.2f} from {size}" for size, loss in self.curve.items())
         verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
+        if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:
+            verdict = "hardly falls, and those left out are not explained: look at samples"
         return [told, *([odd] if count > 2 else []), f"more: loss of those left out {curve}; it {verdict}" if curve else ""]
 
 

@@ -112,6 +112,7 @@ def test_subsets_hold_each_demonstration_equally_often(count: int) -> None:
 def test_the_odd_one_is_far_above_all_others() -> None:
     assert odd_one(torch.tensor([0.5, 0.4, 1.9, 0.6])) == 2
     assert odd_one(torch.tensor([0.5, 0.4, 0.7, 0.6])) is None
+    assert odd_one(torch.tensor([1.0, 0.9, 1.1, 1.7])) is None
     assert odd_one(torch.tensor([0.2, 0.9, 0.2])) is None  # it is still explained better than by nothing
     assert odd_one(torch.tensor([0.2, 2.0])) is None
 
@@ -126,6 +127,7 @@ def test_words_follow_the_numbers() -> None:
     assert more.falling
     assert "odd: demonstration 3, loss 1.90" in " ".join(more.lines())
     assert "more are likely to help" in " ".join(more.lines())
+    assert "look at samples" in LeftOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None).lines()[-1]
     assert not Known("a", (0.9, 0.9, 1.2, 0.9)).clear
 
 
