@@ -299,5 +299,5 @@ def test_demonstrations_that_are_longer_than_plans_are_told(capsys: Told, tiny: 
     long.save("d.safetensors")
     arguments = [*INVERT[:2], f"--model.pretrained={tiny}", "--data.demonstrations=d.safetensors", "--data.steps=1"]
     assert main([*arguments, "--evaluation.samples=1", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]) == 0
-    told = next(row for row in capsys.readouterr().err.splitlines() if row.startswith("note: "))
+    (told,) = [row for row in capsys.readouterr().err.splitlines() if row.startswith("note: ")]
     assert "2" in told

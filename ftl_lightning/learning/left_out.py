@@ -12,7 +12,7 @@ from ftl_lightning.demonstrations.finding import numbered
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.explained_by import relative_losses
 from ftl_lightning.learning.inversion import invert
-from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.inversion_settings import PAPER, InversionSettings
 
 MOST = 12
 """Demonstrations of which this is asked: of each, several concepts are learned."""
@@ -101,6 +101,7 @@ def left_out(
     parts = [replace(own.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
     plain = replace(
         settings,
+        form=PAPER,
         modes=replace(settings.modes, sets=1),
         adapter=replace(settings.adapter, rank=0),
         budget=replace(
