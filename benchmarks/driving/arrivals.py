@@ -31,7 +31,7 @@ def main() -> None:
         few = FewShot.from_pretrained(f"{options.models}/driving-steps{model}/pretrained")
         for seed in (model, model + 3):
             shown = DOMAIN.source(None).draw(TASK, 5, seed)
-            concept = few.learn(shown, name=TASK, seed=seed, **options.learn)
+            concept = few.learn(shown, name=TASK, seed=seed, form="paper", **options.learn)
             episodes = few.execute(concept, few.starts(TASK, options.episodes, STARTS + seed), TASK, seed=seed)
             found.append(episodes.outcomes)
             told = ", ".join(f"{name} {found[-1][name]:.2f}" for name in ("strict success", "crash"))

@@ -57,7 +57,7 @@ def told_concepts(few: FewShot, name: str, shown: Demonstrations, seed: int, cha
     assert isinstance(model, GenerativeModel)
     text = load_encoder("table", DOMAIN.concepts.table, "main")([name])
     return {
-        "ours": few.learn(shown, name=name, seed=seed, **changes),
+        "ours": few.learn(shown, name=name, seed=seed, form="paper", **changes),
         "language": Composition(model.standardise(text)[None], torch.tensor([1.2])),
         "empty concept": Composition(model.empty[None, None], torch.zeros(1)),
     }

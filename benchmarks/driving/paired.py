@@ -42,7 +42,7 @@ def concept(few: FewShot, method: str, shown: Demonstrations, name: str, seed: i
         assert isinstance(model, GenerativeModel)
         text = load_encoder("table", DOMAIN.concepts.table, "main")([name])
         return Composition(model.standardise(text)[None], torch.tensor([LANGUAGE_WEIGHT]))
-    return few.learn(shown, name=name, seed=seed)
+    return few.learn(shown, name=name, seed=seed, form="paper")
 
 
 def arrived(few: FewShot, told: Composition, task: str, count: int, seed: int) -> dict[str, Tensor]:

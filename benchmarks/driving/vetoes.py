@@ -28,7 +28,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     few = FewShot.from_pretrained("driving")
-    concept = few.learn(DOMAIN.source(None).draw(TASK, 5, DEMONSTRATION_SEED), name=TASK)
+    concept = few.learn(DOMAIN.source(None).draw(TASK, 5, DEMONSTRATION_SEED), name=TASK, form="paper")
     starts = few.starts(TASK, options.episodes, 0)
     found = {}
     for veto in VETOES:

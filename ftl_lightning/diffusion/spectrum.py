@@ -1,12 +1,22 @@
 """Plans as cosines over time, each on a scale of its own: what is smooth in pretraining stays smooth in what is learned."""
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor, nn
 
 LEAST = 1e-6
 """Of the largest spread; a cosine that varies less is taken to be constant."""
+
+
+@cache
+def cosines(count: int) -> Tensor:
+    """Orthonormal discrete cosine transform (type II), ``(cosine, time)`` in double precision; its inverse is its transpose."""
+    number = torch.arange(count, dtype=torch.float64)
+    basis = torch.cos(math.pi / count * number[:, None] * (number + 0.5)) * (2 / count) ** 0.5
+    basis[0] /= 2**0.5
+    return basis
 
 
 class Spectrum(nn.Module):
@@ -30,10 +40,7 @@ class Spectrum(nn.Module):
 
     def __init__(self, horizon: int, state_dim: int) -> None:
         super().__init__()
-        number = torch.arange(horizon, dtype=torch.float64)
-        basis = torch.cos(math.pi / horizon * number[:, None] * (number + 0.5)) * (2 / horizon) ** 0.5
-        basis[0] /= 2**0.5
-        self.register_buffer("basis", basis.float(), persistent=False)  # (cosine, time), its inverse is its transpose
+        self.register_buffer("basis", cosines(horizon).float(), persistent=False)
         self.register_buffer("mean", torch.zeros(horizon, state_dim))
         self.register_buffer("scale", torch.ones(horizon, state_dim))
 

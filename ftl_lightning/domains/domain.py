@@ -82,8 +82,7 @@ class Plans:
         return self.start_exponent if window >= self.horizon else 1.0
 
 
-_UNSAID: Any = None
-"""Default of a field whose value follows from the others where it is not said."""
+_UNSAID: Any = None  # default of a field whose value follows from the others where it is not said
 
 
 @dataclass(frozen=True)
@@ -384,8 +383,7 @@ class Domain(Shown):
         """Whether a smaller value of a metric, or of an outcome in closed loop, is better."""
         if metric == COVERAGE and metric not in self.metrics:
             return True
-        outcome = metric.removeprefix(f"{CLOSED} ")
-        if outcome != metric:
+        if (outcome := metric.removeprefix(f"{CLOSED} ")) != metric:
             outcome = outcome.partition(" (")[0]  # the environment
             return self.closed_loop is not None and outcome in self.closed_loop.less_is_better
         return metric in self.metrics and self.metrics[metric].less_is_better

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.diffusion.spectrum import cosines
 from ftl_lightning.seeding import generator
 
 STILL = 0.05
@@ -246,7 +247,7 @@ class Recognition:
         place = whole.mean(dim=1)
         moved = whole - place[:, None]
         size = (moved.square().mean(dim=(1, 2)) + STILL**2).sqrt()
-        shape = _cosines(self.horizon) @ (moved / size[:, None, None]) / math.sqrt(self.horizon)
+        shape = cosines(self.horizon) @ (moved / size[:, None, None]) / math.sqrt(self.horizon)
         bends = scaled.diff(n=2, dim=1) if self.horizon > 2 else scaled[:, :0]
         roughness = bends.square().sum(dim=1) / max(bends.shape[1], 1)
         return _Features(torch.cat((place, size.log()[:, None]), dim=1), shape.flatten(1), roughness, rest)
@@ -276,15 +277,6 @@ def _stretched(states: Tensor, lengths: Tensor) -> Tensor:
     share = (times - before)[..., None]
     index = torch.arange(len(states))[:, None]
     return states[index, before] * (1 - share) + states[index, after] * share
-
-
-@cache
-def _cosines(count: int) -> Tensor:
-    """Orthonormal discrete cosine transform (type II), ``(count, count)``."""
-    steps = torch.arange(count, dtype=torch.float64)
-    found = torch.cos(math.pi / count * (steps + 0.5) * steps[:, None]) * math.sqrt(2 / count)
-    found[0] /= math.sqrt(2)
-    return found
 
 
 def _nearest_end(concept: _Concept, ending: Sequence[_Features], resting: float) -> tuple[Tensor, Tensor]:

@@ -12,12 +12,13 @@ from torch import Tensor
 from ftl_lightning import log_folder
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.data import InversionData
-from ftl_lightning.domains.from_file import OWN, own_domain
+from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.errors import UserError, short
+from ftl_lightning.judging import judging_domain
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import warnings_of
 from ftl_lightning.learning.longer import longer_than_plans
@@ -55,6 +56,7 @@ class Adaptation(pl.LightningModule, ABC):
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
         self._found: dict[str, Concept] = {}
+        self._own = False  # whether somebody's own demonstrations are learned from, not a domain's tasks
 
     @property
     def method(self) -> str:
@@ -96,13 +98,12 @@ class Adaptation(pl.LightningModule, ABC):
             self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
         except UserError as error:
             raise UserError(f"data.demonstrations: {error}") from None
+        self._own = data.own
         if self.model.examples is not None:  # of a user's own data, whose new concepts are judged by their demonstrations
-            examples = concatenate([self.model.examples, self.demonstrations])
-            config = self.model.config
-            self.domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
+            self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
         if told := longer_than_plans(self.demonstrations, self.model):
             say(f"note: {told}", error=True)
-        for text in self.concepts if data.own else ():
+        for text in self.concepts if self._own else ():
             for told in warnings_of(self.model, self.demonstrations.select(text)):
                 say(f"note: {text}: {told}", error=True)
 
@@ -141,13 +142,8 @@ class Adaptation(pl.LightningModule, ABC):
             say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
             if concept.choice is not None:
                 say(f"  form: {concept.choice}")
-            if self._own_file:
+            if self._own:
                 self._show_quality(name, concept)
-
-    @property
-    def _own_file(self) -> bool:
-        """Whether somebody's own demonstrations are learned from, not a domain's tasks."""
-        return bool(self.trainer.datamodule.hparams["demonstrations"])  # type: ignore[attr-defined]
 
     def _show_quality(self, name: str, concept: Concept) -> None:
         """Say what samples of a concept are like beside its demonstrations, and draw them into TensorBoard."""

@@ -1,31 +1,35 @@
 """The forms that a concept may have, and how one is chosen by what its demonstrations say."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
+from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Choice, Concept
-from ftl_lightning.concepts.modes import even_stretch
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.concepts.modes import Modes, even_stretch
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import check_settings, compared, invert
+from ftl_lightning.learning.explained_by import relative_losses
+from ftl_lightning.learning.inversion import check_settings, invert, warn_of_loss
 from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
+from ftl_lightning.learning.left_out import learned_from, quickly
 from ftl_lightning.learning.quality import Quality, measured
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Of adapters and of their learning, where the settings name none."""
-MODE_SAMPLES = 16
-"""Noised demonstrations a step of a mode that is learned without an adapter."""
-FOLDS, FOLD_SAMPLES, FOLD_STEPS = 5, 16, 150
-"""Concepts that leave a demonstration out, at most, and noised demonstrations a step and steps of each."""
+MODE_SAMPLES, MODE_STEPS = 16, 400
+"""Noised demonstrations a step of a mode that is learned without an adapter, and steps, at most."""
+FOLDS = 5
+"""Sets of embeddings that leave a demonstration out, at most."""
 TOLERANCE = 0.01
 """Of the stopping rule, where the settings have none."""
-BOTH, OWN = 2.03, 0.8
-"""One set suffices if its losses on its own and on left-out demonstrations, as shares of the empty concept's, are together at most
-the first, or that on its own at most the second. Chosen on relations that pretraining does not show, see docs/experiments-forms.md.
+OWN, BOTH, ALL = 0.8, 2.03, 3.27
+"""One set suffices if its loss on its own demonstrations, as a share of the empty concept's, is at most the first; or with that on
+left-out ones at most the second; or where there are sets in the span, with theirs on left-out ones at most the third. Chosen on
+relations that pretraining does not show, see docs/experiments-forms.md.
 """
 NARROW, WIDE = 0.85, 0.9
 """Mixtures take the place of one set whose samples spread less than the first of what the demonstrations do; those that spread more
@@ -44,16 +48,9 @@ def learn(
     steps: int,
     tell: Tell = lambda loss: None,
 ) -> dict[str, Concept]:
-    """Learn every concept of some demonstrations in the form that the settings name, without a trainer.
-
-    Args:
-        model: frozen.
-        demonstrations: with concept texts, which name the concepts.
-        settings: how.
-        steps: of gradient descent.
-        tell: called with the mean loss after each step.
-    """
+    """:func:`~ftl_lightning.learning.inversion.invert`, with concepts in the form that the settings name."""
     check_settings(model, settings)
+    warn_of_loss(model, settings)
     first = invert(model, demonstrations, first_settings(settings), steps, tell)
     return formed(model, demonstrations, settings, steps, first, tell)
 
@@ -65,7 +62,6 @@ def first_settings(settings: InversionSettings) -> InversionSettings:
     return _one_set(settings)
 
 
-@torch.enable_grad()
 def formed(
     model: ConceptModel,
     demonstrations: Demonstrations,
@@ -76,64 +72,71 @@ def formed(
 ) -> dict[str, Concept]:
     """Concepts in the form that the settings name, and where that is to be chosen, in the one that the demonstrations ask for.
 
-    Gradients are made here, whatever the caller's mode is: a trainer turns them off at the end of learning.
-
     Args:
-        model, demonstrations, settings, steps, tell: as of :func:`learn`.
+        model, demonstrations, settings, steps, tell: as of :func:`~ftl_lightning.learning.inversion.invert`.
         first: what was learned by :func:`first_settings`.
     """
     if settings.form in (UNSAID, PAPER, ONE):
         return first
+    with torch.inference_mode(False), torch.enable_grad():  # which a trainer turns off at the end of learning
+        return _beyond_first(model, demonstrations, settings, steps, first, tell)
+
+
+def _beyond_first(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    first: Mapping[str, Concept],
+    tell: Tell,
+) -> dict[str, Concept]:
     if settings.form == MODES:
-        return _with_modes(model, demonstrations, settings, steps, tell)
+        return _with_modes(model, demonstrations, settings, steps, first, tell)
     if settings.form in (ADAPTED, MIXED):
-        adapted = _adapted(model, demonstrations, settings, steps, tell)
-        return {name: forms[settings.form] for name, forms in adapted.items()}
-    shares = _loss_shares(model, demonstrations, settings, steps, first, tell)
-    enough = [name for name, share in shares.items() if share.suffices]
-    span: Mapping[str, Concept] = {}
-    if composable := [name for name, share in shares.items() if share.composes]:
-        inside = _one_set(settings, off_span=0.0, restarts=1)
-        span = invert(model, _of(demonstrations, composable), inside, steps, tell)
-    forms = {name: {ONE: concept} for name, concept in first.items()}
-    if enough:
-        for name, more in _adapted(model, _of(demonstrations, enough), settings, steps, tell).items():
-            forms[name] |= more
-    if rest := [name for name in shares if name not in enough]:
-        for name, concept in _with_modes(model, _of(demonstrations, rest), settings, steps, tell).items():
-            forms[name] |= {MODES: concept}
-    return _chosen(model, demonstrations, settings.seed, forms, shares, span)
+        return _adapted(model, demonstrations, settings, steps, settings.form == MIXED, tell)
+    return _chosen(model, demonstrations, settings, steps, first, tell)
 
 
 def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
     """One set without an adapter; where the form is to be chosen it is learned for its loss alone, and stops by itself."""
     if settings.form == AUTO and settings.budget.tolerance is None:
         changes["tolerance"] = TOLERANCE
-    return replace(settings, form=PAPER).changed(modes=1, adapter=0, **changes)
+    return settings.changed(form=PAPER, modes=1, adapter=0, **changes)
 
 
 def _with_modes(
-    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    first: Mapping[str, Concept],
+    tell: Tell,
 ) -> dict[str, Concept]:
-    """Concepts of one set for each demonstration, learned in all steps: what a sample is like depends on them alone."""
-    changes = {"modes": "each", "mode_samples": MODE_SAMPLES, "adapter": 0, "tolerance": None, "restarts": 1}
-    return invert(model, demonstrations, replace(settings, form=PAPER).changed(**changes), steps, tell)
+    """The first concepts with one set for each demonstration, learned without stopping: what samples are like depends on them."""
+    alone = settings.changed(form=PAPER, modes=1, adapter=0, restarts=1, samples=MODE_SAMPLES, tolerance=None)
+    sets = learned_from(model, demonstrations, [[row] for row in range(len(demonstrations))], alone, min(steps, MODE_STEPS), tell)
+    found = {}
+    for name, concept in first.items():
+        rows = [row for row, text in enumerate(demonstrations.concepts) if text == name]
+        modes = Modes(sets.embeddings[rows].cpu(), sets.weights[rows].cpu(), mixed=False)
+        found[name] = replace(concept, modes=modes if len(rows) > 1 else None)
+    return found
 
 
 def _adapted(
-    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, tell: Tell
-) -> dict[str, dict[str, Concept]]:
-    """Of every concept the forms with an adapter, by name. Of a single demonstration there are no modes to mix."""
+    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, mixed: bool, tell: Tell
+) -> dict[str, Concept]:
+    """Concepts of one set and an adapter; or of mixtures that share one, and of a single demonstration there are none."""
     own = settings.adapter
     rank, rate = (own.rank, own.learning_rate) if own.rank else (RANK, RATE)
-    changes = {"modes": "each", "adapter": rank, "adapter_learning_rate": rate, "tolerance": None, "restarts": 1}
-    adapted = replace(settings, form=PAPER).changed(**changes)
-    found = {}
-    for name, concept in invert(model, demonstrations, adapted, min(steps, ADAPTER_STEPS), tell).items():
-        modes = concept.modes
-        mixed = modes and replace(modes, mixed=True, stretch=even_stretch(len(modes)))
-        found[name] = {ADAPTED: replace(concept, modes=None), MIXED: replace(concept, modes=mixed)}
-    return found
+    changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None, "restarts": 1}
+    found = invert(model, demonstrations, settings.changed(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
+    return {
+        name: replace(concept, modes=replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes))))
+        if concept.modes
+        else concept
+        for name, concept in found.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,10 @@ class _Shares:
     @property
     def suffices(self) -> bool:
         """Whether one set says enough of what the demonstrations have in common."""
-        return self.own <= OWN or (self.left_out is not None and self.own + self.left_out <= BOTH)
+        if self.own <= OWN or self.left_out is None:
+            return self.own <= OWN
+        both = self.own + self.left_out
+        return both <= BOTH if self.in_span is None else both + self.in_span <= ALL
 
     @property
     def composes(self) -> bool:
@@ -176,72 +182,86 @@ def _loss_shares(
     tell: Tell,
 ) -> dict[str, _Shares]:
     """What one set of every concept says of its own demonstrations and of left-out ones."""
-    known: list[Demonstrations] = []
-    held: list[Demonstrations] = []
-    texts: dict[str, list[str]] = {name: [] for name in first}
-    for name in first:
-        own = demonstrations.select(name)
-        for row in range(0, len(own), -(-len(own) // FOLDS)) if len(own) > 2 else ():
-            text = f"{name} without demonstration {row + 1}"
-            known.append(_named(own, [other for other in range(len(own)) if other != row], text))
-            held.append(_named(own, [row], text))
-            texts[name].append(text)
-    left_out: list[dict[str, float]] = []
-    for off_span in (settings.embeddings.off_span, 0.0)[: 1 + isinstance(model, TextConceptModel)] if known else ():
-        learning = _one_set(settings, samples=FOLD_SAMPLES, restarts=1, off_span=off_span)
-        folds = invert(model, concatenate(known), learning, min(steps, FOLD_STEPS), tell)
-        left_out.append(compared(model, concatenate(held), folds, settings.loss.kind))
-    own_shares = compared(model, demonstrations, first, settings.loss.kind)
-    return {
-        name: _Shares(own_shares[name], *(sum(found[text] for text in some) / len(some) for found in left_out if some))
-        for name, some in texts.items()
-    }
+    every = {name: [row for row, text in enumerate(demonstrations.concepts) if text == name] for name in first}
+    left = {name: rows[:: -(-len(rows) // FOLDS)] if len(rows) > 2 else [] for name, rows in every.items()}
+    folds = [[row for row in every[name] if row != out] for name, rows in left.items() for out in rows]
+    losses = {name: [_own_loss(model, _of(demonstrations, [name]), first[name], settings)] for name in first}
+    for off_span in (settings.embeddings.off_span, 0.0)[: 1 + isinstance(model, TextConceptModel)] if folds else ():
+        learned = learned_from(model, demonstrations, folds, quickly(settings).changed(off_span=off_span), steps, tell)
+        number = 0
+        for name, rows in left.items():
+            own = slice(number, number + len(rows))
+            sets = Composition(learned.embeddings[own], learned.weights[own])
+            if rows:
+                losses[name].append(float(relative_losses(model, demonstrations.rows(rows), sets, settings).diagonal().mean()))
+            number += len(rows)
+    return {name: _Shares(*measured) for name, measured in losses.items()}
 
 
-def _of(demonstrations: Demonstrations, concepts: Sequence[str]) -> Demonstrations:
+def _own_loss(model: ConceptModel, demonstrations: Demonstrations, concept: Concept, settings: InversionSettings) -> float:
+    """Of one set of embeddings on the demonstrations that it was learned from."""
+    weights = concept.weights if settings.omega != "learned" else concept.weights / settings.weights.scale
+    alone = Composition(concept.embeddings[None], weights[None]).to(model.device)
+    return float(relative_losses(model, demonstrations, alone, settings).mean())
+
+
+def _of(demonstrations: Demonstrations, concepts: Collection[str]) -> Demonstrations:
     """The demonstrations of some concepts."""
     return demonstrations.rows([row for row, name in enumerate(demonstrations.concepts) if name in concepts])
-
-
-def _named(demonstrations: Demonstrations, rows: Sequence[int], text: str) -> Demonstrations:
-    """Some demonstrations under another concept's name."""
-    return replace(demonstrations.rows(rows), concepts=(text,) * len(rows))
 
 
 def _chosen(
     model: ConceptModel,
     demonstrations: Demonstrations,
-    seed: int,
-    forms: Mapping[str, Mapping[str, Concept]],
-    shares: Mapping[str, _Shares],
-    span: Mapping[str, Concept],
+    settings: InversionSettings,
+    steps: int,
+    first: Mapping[str, Concept],
+    tell: Tell,
 ) -> dict[str, Concept]:
     """Of every concept the form that its demonstrations ask for, with what was measured, and what it is composed from."""
-    found = {}
-    for name, candidates in forms.items():
-        own = demonstrations.select(name)
-        if len(own) < 2:
-            found[name] = replace(candidates[ONE], choice=Choice(ONE, "there is a single demonstration", {}))
-            continue
-        qualities = measured(model, own, candidates, seed)
-        if MIXED in candidates and (wide := qualities[MIXED].spread) > WIDE:
-            candidates = {**candidates, MIXED: _stretched(candidates[MIXED], WIDE / wide)}
-            qualities |= measured(model, own, {MIXED: candidates[MIXED]}, seed)
-        form, because = _choice(shares[name], qualities)
-        numbers = shares[name].numbers
-        numbers |= {f"{key}, {kind}": value for kind, one in qualities.items() for key, value in one.numbers.items()}
+    own = {name: demonstrations.select(name) for name in first}
+    found = {
+        name: replace(concept, choice=Choice(ONE, "there is a single demonstration", {}))
+        for name, concept in first.items()
+        if len(own[name]) < 2
+    }
+    several = {name: concept for name, concept in first.items() if name not in found}
+    if not several:
+        return found
+    shares = _loss_shares(model, _of(demonstrations, several), settings, steps, several, tell)
+    forms: dict[str, dict[str, Concept]] = {name: {} for name in several}
+    if rest := {name: concept for name, concept in several.items() if not shares[name].suffices}:
+        for name, concept in _with_modes(model, _of(demonstrations, rest), settings, steps, rest, tell).items():
+            forms[name][MODES] = concept
+    if enough := [name for name in several if name not in rest]:
+        for name, concept in _adapted(model, _of(demonstrations, enough), settings, steps, False, tell).items():
+            forms[name][ADAPTED] = concept
+    qualities = {name: measured(model, own[name], forms[name], settings.seed) for name in several}
+    if narrow := [name for name in enough if qualities[name][ADAPTED].spread < NARROW]:
+        for name, concept in _adapted(model, _of(demonstrations, narrow), settings, steps, True, tell).items():
+            forms[name][MIXED], qualities[name][MIXED] = _narrowed(model, own[name], concept, settings.seed)
+    span: Mapping[str, Concept] = {}
+    if composable := [name for name, share in shares.items() if share.composes]:
+        span = invert(model, _of(demonstrations, composable), _one_set(settings, off_span=0.0, restarts=1), steps, tell)
+    for name in several:
+        form, because = _choice(shares[name], qualities[name])
         composing = None
-        if shares[name].composes and name in span:
+        if name in span:
             composing, because = (span[name].embeddings, span[name].weights), f"{because}; composed in the training span"
-        choice = Choice(form, because, {key: round(value, 4) for key, value in numbers.items()})
-        found[name] = replace(candidates[form], choice=choice, composing=composing)
-    return found
+        numbers = {f"{key}, {kind}": value for kind, one in qualities[name].items() for key, value in one.numbers.items()}
+        rounded = {key: round(value, 4) for key, value in (shares[name].numbers | numbers).items()}
+        found[name] = replace(forms[name][form], choice=Choice(form, because, rounded), composing=composing)
+    return {name: found[name] for name in first}
 
 
-def _stretched(concept: Concept, factor: float) -> Concept:
-    """A concept of modes whose mixtures are stretched so many times as much, though not below plain ones."""
-    modes = concept.modes
-    return replace(concept, modes=modes and replace(modes, stretch=max(factor * modes.stretch, 1.0)))
+def _narrowed(model: ConceptModel, demonstrations: Demonstrations, concept: Concept, seed: int) -> tuple[Concept, Quality]:
+    """Mixtures that spread about as much as the demonstrations do, if wider ones than that are learned, and their quality."""
+    quality = measured(model, demonstrations, {MIXED: concept}, seed)[MIXED]
+    if quality.spread <= WIDE or concept.modes is None:
+        return concept, quality
+    stretch = max(WIDE / quality.spread * concept.modes.stretch, 1.0)  # not below plain mixtures
+    concept = replace(concept, modes=replace(concept.modes, stretch=stretch))
+    return concept, measured(model, demonstrations, {MIXED: concept}, seed)[MIXED]
 
 
 def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str]:
@@ -251,8 +271,7 @@ def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str
         told = f"{shares.left_out:.2f} of the empty concept's on left-out demonstrations, {shares.own:.2f} on its own"
     if not shares.suffices:
         return MODES, f"one set of embeddings does not explain the demonstrations (loss {told}), so samples stay close to them"
-    because = f"one set of embeddings explains the demonstrations (loss {told})"
-    spread, mixed = qualities[ADAPTED].spread, qualities[MIXED].spread
-    if spread < min(NARROW, mixed):
+    because, spread = f"one set of embeddings explains the demonstrations (loss {told})", qualities[ADAPTED].spread
+    if MIXED in qualities and (mixed := qualities[MIXED].spread) > spread:
         return MIXED, f"{because}; its samples spread {spread:.2f} of what the demonstrations do, mixtures {mixed:.2f}"
     return ADAPTED, f"{because}; samples spread {spread:.2f} of what the demonstrations do"

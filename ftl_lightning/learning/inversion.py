@@ -1,7 +1,7 @@
 """Inversion: learning concepts from a few demonstrations by gradient descent through the frozen model (Eq. 2 of the paper)."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -289,32 +289,15 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
         raise UserError(f"model.form: expected {PAPER}, {ONE} or {MODES} for {model.method.name}, found {settings.form}")
     if settings.adapter.rank and not model.adaptable():
         raise UserError(f"model.adapter.rank: expected 0 (none) for {model.method.name}, found {settings.adapter.rank}")
+
+
+def warn_of_loss(model: ConceptModel, settings: InversionSettings) -> None:
+    """Say where concepts are to be learned by another loss than the model was."""
     pretrained = model.config.training.get("model", {}).get("loss", settings.loss.kind)
     if pretrained != settings.loss.kind:
         _LOG.warning(
             "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse", pretrained, settings.loss.kind
         )
-
-
-@torch.no_grad()
-def compared(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], loss: str) -> dict[str, float]:
-    """Losses of concepts on some demonstrations, by name, as shares of the empty concept's; of a concept with modes, that of its
-    set for all demonstrations.
-
-    Args:
-        model: frozen.
-        demonstrations: of every concept one or more, which it need not have been learned from.
-        concepts: by name, without adapters.
-        loss: whose squared error.
-    """
-    inversion = Inversion(model, demonstrations, InversionSettings(components=1).changed(loss=loss)).to(model.device)
-    embeddings = torch.stack([concepts[name].embeddings for name in inversion.concepts]).to(model.device)
-    weights = torch.stack([concepts[name].weights for name in inversion.concepts]).to(model.device)
-    found, empty = (
-        inversion._losses(FINAL_SAMPLES, generator(model.device, 0, 4), embeddings, each, None).mean(dim=1)
-        for each in (weights, torch.zeros_like(weights))
-    )
-    return dict(zip(inversion.concepts, (found / empty).tolist(), strict=True))
 
 
 def origin(model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float) -> Origin:

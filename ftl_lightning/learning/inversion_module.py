@@ -3,6 +3,7 @@
 from typing import Any, Literal
 
 import torch
+from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
@@ -11,7 +12,7 @@ from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_M
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.forms import first_settings, formed
-from ftl_lightning.learning.inversion import Inversion, check_settings
+from ftl_lightning.learning.inversion import Inversion, check_settings, warn_of_loss
 from ftl_lightning.learning.inversion_settings import (
     ADAPTED,
     AUTO,
@@ -101,6 +102,7 @@ class InversionModule(ExactResume, Adaptation):
             form=form,
         )
         check_settings(self.model, self.settings)
+        warn_of_loss(self.model, self.settings)
         self.inversion: Inversion
         self._formed: tuple[int, dict[str, Concept]] | None = None
 
@@ -137,7 +139,7 @@ class InversionModule(ExactResume, Adaptation):
         if "inversion" not in self._modules:
             with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
                 super().configure_model()
-                if self._own_file:
+                if self._own:
                     self.settings = self.settings.for_own(bool(self.model.adaptable()))
                 self.inversion = Inversion(self.model, self.demonstrations, first_settings(self.settings))
 
@@ -175,17 +177,22 @@ class InversionModule(ExactResume, Adaptation):
 
     def signature(self) -> dict[str, Any]:
         """Settings that must match before a checkpoint is loaded."""
+        first = first_settings(self.settings)
         return {
             "pretrained": self.model.hash,
             "demonstrations": self.demonstrations.hash,
-            "components": self.settings.components,
-            "restarts": self.settings.budget.restarts,
-            **({} if (modes := first_settings(self.settings).modes.sets) == 1 else {"modes": modes}),
-            **({} if self.settings.embeddings.knots == 1 else {"knots": self.settings.embeddings.knots}),
-            **({} if self.settings.adapter.rank == 0 else {"adapter": self.settings.adapter.rank}),
-            **({} if self.settings.budget.tolerance is None else {"tolerance": self.settings.budget.tolerance}),
-            "omega": self.settings.omega,
+            "components": first.components,
+            "restarts": first.budget.restarts,
+            **({} if first.modes.sets == 1 else {"modes": first.modes.sets}),
+            **({} if first.embeddings.knots == 1 else {"knots": first.embeddings.knots}),
+            **({} if first.adapter.rank == 0 else {"adapter": first.adapter.rank}),
+            **({} if first.budget.tolerance is None else {"tolerance": first.budget.tolerance}),
+            "omega": first.omega,
         }
+
+    def on_validation_start(self) -> None:
+        """While learning, of what is learned first: other forms are learned once, at the end."""
+        self._found = self.inversion.learned() if self.trainer.state.fn == TrainerFn.FITTING else self.learned()
 
     def learned(self) -> dict[str, Concept]:
         if self._formed is None or self._formed[0] != self.global_step:

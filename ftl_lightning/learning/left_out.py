@@ -1,6 +1,6 @@
 """How well a concept that is learned from some demonstrations explains those that were left out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +17,7 @@ from ftl_lightning.learning.inversion_settings import PAPER, InversionSettings
 MOST = 12
 """Demonstrations of which this is asked: of each, several concepts are learned."""
 SAMPLES, TOLERANCE = 16, 0.03
-"""Of learning from a subset, which only has to tell good from bad: noised demonstrations of a step, and when to stop."""
+"""Of learning quickly from a subset: noised demonstrations of a step, and when to stop."""
 ODD, HARMED = 1.7, 1.2
 """An odd demonstration's left-out loss is so many times the largest of the others, and of the empty concept's."""
 COVERED = 0.95
@@ -80,6 +80,43 @@ def subsets(count: int) -> list[tuple[int, ...]]:
     return [tuple(sorted((start + step) % count for step in range(size))) for size in sizes for start in range(count)]
 
 
+def learned_from(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    chosen: Sequence[Sequence[int]],
+    settings: InversionSettings,
+    steps: int,
+    tell: Callable[[float], None] = lambda loss: None,
+) -> Composition:
+    """One set of embeddings from each of some subsets, all in one batch: ``(subset, K, ...)`` on the model's device.
+
+    Args:
+        model: through which concepts are learned.
+        demonstrations: of one concept or several.
+        chosen: rows of each subset.
+        settings: how, in the paper's form.
+        steps: of gradient descent, at most.
+        tell: called with the mean loss after each step.
+    """
+    parts = [replace(demonstrations.rows(rows), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
+    learned = list(invert(model, concatenate(parts), settings, steps, tell).values())
+    every = Composition(torch.stack([one.embeddings for one in learned]), torch.stack([one.weights for one in learned]))
+    return every.to(model.device)
+
+
+def quickly(settings: InversionSettings) -> InversionSettings:
+    """The same for sets of embeddings that only have to tell good from bad."""
+    return settings.changed(
+        form=PAPER,
+        modes=1,
+        adapter=0,
+        restarts=1,
+        samples=min(settings.budget.samples, SAMPLES),
+        tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
+        guidance_scale=1.0,  # it is for generating, not for explaining
+    )
+
+
 def left_out(
     model: ConceptModel,
     demonstrations: Demonstrations,
@@ -98,23 +135,7 @@ def left_out(
     """
     count = min(len(demonstrations), MOST)
     own, chosen = demonstrations.rows(list(range(count))), subsets(count)
-    parts = [replace(own.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
-    plain = replace(
-        settings,
-        form=PAPER,
-        modes=replace(settings.modes, sets=1),
-        adapter=replace(settings.adapter, rank=0),
-        budget=replace(
-            settings.budget,
-            restarts=1,
-            samples=min(settings.budget.samples, SAMPLES),
-            tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
-        ),
-        weights=replace(settings.weights, scale=1.0),  # it is for generating, not for explaining
-    )
-    learned = list(invert(model, concatenate(parts), plain, steps, tell).values())
-    together = Composition(torch.stack([one.embeddings for one in learned]), torch.stack([one.weights for one in learned]))
-    losses = relative_losses(model, own, together.to(model.device), settings)
+    losses = relative_losses(model, own, learned_from(model, own, chosen, quickly(settings), steps, tell), settings)
     without = torch.tensor([[row not in rows for row in range(count)] for rows in chosen])
     sizes = torch.tensor([len(rows) for rows in chosen])
     last = sizes == count - 1
