@@ -15,7 +15,7 @@ from ftl_lightning.domains.object_rearrangement.generation import random_scenes
 from ftl_lightning.domains.object_rearrangement.relations import columns
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.forms import BOTH, OWN, _Shares, learn
+from ftl_lightning.learning.forms import ALL, OWN, RANK, TOLERANCE, _Shares, first_settings, formed, learn
 from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, FORMS, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.learning.quality import Quality
 from ftl_lightning.testing.strokes import strokes
@@ -38,8 +38,8 @@ def test_where_demonstrations_share_a_relation_one_set_suffices_and_the_numbers_
     choice = learned.concept.choice
     assert choice is not None
     assert choice.form in (ADAPTED, MIXED)
-    own, left_out = choice.numbers["loss, own"], choice.numbers["loss, left out"]
-    assert own + left_out <= BOTH or own <= OWN
+    own, *left_out = (choice.numbers[f"loss, {name}"] for name in ("own", "left out", "left out, in span"))
+    assert own + sum(left_out) <= ALL or own <= OWN
     assert "left-out demonstrations" in choice.because
     assert learned.concept.adapter is not None
     samples = model.sample(learned, 50)
@@ -142,9 +142,11 @@ def test_several_concepts_are_chosen_for_each_by_itself(model: FewShot) -> None:
     assert all(concept.choice is not None for concept in together.values())
 
 
-def test_one_set_suffices_by_either_loss() -> None:
+def test_one_set_suffices_by_its_own_loss_or_by_all_together() -> None:
     assert _Shares(0.9, 1.1).suffices
-    assert _Shares(0.7, 1.5).suffices
+    assert _Shares(0.9, 1.1, 1.2).suffices
+    assert _Shares(0.7, 1.5, 1.9).suffices
+    assert not _Shares(0.9, 1.1, 1.4).suffices
     assert not _Shares(0.9, 1.3).suffices
     assert not _Shares(0.9).suffices
     assert _Shares(0.9, 1.1, 1.0).composes
@@ -210,3 +212,37 @@ def test_own_data_is_drawn_with_its_demonstrations_above_on_one_scale() -> None:
     assert len(drawn) == 11
     assert len({axes.get_xlim() for axes in drawn}) == 1
     assert [axes.get_ylabel() for axes in drawn if axes.get_ylabel()] == ["demonstrations", "samples"]
+
+
+def test_an_adapter_that_is_named_beside_the_choice_is_of_the_named_rank(model: FewShot) -> None:
+    assert model.tuned.inversion.budget.tolerance is not None  # with which an adapter alone is refused
+    for options, rank in (({}, RANK), ({"adapter": 3}, 3)):
+        adapter = model.learn(scenes(model), steps=3, form=ADAPTED, **options).concept.adapter
+        assert adapter is not None
+        assert {up.shape[-1] for up, _ in adapter.factors.values()} == {rank}
+
+
+def test_forms_are_learned_where_a_trainer_has_turned_gradients_off(model: FewShot) -> None:
+    five, settings = scenes(model), model.tuned.inversion.changed(form=MODES)
+    first = learn(model.model, five, settings.changed(form=ONE), 3)
+    expected = formed(model.model, five, settings, 3, first)[TASK].modes
+    with torch.inference_mode():
+        found = formed(model.model, five, settings, 3, first)[TASK].modes
+    assert found is not None
+    assert expected is not None
+    assert torch.equal(found.embeddings, expected.embeddings)
+
+
+def test_a_warning_that_another_loss_was_pretrained_with_comes_once(
+    model: FewShot, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model.model, "config", replace(model.model.config, training={"model": {"loss": "v"}}))
+    model.learn(scenes(model), steps=2, form=AUTO)
+    assert sum("model.loss.kind" in record.message for record in caplog.records) == 1
+
+
+def test_what_is_learned_first_stops_by_itself_where_the_form_is_to_be_chosen() -> None:
+    settings = InversionSettings(form=AUTO).changed(tolerance=None, adapter=2, modes=3)
+    first = first_settings(settings)
+    assert (first.budget.tolerance, first.adapter.rank, first.modes.sets) == (TOLERANCE, 0, 1)
+    assert first_settings(settings.changed(form=MODES)).budget.tolerance is None
