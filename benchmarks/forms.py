@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from ftl_lightning.cli import main as ftl_lightning
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learned_concept import LearnedConcept
+from ftl_lightning.learning.forms import ALL
 from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE
 from ftl_lightning.learning.quality import roughness
 from ftl_lightning.tensor_file import write_text
@@ -43,6 +45,8 @@ PAIRS = (
 """Learned, and composed with weights 1 and 0.8."""
 
 Numbers = dict[str, float]
+Kinds = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""By kind, seed and form numbers; under ``choice`` what the choice says."""
 
 
 def pretrained(name: str, family: Family, folder: Path) -> FewShot:
@@ -87,16 +91,16 @@ def forms_of(model: FewShot, states: NDArray[np.float32], name: str, seed: int) 
     }
 
 
-def run_family(name: str, seeds: Sequence[int], folder: Path) -> dict[str, dict[str, dict[str, object]]]:
+def run_family(name: str, seeds: Sequence[int], folder: Path) -> dict[str, dict[str, dict[str, Any]]]:
     """By kind, seed and form what samples are like; under ``choice`` what the choice says."""
     family = FAMILIES[name]
     model = pretrained(name, family, folder)
-    found: dict[str, dict[str, dict[str, object]]] = {}
+    found: dict[str, dict[str, dict[str, Any]]] = {}
     for kind in family.new:
         fresh = family.draw(kind, SAMPLES, 2_000_000)
         for seed in seeds:
             known = family.draw(kind, FEW, 1_000_000 + seed)
-            entry: dict[str, object] = {}
+            entry: dict[str, Any] = {}
             for form, concept in forms_of(model, known, kind, seed).items():
                 samples = model.sample(concept, SAMPLES, seed=seed).states.numpy()
                 numbers = {"recognised": float(family.recognised(samples, kind).mean()), **compared(samples, known, fresh)}
@@ -137,13 +141,13 @@ def run_pairs(seeds: Sequence[int]) -> dict[str, dict[str, float]]:
     return found
 
 
-def summary(families: Mapping[str, Mapping[str, Mapping[str, Mapping[str, object]]]]) -> dict[str, dict[str, Numbers]]:
+def summary(families: Mapping[str, Kinds]) -> dict[str, dict[str, Numbers]]:
     """Means by family and form, and the least recognised kind."""
     found: dict[str, dict[str, Numbers]] = {}
     for name, kinds in families.items():
         entries = [entry for seeds in kinds.values() for entry in seeds.values()]
         for form in (ONE, SPAN, MODES, ADAPTED, MIXED, AUTO):
-            rows: list[Numbers] = [entry[form] for entry in entries]  # type: ignore[misc]
+            rows: list[Numbers] = [entry[form] for entry in entries]
             means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0]}
             means |= {"least recognised": min(row["recognised"] for row in rows)}
             means |= {"largest roughness": max(row["roughness"] for row in rows)} if "roughness" in rows[0] else {}
@@ -151,14 +155,18 @@ def summary(families: Mapping[str, Mapping[str, Mapping[str, Mapping[str, object
     return found
 
 
-def points(families: Mapping[str, Mapping[str, Mapping[str, Mapping[str, object]]]], name: str) -> dict[str, list[list[float]]]:
-    """Loss on left-out demonstrations, as a share of the empty concept's, and the share recognised: by form, a pair a concept."""
-    found: dict[str, list[list[float]]] = {ONE: [], SPAN: []}
-    for seeds in families[name].values():
+LOSSES = ("loss, own", "loss, left out", "loss, left out, in span")
+PREDICTED = {ONE: LOSSES[1:2], SPAN: LOSSES[2:], ADAPTED: LOSSES}
+"""Losses, shares of the empty concept's, whose sum is to tell how many samples of a form are right."""
+
+
+def points(kinds: Kinds) -> dict[str, list[list[float]]]:
+    """The sum of losses and the share of samples that are right, by form: a pair for each concept and seed."""
+    found: dict[str, list[list[float]]] = {form: [] for form in PREDICTED}
+    for seeds in kinds.values():
         for entry in seeds.values():
-            choice: Mapping[str, float] = entry["choice"]  # type: ignore[assignment]
-            for form, key in ((ONE, "loss, left out"), (SPAN, "loss, left out, in span")):
-                found[form].append([choice[key], entry[form]["recognised"]])  # type: ignore[index]
+            for form, losses in PREDICTED.items():
+                found[form].append([sum(entry["choice"][name] for name in losses), entry[form]["recognised"]])
     return found
 
 
@@ -174,13 +182,46 @@ def draw(found: Mapping[str, list[list[float]]], path: str) -> None:
     """The points, by form."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5, 3.4), layout="constrained")
-    axes = figure.subplots()
-    for (form, pairs), mark in zip(found.items(), "os", strict=True):
-        axes.plot(*np.array(pairs).T, mark, label=f"{form}: rank correlation {rank_correlation(pairs):.2f}", alpha=0.7)
-    axes.set(xlabel="loss on left-out demonstrations / the empty concept's", ylabel="samples that are right", ylim=(-0.05, 1.05))
-    axes.legend(fontsize=8)
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    for axes, (form, pairs) in zip(figure.subplots(1, 3, sharey=True), found.items(), strict=True):
+        axes.plot(*np.array(pairs).T, "o", alpha=0.6)
+        axes.set_title(f"{form}: rank correlation {rank_correlation(pairs):.2f}", fontsize=9)
+        axes.set(xlabel=" + ".join(name.removeprefix("loss, ") for name in PREDICTED[form]), ylim=(-0.05, 1.05))
+        axes.axvline(1 if len(PREDICTED[form]) == 1 else ALL, color="grey", linewidth=0.8)
+    figure.axes[0].set_ylabel("samples that are right")
+    figure.supxlabel("loss / the empty concept's", fontsize=9)
     figure.savefig(path, dpi=120)
+
+
+def page(content: Mapping[str, Any]) -> str:
+    """The tables of the documentation, in Markdown."""
+    told = ["| family | form | recognised (least) | spread (least) | novelty | roughness (largest) |", "|---|---|---|---|---|---|"]
+    for family, forms in content["summary"].items():
+        for form, one in forms.items():
+            rough = f"{one['roughness']:.2f} ({one['largest roughness']:.2f})" if "roughness" in one else "-"
+            told.append(
+                f"| {family} | {form} | {one['recognised']:.2f} ({one['least recognised']:.2f}) "
+                f"| {one['spread']:.2f} ({one['least spread']:.2f}) | {one['novelty']:.2f} | {rough} |"
+            )
+    if relations := content["families"].get("relations"):
+        told += ["", "| relation | own | left out | in span | right: one set | adapter | modes | chosen | novelty | forms chosen |"]
+        told += ["|---|---|---|---|---|---|---|---|---|---|"]
+        for kind, seeds in relations.items():
+            entries = list(seeds.values())
+            losses = [np.mean([entry["choice"][name] for entry in entries]) for name in LOSSES]
+            right = [np.mean([entry[form]["recognised"] for entry in entries]) for form in (ONE, ADAPTED, MODES, AUTO)]
+            new = np.mean([entry[AUTO]["novelty"] for entry in entries])
+            chosen = ", ".join(entry["choice"]["form"] for entry in entries)
+            told.append(f"| {kind} | {' | '.join(f'{value:.2f}' for value in (*losses, *right, new))} | {chosen} |")
+        ranks = content["rank correlation, relations"]
+        told += ["", "| form | losses whose sum is to tell | rank correlation with the share of right samples |", "|---|---|---|"]
+        told += [f"| {form} | {'; '.join(PREDICTED[form])} | {value:.2f} |" for form, value in ranks.items()]
+    if "pairs" in content:
+        told += ["", "| learned + 0.8 learned | form chosen, mean (least) | one set, mean (least) |", "|---|---|---|"]
+        for pair, found in content["pairs"].items():
+            rates = [[value for key, value in found.items() if key.startswith(form)] for form in (AUTO, ONE)]
+            told.append(f"| {pair} | {' | '.join(f'{np.mean(some):.2f} ({min(some):.2f})' for some in rates)} |")
+    return "\n".join(told) + "\n"
 
 
 def main() -> None:
@@ -202,20 +243,19 @@ def main() -> None:
         content["pairs"] = run_pairs(options.pairs)
     _write(options.out, content, families)
     if options.figure and "relations" in families:
-        draw(points(families, "relations"), options.figure)
+        draw(points(families["relations"]), options.figure)
 
 
-def _write(out: Path | None, content: dict[str, object], families: dict[str, dict[str, dict[str, dict[str, object]]]]) -> None:
+def _write(out: Path | None, content: dict[str, Any], families: dict[str, Any]) -> None:
+    """The numbers, and the documentation's tables of them beside it."""
     content["summary"], content["families"] = summary(families), families
     if "relations" in families:
-        found = points(families, "relations")
-        every = [pair for pairs in found.values() for pair in pairs]
-        content["rank correlation, relations"] = {form: rank_correlation(pairs) for form, pairs in found.items()} | {
-            "both": rank_correlation(every)
-        }
+        found = points(families["relations"])
+        content["rank correlation, relations"] = {form: rank_correlation(pairs) for form, pairs in found.items()}
     print(json.dumps(content["summary"], indent=2))
     if out:
         write_text(out, json.dumps(content, indent=2, sort_keys=False) + os.linesep)
+        write_text(out.with_suffix(".md"), page(content))
 
 
 if __name__ == "__main__":

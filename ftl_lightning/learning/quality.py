@@ -40,7 +40,8 @@ class Quality:
     Attributes:
         novelty: how far a sample is from the nearest demonstration, as a share of how far demonstrations are from their nearest
             others (mean over samples; means over demonstrations): 0 for copies, about 1 for behaviour that is as new as the
-            demonstrations are to each other.
+            demonstrations are to each other. Where what is observed is given, the demonstration whose it is does not count, as
+            being like that may be right.
         spread: standard deviation over samples as a share of the demonstrations' own, unbiased, all columns and times together: 0
             where all samples are the same.
         roughness: second differences over time, relative to how much a plan varies, as a share of the demonstrations' (medians);
@@ -52,12 +53,13 @@ class Quality:
     roughness: float
 
     @classmethod
-    def of(cls, samples: Tensor, demonstrations: Tensor) -> Self:
+    def of(cls, samples: Tensor, demonstrations: Tensor, observed: Tensor | None = None) -> Self:
         """Compare them.
 
         Args:
             samples: ``(sample, horizon, state)``, columns on comparable scales, such as a model's normalised ones.
             demonstrations: ``(demo, horizon, state)``, two or more.
+            observed: the demonstration of which each sample sees what is observed ``(sample,)`` int64; ``None`` for none.
 
         Raises:
             ValueError: for fewer than two demonstrations.
@@ -65,9 +67,11 @@ class Quality:
         if len(demonstrations) < 2:
             raise ValueError(f"expected two demonstrations or more, found {len(demonstrations)}")
         among = path_distance(demonstrations, demonstrations).fill_diagonal_(torch.inf).amin(dim=1).mean()
-        new = path_distance(samples, demonstrations).amin(dim=1).mean()
+        new = path_distance(samples, demonstrations)
+        if observed is not None:
+            new = new.scatter(1, observed[:, None], torch.inf)
         return cls(
-            novelty=_share(new, among),
+            novelty=_share(new.amin(dim=1).mean(), among),
             spread=_share(samples.var(dim=0).mean().sqrt(), demonstrations.var(dim=0).mean().sqrt()),
             roughness=_roughness_share(samples, demonstrations) if samples.shape[1] > 2 else 1.0,
         )
@@ -123,7 +127,7 @@ def measured(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapp
     """
     known = _encoded(model, *first_windows(demonstrations, model.config.horizon))
     plans, starts = generated(model, demonstrations, concepts, seed)
-    return {name: Quality.of(_encoded(model, own, starts), known) for name, own in plans.items()}
+    return {name: Quality.of(_encoded(model, own, starts), known, _observed(demonstrations)) for name, own in plans.items()}
 
 
 def generated(
@@ -131,13 +135,23 @@ def generated(
 ) -> tuple[dict[str, Tensor], InitialStates]:
     """Samples of some concepts ``(GENERATED, horizon, state)`` by name, and where each starts; arguments as of :func:`measured`."""
     names = list(concepts)
-    starts = demonstrations.initial_states.take(torch.arange(GENERATED) % len(demonstrations))
+    starts = demonstrations.initial_states.take(_turns(demonstrations))
     seen = {key: value.repeat(len(names), *(1,) * (value.dim() - 1)) for key, value in starts.observed.items()}
     draws = [generator("cpu", seed, 4, task_key(name)) for name in names]
     sampling = replace(SAMPLING, steps=min(SAMPLING.steps, model.max_steps or SAMPLING.steps))
     together = [concepts[name].composition.to(model.device) for name in names]
     plans = model.sample(together, GENERATED, sampling, draws, moved(seen, model.device)).cpu()
     return dict(zip(names, plans, strict=True)), starts
+
+
+def _turns(demonstrations: Demonstrations) -> Tensor:
+    """The demonstration that each sample starts like ``(GENERATED,)``."""
+    return torch.arange(GENERATED) % len(demonstrations)
+
+
+def _observed(demonstrations: Demonstrations) -> Tensor | None:
+    """The same where anything is observed."""
+    return _turns(demonstrations) if demonstrations.observed else None
 
 
 def first_windows(demonstrations: Demonstrations, horizon: int) -> tuple[Tensor, InitialStates]:
@@ -200,5 +214,5 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
     if domain.metrics and domain.concepts.reads(name):
         measured = domain.measure(name, plans, starts if domain.observed else None)
         right = next(((key, float(own.float().mean())) for key, own in measured.items() if own.dtype == torch.bool), None)
-    quality = Quality.of(_encoded(model, plans, starts), _encoded(model, known, first))
+    quality = Quality.of(_encoded(model, plans, starts), _encoded(model, known, first), _observed(demonstrations))
     return Inspection(quality, right, known, plans, starts, domain, name)
