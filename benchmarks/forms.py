@@ -2,7 +2,8 @@
 
 For every new kind of every family of ``benchmarks/families.py`` a concept is learned in each form and in the chosen one. Fifty
 samples of each are recognised or not by a rule that the method does not know, and measured beside fifty fresh ones: spread
-(standard deviation), novelty (distance to the nearest demonstration) and roughness (second differences), each as a share of theirs.
+(standard deviation), novelty (distance to the nearest demonstration) and roughness (second differences), each as a share of theirs,
+columns in units of their spread in pretraining (relations: in fresh scenes; those of pictures are alike).
 Then pairs of learned relations are composed. Models of one's own data are pretrained on first and kept in ``--folder``.
 
     python benchmarks/forms.py --out results/forms.json --figure docs/left_out.png
@@ -65,10 +66,19 @@ def pretrained(name: str, family: Family, folder: Path) -> FewShot:
     return FewShot.from_pretrained(place / "pretrained")
 
 
-def compared(samples: NDArray[np.float32], known: NDArray[np.float32], fresh: NDArray[np.float32]) -> Numbers:
-    """Spread, novelty and roughness of samples as shares of those of fresh behaviour, columns scaled alike."""
-    scale = fresh.reshape(-1, fresh.shape[2]).std(axis=0)
-    scale = np.where(scale > 0, scale, 1)
+def scale_of(family: Family, fresh: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of each column, which it is measured in."""
+    if fresh.shape[1] == 1 and family.training:
+        return np.ones(fresh.shape[2], dtype=np.float32)
+    seen = [family.draw(kind, PRETRAINING, 1) for kind in family.training]
+    scale = np.concatenate(seen or [fresh]).reshape(-1, fresh.shape[2]).std(axis=0)
+    return np.where(scale > 0, scale, 1).astype(np.float32)
+
+
+def compared(
+    samples: NDArray[np.float32], known: NDArray[np.float32], fresh: NDArray[np.float32], scale: NDArray[np.float32]
+) -> Numbers:
+    """Spread, novelty and roughness of samples as shares of those of fresh behaviour, columns in the given units."""
     one, other, base = (torch.from_numpy(np.asarray(some / scale)).float() for some in (samples, fresh, known))
 
     def novelty(some: torch.Tensor) -> float:
@@ -98,12 +108,13 @@ def run_family(name: str, seeds: Sequence[int], folder: Path) -> dict[str, dict[
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for kind in family.new:
         fresh = family.draw(kind, SAMPLES, 2_000_000)
+        scale = scale_of(family, fresh)
         for seed in seeds:
             known = family.draw(kind, FEW, 1_000_000 + seed)
             entry: dict[str, Any] = {}
             for form, concept in forms_of(model, known, kind, seed).items():
                 samples = model.sample(concept, SAMPLES, seed=seed).states.numpy()
-                numbers = {"recognised": float(family.recognised(samples, kind).mean()), **compared(samples, known, fresh)}
+                numbers = {"recognised": float(family.recognised(samples, kind).mean()), **compared(samples, known, fresh, scale)}
                 entry[form] = {key: round(value, 4) for key, value in numbers.items()}
                 if form == AUTO and (choice := concept.concept.choice) is not None:
                     entry["choice"] = {

@@ -55,7 +55,7 @@ def run(seed: int, encoder: str) -> dict[str, dict[str, Any]]:
     looks = {}
     for kind in NEW:
         known, fresh = strokes(kind, FEW, 1_000_000 + seed), strokes(kind, SAMPLES, 2_000_000 + seed)
-        numbers = {key: round(value, 4) for key, value in compared(drawn[kind], known, fresh).items()}
+        numbers = {key: round(value, 4) for key, value in compared(drawn[kind], known, fresh, np.ones(2, dtype=np.float32)).items()}
         looks[kind] = {"form": learned[kind].concept.choice.form, **numbers}  # type: ignore[union-attr]
     empty = model.sample(model[TRAINING[0]] * 0.0, SAMPLES, seed=seed).states.numpy()
     return {

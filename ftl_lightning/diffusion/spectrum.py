@@ -13,7 +13,7 @@ LEAST = 1e-6
 @cache
 def cosines(count: int) -> Tensor:
     """Orthonormal discrete cosine transform (type II), ``(cosine, time)`` in double precision; its inverse is its transpose."""
-    number = torch.arange(count, dtype=torch.float64)
+    number = torch.arange(count, dtype=torch.float64, device="cpu")  # wherever a network is being made, as this is kept
     basis = torch.cos(math.pi / count * number[:, None] * (number + 0.5)) * (2 / count) ** 0.5
     basis[0] /= 2**0.5
     return basis
