@@ -33,7 +33,7 @@ from ftl_lightning.tensor_file import write_text
 
 ROOT = Path(__file__).parent.parent
 FEW, SAMPLES, PRETRAINING = 5, 50, 80
-SPAN = "one set in the span"
+SPAN, FRESH = "one set in the span", "fresh behaviour"
 PAIRS = (
     ("triangle antidiagonal to square", "circle above square"),
     ("triangle antidiagonal to square", "circle right of triangle"),
@@ -88,6 +88,15 @@ def compared(
     return found | ({"roughness": float(roughness(one) / roughness(other))} if one.shape[1] > 2 else {})
 
 
+def reference(
+    family: Family, kind: str, known: NDArray[np.float32], fresh: NDArray[np.float32], scale: NDArray[np.float32]
+) -> Numbers:
+    """The same numbers of behaviour that is drawn once more."""
+    again = family.draw(kind, SAMPLES, 3_000_000)
+    numbers = {"recognised": float(family.recognised(again, kind).mean()), **compared(again, known, fresh, scale)}
+    return {key: round(value, 4) for key, value in numbers.items()}
+
+
 def forms_of(model: FewShot, states: NDArray[np.float32], name: str, seed: int) -> dict[str, LearnedConcept]:
     """The concept in every form."""
     mixed = model.learn(states, name=name, seed=seed, form=MIXED)
@@ -111,7 +120,7 @@ def run_family(name: str, seeds: Sequence[int], folder: Path) -> dict[str, dict[
         scale = scale_of(family, fresh)
         for seed in seeds:
             known = family.draw(kind, FEW, 1_000_000 + seed)
-            entry: dict[str, Any] = {}
+            entry: dict[str, Any] = {FRESH: reference(family, kind, known, fresh, scale)}
             for form, concept in forms_of(model, known, kind, seed).items():
                 samples = model.sample(concept, SAMPLES, seed=seed).states.numpy()
                 numbers = {"recognised": float(family.recognised(samples, kind).mean()), **compared(samples, known, fresh, scale)}
@@ -157,7 +166,7 @@ def summary(families: Mapping[str, Kinds]) -> dict[str, dict[str, Numbers]]:
     found: dict[str, dict[str, Numbers]] = {}
     for name, kinds in families.items():
         entries = [entry for seeds in kinds.values() for entry in seeds.values()]
-        for form in (ONE, SPAN, MODES, ADAPTED, MIXED, AUTO):
+        for form in (ONE, SPAN, MODES, ADAPTED, MIXED, AUTO, FRESH):
             rows: list[Numbers] = [entry[form] for entry in entries]
             means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0]}
             means |= {"least recognised": min(row["recognised"] for row in rows)}
@@ -211,7 +220,7 @@ def page(content: Mapping[str, Any]) -> str:
         for form, one in forms.items():
             rough = f"{one['roughness']:.2f} ({one['largest roughness']:.2f})" if "roughness" in one else "-"
             told.append(
-                f"| {family} | {form} | {one['recognised']:.2f} ({one['least recognised']:.2f}) "
+                f"| {family} | {'chosen' if form == AUTO else form} | {one['recognised']:.2f} ({one['least recognised']:.2f}) "
                 f"| {one['spread']:.2f} ({one['least spread']:.2f}) | {one['novelty']:.2f} | {rough} |"
             )
     if relations := content["families"].get("relations"):

@@ -1,5 +1,6 @@
 """The documentation: its length, its links, and the commands that it shows."""
 
+import json
 import re
 import runpy
 from dataclasses import dataclass
@@ -98,6 +99,14 @@ def test_the_tables_of_fields_are_what_the_docstrings_say() -> None:
     stale = page.replace("number of states in a plan", "what nobody wrote")
     assert stale != page
     assert fields["written"](stale) == page
+
+
+def test_the_tables_of_forms_are_what_the_results_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    forms = runpy.run_path(str(ROOT / "benchmarks" / "forms.py"))
+    content = json.loads((ROOT / "results" / "forms.json").read_text(encoding="utf-8"))
+    assert forms["summary"](content["families"]) == content["summary"]
+    assert forms["page"](content) == (ROOT / "results" / "forms.md").read_text(encoding="utf-8"), "run benchmarks/forms.py"
 
 
 def test_a_docstring_that_leaves_out_a_field_is_an_error() -> None:

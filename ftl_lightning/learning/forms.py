@@ -22,8 +22,10 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Of adapters and of their learning, where the settings name none."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step of a mode that is learned without an adapter, and steps, at most."""
-FOLDS = 5
-"""Sets of embeddings that leave a demonstration out, at most."""
+FOLDS, CLEAR, FEWER = 5, 0.4, 2
+"""Sets of embeddings that leave a demonstration out, at most; and their number where the loss of one set is less than the second, as
+a share of the empty concept's: it suffices then, and left-out demonstrations only decide what is composed.
+"""
 TOLERANCE = 0.01
 """Of the stopping rule, where the settings have none."""
 OWN, BOTH, ALL = 0.8, 2.03, 3.27
@@ -183,9 +185,12 @@ def _loss_shares(
 ) -> dict[str, _Shares]:
     """What one set of every concept says of its own demonstrations and of left-out ones."""
     every = {name: [row for row, text in enumerate(demonstrations.concepts) if text == name] for name in first}
-    left = {name: rows[:: -(-len(rows) // FOLDS)] if len(rows) > 2 else [] for name, rows in every.items()}
-    folds = [[row for row in every[name] if row != out] for name, rows in left.items() for out in rows]
     losses = {name: [_own_loss(model, _of(demonstrations, [name]), first[name], settings)] for name in first}
+    left = {
+        name: rows[:: -(-len(rows) // (FEWER if losses[name][0] < CLEAR else FOLDS))] if len(rows) > 2 else []
+        for name, rows in every.items()
+    }
+    folds = [[row for row in every[name] if row != out] for name, rows in left.items() for out in rows]
     for off_span in (settings.embeddings.off_span, 0.0)[: 1 + isinstance(model, TextConceptModel)] if folds else ():
         learned = learned_from(model, demonstrations, folds, quickly(settings).changed(off_span=off_span), steps, tell)
         number = 0
