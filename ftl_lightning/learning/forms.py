@@ -23,7 +23,7 @@ RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 MODE_SAMPLES, MODE_STEPS = 16, 400
 """Noised demonstrations a step of a mode that is learned without an adapter, and steps, at most."""
 FOLDS, CLEAR, FEWER = 5, 0.4, 2
-"""Sets of embeddings that leave a demonstration out, at most; and their number where the loss of one set is less than the second, as
+"""Sets of embeddings that leave a demonstration out, at most; and how many where the loss of one set is less than the second, as
 a share of the empty concept's: it suffices then, and left-out demonstrations only decide what is composed.
 """
 TOLERANCE = 0.01
