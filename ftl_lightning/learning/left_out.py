@@ -98,7 +98,7 @@ def learned_from(
         steps: of gradient descent, at most.
         tell: called with the mean loss after each step.
     """
-    parts = [replace(demonstrations.rows(rows), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
+    parts = [replace(demonstrations.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
     learned = list(invert(model, concatenate(parts), settings, steps, tell).values())
     every = Composition(torch.stack([one.embeddings for one in learned]), torch.stack([one.weights for one in learned]))
     return every.to(model.device)
