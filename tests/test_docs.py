@@ -109,6 +109,21 @@ def test_the_tables_of_forms_are_what_the_results_say(monkeypatch: pytest.Monkey
     assert forms["page"](content) == (ROOT / "results" / "forms.md").read_text(encoding="utf-8"), "run benchmarks/forms.py"
 
 
+def test_pages_tell_the_numbers_of_strokes() -> None:
+    content = json.loads((ROOT / "results" / "strokes.json").read_text(encoding="utf-8"))
+    rates = [f"{content[encoder]['recognised']['new kinds']:.2f}" for encoder in ("hashing", "minilm")]
+    looks = {
+        name: [f"{content[encoder]['looks'][name]:.2f}" for encoder in ("hashing", "minilm")]
+        for name in ("spread", "novelty", "roughness")
+    }
+    told = f"new kinds {rates[0]} with hashing and {rates[1]} with MiniLM; "
+    told += ", ".join(f"{name} {one} and {other}" for name, (one, other) in looks.items())
+    assert told in (ROOT / "docs" / "experiments-own-data.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "own-data.md").read_text(encoding="utf-8")
+    assert f"recognises {rates[0]} of the samples of the three new kinds" in page
+    assert f"spread {looks['spread'][0]} of fresh strokes and are smoother (roughness {looks['roughness'][0]})" in page
+
+
 def test_a_docstring_that_leaves_out_a_field_is_an_error() -> None:
     fields = runpy.run_path(str(ROOT / "docs" / "fields.py"))
 
