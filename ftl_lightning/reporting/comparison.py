@@ -6,7 +6,7 @@ from itertools import zip_longest
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
+from ftl_lightning.domains.paper import CHOSEN, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
 from ftl_lightning.learning.methods import load_method
 from ftl_lightning.reporting.paired import leads, least_certain, same_outcome, signed
@@ -36,7 +36,7 @@ from ftl_lightning.reporting.tables import (
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
 """The paper's, by their names in tables."""
 LANGUAGE = BASELINES[-1]
-METHODS = (PAPERS_METHOD, Compared(OURS, WITH_MODES), *map(Compared, BASELINES))
+METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *map(Compared, BASELINES))
 """The order of methods in tables; others come after them."""
 ALIKE = 0.9
 """In this share of episodes, at least, a reference policy ends as ours does to be told."""
@@ -124,12 +124,14 @@ def overview(results: pd.DataFrame) -> Table:
             for metric in metrics(domain):
                 if not select(rows, setting=setting, metric=metric).empty:
                     lines.append(_line(domain, rows, references, setting, metric, columns))
-    return _overview(results, lines)
+    return _overview(results, lines, columns)
 
 
 def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines: of each domain in turn what says most."""
+    """The overview in at most :data:`LINES` lines: of each domain in turn what says most. The form that is chosen stands for modes."""
     columns = methods(results)
+    if Compared(OURS, CHOSEN) in columns:
+        columns = [method for method in columns if method != Compared(OURS, WITH_MODES)]
     lines = {
         domain.name: [
             _line(domain, rows, reference_lines(domain, results), setting, metric, columns)
@@ -140,15 +142,15 @@ def short_overview(results: pd.DataFrame) -> Table:
     }
     shown = [line for turn in zip_longest(*lines.values()) for line in turn if line][:LINES]
     shown.sort(key=lambda line: list(lines).index(line[0]))
-    return _overview(results, shown)
+    return _overview(results, shown, columns)
 
 
-def _overview(results: pd.DataFrame, lines: list[list[str]]) -> Table:
+def _overview(results: pd.DataFrame, lines: list[list[str]], methods: Sequence[Compared]) -> Table:
     papers = " [the paper's]" if any(map(published, _domains(results))) else ""
     caption = (
         f"Ours and the baselines, mean ± standard error over tasks{papers}; lead: by how much ours is better than the best baseline"
     )
-    columns = ["domain", "setting, metric", *(label(*method) for method in methods(results)), "lead", "reference lines"]
+    columns = ["domain", "setting, metric", *(label(*method) for method in methods), "lead", "reference lines"]
     return Table("overview", caption, pd.DataFrame(lines, columns=columns, dtype=str))
 
 
