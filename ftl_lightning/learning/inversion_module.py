@@ -116,7 +116,9 @@ class InversionModule(ExactResume, Adaptation):
         """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
         if self._fine_tuned:
             return ""
-        return " ".join(word for word in (self.model.method.form(self.hparams), _FORMS.get(self.settings.form)) if word)
+        decided = _FORMS.get(self.settings.form)
+        options = {**self.hparams, **({"modes": 1, "adapter": 0} if decided else {})}
+        return " ".join(word for word in (self.model.method.form(options), decided) if word)
 
     @property
     def _fine_tuned(self) -> bool:
@@ -126,7 +128,8 @@ class InversionModule(ExactResume, Adaptation):
     def variant(self) -> str:
         off_span, weight = self.settings.embeddings.off_span, self.settings.weights.training
         form = {1.0: "free", 0.0: "span"}.get(off_span, f"near span {off_span:g}")
-        modes = [] if self.settings.modes.sets in (1, "auto") else [f"modes: {self.settings.modes.sets}"]
+        sets = 1 if self.settings.form in _FORMS else self.settings.modes.sets
+        modes = [] if sets in (1, "auto") else [f"modes: {sets}"]
         knots = [f"{self.settings.embeddings.knots} knots"] if self.settings.embeddings.knots > 1 else []
         scaled = self.settings.omega == "learned" and self.settings.weights.scale != 1
         scale = [f"guidance {self.settings.weights.scale:g}"] if scaled else []

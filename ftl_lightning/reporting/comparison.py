@@ -128,7 +128,7 @@ def overview(results: pd.DataFrame) -> Table:
 
 
 def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines: of each domain in turn what says most. The form that is chosen stands for modes."""
+    """The overview in at most :data:`LINES` lines: of each domain in turn what says most; modes only where no form is chosen."""
     columns = methods(results)
     if Compared(OURS, CHOSEN) in columns:
         columns = [method for method in columns if method != Compared(OURS, WITH_MODES)]
