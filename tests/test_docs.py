@@ -124,6 +124,18 @@ def test_pages_tell_the_numbers_of_strokes() -> None:
     assert f"spread {looks['spread'][0]} of fresh strokes and are smoother (roughness {looks['roughness'][0]})" in page
 
 
+def test_the_page_of_own_data_tells_what_check_finds() -> None:
+    content = json.loads((ROOT / "results" / "check.json").read_text(encoding="utf-8"))
+    page = (ROOT / "docs" / "own-data.md").read_text(encoding="utf-8")
+    found = [content["faults"][name] for name in ("strokes", "object_rearrangement", "agent", "tabletop", "mocap")]
+    for fault in found[0]:
+        cells = " | ".join(f"{one[fault]:.2f}" if fault in one else "-" for one in found)
+        row = "good sets in which it finds fault" if fault == "good" else fault
+        assert f"| {row} | {cells} |" in page
+    paths, relations = (content["odd one, after learning"][name]["found"] for name in ("paths", "relations"))
+    assert f"in {paths:.2f} of the sets of paths and in {relations:.2f} of those of relations" in page
+
+
 def test_a_docstring_that_leaves_out_a_field_is_an_error() -> None:
     fields = runpy.run_path(str(ROOT / "docs" / "fields.py"))
 
