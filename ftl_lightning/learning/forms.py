@@ -33,7 +33,7 @@ OWN, BOTH, ALL = 0.8, 2.03, 3.27
 left-out ones at most the second; or where there are sets in the span, with theirs on left-out ones at most the third. Chosen on
 relations that pretraining does not show, see docs/experiments-forms.md.
 """
-NARROW, WIDE = 0.85, 0.75
+NARROW, WIDE = 0.65, 0.75
 """Mixtures take the place of one set whose samples spread less than the first of what the demonstrations do; those that spread more
 than the second are stretched less."""
 SPAN_LOSS = 1.03
