@@ -151,15 +151,22 @@ def device_named(name: object) -> torch.device:
     """A device that this machine can compute on.
 
     Raises:
-        UserError: for another one, with those that there are.
+        UserError: for another one, with those that there are; for one that is there and fails, with what it said.
     """
     told = f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}"
     if not isinstance(name, str | torch.device):
         raise UserError(told)
     try:
         found = torch.device(name)
+    except RuntimeError as error:
+        raise UserError(told) from error
+    try:
         torch.ones(1, device=found).cpu()  # it may be named without being there
     except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch has one for each kind of absence
+        # One that is there, and out of memory or broken, is not absent.
+        if str(found) in _devices() or (found.type == "cuda" and found.index is None and torch.cuda.is_available()):
+            reason = short(next(iter(str(error).splitlines()), "") or type(error).__name__)
+            raise UserError(f"device: expected {found} to compute, found that it cannot: {reason}") from error
         raise UserError(told) from error
     return found
 

@@ -438,6 +438,15 @@ def test_cuda_is_told_where_there_is_none(things: Things) -> None:
             FewShot.from_pretrained("object_rearrangement", device=device)
 
 
+def test_a_device_that_is_there_and_fails_is_not_told_to_be_absent(things: Things, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*size: int, **options: object) -> torch.Tensor:
+        raise RuntimeError("out of memory\nand more lines")
+
+    monkeypatch.setattr(torch, "ones", full)
+    with pytest.raises(UserError, match=r"^device: expected cpu to compute, found that it cannot: out of memory$"):
+        things.scenes.to("cpu")
+
+
 def test_numpys_numbers_are_as_good_as_pythons(things: Things) -> None:
     scenes = things.scenes
     plain = scenes.sample(0.5 * scenes[SCENE], 3, seed=2, **QUICK, temperature=0.5).states

@@ -4,16 +4,17 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
+from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.rendering import LEFT, MAX_SAMPLES, RIGHT, SOLE, TRUNK, film, picture, wireframe
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.wireframe import seen
 from ftl_lightning.evaluation.animation import gif, side_by_side
+from tests.domains.mocap_samples import folder
 
 STANDING = (
     (0.1, 0, 0), (0.1, 0, -0.42), (0.1, 0, -0.82), (-0.1, 0, 0), (-0.1, 0, -0.42), (-0.1, 0, -0.82), (0.2, 0, 0.5), (0.22, 0, 0.22),
@@ -142,12 +143,12 @@ def test_films_stand_beside_one_another_above_their_names() -> None:
     assert side_by_side({}) == []
 
 
-@pytest.mark.skipif("FTL_LIGHTNING_DATA" not in os.environ, reason="FTL_LIGHTNING_DATA names no folder with recordings")
-def test_recordings_can_be_filmed() -> None:
-    path = Path(os.environ["FTL_LIGHTNING_DATA"]) / "cmu14_segments.npz"
-    if not path.is_file():
-        pytest.skip(f"no {path.name} in the folder that FTL_LIGHTNING_DATA names")
-    with np.load(path, allow_pickle=False) as archive:
-        states = torch.from_numpy(archive["positions"][:HORIZON]).flatten(1)
-    assert len(film(states)) == HORIZON
-    assert all(inked(frame, LEFT).any() and inked(frame, RIGHT).any() for frame in film(states))
+def test_recordings_can_be_filmed(tmp_path: Path) -> None:
+    """Made-up ones, and the user's where they are named."""
+    named = os.environ.get("FTL_LIGHTNING_DATA")
+    for root in (folder(tmp_path / "recordings"), *([Path(named)] if named else [])):
+        recorded, _ = read_folder(root)
+        pictures = film(torch.from_numpy(recorded.trial(0)[:HORIZON]))
+        assert len(pictures) == HORIZON
+        assert all(inked(frame, LEFT).any() and inked(frame, RIGHT).any() for frame in pictures)
+        assert any(not np.array_equal(frame, pictures[0]) for frame in pictures), "nobody moves"
