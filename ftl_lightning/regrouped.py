@@ -20,6 +20,7 @@ PRETRAINING: Mapping[str, str] = {
     "code_knots": "codes.knots",
     "code_size": "codes.size",
     "code_noise": "codes.noise",
+    "code_relative": "codes.relative",
 }
 """Of our pretraining, where each option is, ``'group.option'``, by its flat name, under which models' records know it."""
 INVERSION: Mapping[str, str] = {

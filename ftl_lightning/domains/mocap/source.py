@@ -163,6 +163,15 @@ class Recorded:
             raise UserError(f"{self.root}: expected held-out trials in which someone stands with arms down, found none")
         return found
 
+    def training_poses(self) -> tuple[Tensor, ...]:
+        """Of each trial used for training in which someone stands or walks with arms down, all such poses ``(pose, 42)``.
+
+        Mirror images are among them.
+        """
+        trials = sorted({piece.trial for piece in self._pieces} - self._validation)
+        down = [poses[hang_down(poses)] for poses in (torch.from_numpy(self.recordings.trial(trial)) for trial in trials)]
+        return tuple(torch.cat((poses, mirrored(poses))) for poses in down if len(poses))
+
     def _passed(self, concept: str) -> tuple[Tensor, ...]:
         """Poses ``(pose, 42)`` of each piece of a training concept's trials that a window starts from; none where there is none."""
         own = [piece for piece in self._pieces if piece.concept == concept]

@@ -1,10 +1,18 @@
-"""Poses made by rule, for those who have no recordings: where a shipped model's behaviour starts."""
+"""Poses of people who stand or walk with their arms down, without recordings: made by rule, or drawn from a distribution.
+
+Those made by rule are where a shipped model's behaviour starts for those who have no recordings. The distribution is a Gaussian
+fitted to such poses of recordings used for training (``benchmarks/mocap_beginnings.py``); learning starts from draws of it.
+"""
+
+from functools import cache
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, as_joints
+from ftl_lightning.tensor_file import load_tensors, save_tensors
 
 _RIGHT_SIDE = (
     (0.09, 0.0, 0.0),
@@ -22,6 +30,9 @@ SWING = 0.8
 """How far the arm of the same side is swung the other way, compared to the leg."""
 BEND = 0.15
 """Radians by which thighs point further forwards, and shanks further back."""
+
+BEGINNINGS = "distribution of poses"
+_FILE = Path(__file__).parent / "beginnings.safetensors"
 
 
 def standing_poses(count: int, draw: torch.Generator) -> Tensor:
@@ -53,3 +64,31 @@ def _turned(joints: Tensor, limb: tuple[int, ...], angle: Tensor) -> None:
     y, z = hanging[..., 1], hanging[..., 2]
     turned = torch.stack((hanging[..., 0], y * cos - z * sin, y * sin + z * cos), dim=-1)
     joints[:, others] = joints[:, first : first + 1] + turned
+
+
+def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
+    """Write a Gaussian of few principal directions for :func:`drawn_poses`.
+
+    Args:
+        poses: ``(pose, 42)`` in metres.
+        directions: of greatest variance that are kept.
+        path: the file.
+    """
+    mean = poses.double().mean(dim=0)
+    _, size, axes = torch.linalg.svd(poses.double() - mean, full_matrices=False)
+    scaled = axes[:directions] * size[:directions, None] / (len(poses) - 1) ** 0.5
+    save_tensors(path, BEGINNINGS, {"mean": mean.float(), "directions": scaled.float()}, {"poses": len(poses)})
+
+
+def drawn_poses(count: int, draw: torch.Generator) -> Tensor:
+    """Poses ``(count, 42)`` of the shipped Gaussian, in metres, on the generator's device."""
+    mean, directions = _distribution()
+    return mean.to(draw.device) + torch.randn((count, len(directions)), generator=draw, device=draw.device) @ directions.to(
+        draw.device
+    )
+
+
+@cache
+def _distribution() -> tuple[Tensor, Tensor]:
+    tensors, _ = load_tensors(_FILE, BEGINNINGS)
+    return tensors["mean"], tensors["directions"]

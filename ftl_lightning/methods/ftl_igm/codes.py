@@ -15,8 +15,8 @@ from ftl_lightning.seeding import generator
 class Codes:
     """Rough codes of behaviour, which are added to the texts of some samples in pretraining.
 
-    A code is a random linear projection of how far the plan has come from its first state, at each of several knots, with noise. It
-    is as long as a text's embedding on average, and half of the samples with a code have no text.
+    A code is a random linear projection of the plan's states at each of several knots, with noise. It is as long as a text's
+    embedding on average, and half of the samples with a code have no text.
 
     Attributes:
         share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept. 0 is the
@@ -24,12 +24,15 @@ class Codes:
         knots: times.
         size: numbers of a code at a knot.
         noise: standard deviation of what is added to the numbers, which have unit variance.
+        relative: codes tell how far a plan has come from its first state; otherwise where it is. Concepts of where it is lead to the
+            same places from any initial state.
     """
 
     share: float = 0.0
     knots: int = 8
     size: int = 16
     noise: float = 0.3
+    relative: bool = True
 
     def __post_init__(self) -> None:
         expect_range("model.codes.share", self.share, 0, 1)
@@ -51,7 +54,8 @@ class Codes:
         fixed = generator("cpu", zlib.crc32(b"codes"))
         mixing = torch.randn(clean.shape[2], self.size, generator=fixed).to(device)
         directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
-        way = (clean[:, times] - clean[:, :1]) @ mixing  # (batch, knot, size)
+        shown = clean[:, times] - clean[:, :1] if self.relative else clean[:, times]
+        way = shown @ mixing  # (batch, knot, size)
         numbers = way / way.square().mean().sqrt().clamp(min=1e-6)
         numbers = numbers + self.noise * torch.randn(numbers.shape, generator=draw, device=device)
         told = (torch.rand(count, generator=draw, device=device) < self.share) & ~removed
