@@ -32,7 +32,7 @@ def main() -> None:
     fit_poses(poses, DIRECTIONS, options.out)
     spread = torch.linalg.svdvals(poses - poses.mean(dim=0)).square()
     held = float(spread[:DIRECTIONS].sum() / spread.sum())
-    print(json.dumps({"trials": len(trials), "poses": len(poses), "variance held": round(held, 4)}))  # noqa: T201
+    print(json.dumps({"trials": len(trials), "poses": len(poses), "variance held": round(held, 4)}))
 
 
 if __name__ == "__main__":

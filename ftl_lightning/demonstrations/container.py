@@ -175,6 +175,16 @@ class Demonstrations(Shown):
         return InitialStates(first, self.scenes)
 
     @property
+    def final_states(self) -> InitialStates:
+        """What is observed where each demonstration ends; what is observed once, as it is at the start.
+
+        Behaviour that goes on from there can start in it.
+        """
+        rows, last = torch.arange(len(self)), self.lengths - 1
+        found = {name: values[rows, last] if name in self.per_step else values for name, values in self.observed.items()}
+        return InitialStates(found, self.scenes)
+
+    @property
     def every_observation(self) -> dict[str, Tensor]:
         """What is observed at all times of all demonstrations, by name ``(observation, *shape)``."""
         return {name: values.flatten(0, 1) if name in self.per_step else values for name, values in self.observed.items()}

@@ -140,7 +140,8 @@ class Metric:
 
     Attributes:
         measure: ``(goal, states (sample, horizon, state), initial states or None) -> (sample,)`` of bool (right or wrong) or of
-            numbers; or a single number ``()`` for the whole set, such as a distance between distributions.
+            numbers; or one number ``()`` for the whole set, such as a distance between distributions. NaN where it says nothing
+            of a plan or a goal: such plans do not count, and where it says nothing at all it is not reported.
         less_is_better: whether a smaller value is better.
         identity: what the values depend on besides the code, such as the hash of a trained judge's weights. It is part of the
             configuration's hash; empty for a rule.

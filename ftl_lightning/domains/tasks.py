@@ -21,8 +21,8 @@ class EvaluationTask:
         without: training concepts in the composition with the negative weight :data:`WITHOUT_WEIGHT`: what behaviour should not be.
         component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
         on: concepts, learned or texts, that act on some groups of a state's columns only, each with the names of the groups.
-        initial: where plans start, in domains with initial states: in new ones, or in those of the demonstrations that the concept
-            was learned from.
+        initial: where plans start, in domains with initial states: in new ones, or in those that the demonstrations that the
+            concept was learned from start in, or end in.
 
     Raises:
         UserError: at construction, for ``learned``, ``texts`` or ``without`` that are no tuples, or where a single component or the
@@ -36,13 +36,13 @@ class EvaluationTask:
     without: tuple[str, ...] = ()
     component: int | None = None
     on: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    initial: Literal["new", "demonstrated"] = "new"
+    initial: Literal["new", "demonstrated", "last"] = "new"
 
     def __post_init__(self) -> None:
         for key in ("learned", "texts", "without"):
             if not isinstance(names := getattr(self, key), tuple):
                 raise UserError(f"evaluation task {self.goal!r}: {key}: expected a tuple of names, found {names!r}")
-        if len(self.learned) != 1 and (self.component is not None or self.initial == "demonstrated"):
+        if len(self.learned) != 1 and (self.component is not None or self.initial != "new"):
             key = "component" if self.component is not None else "initial"
             raise UserError(f"evaluation task {self.goal!r}: {key}: expected one learned concept, found {len(self.learned)}")
 

@@ -79,7 +79,7 @@ class Real:
             root: folder of the user's copy of the data.
             seed: of the fresh samples.
         """
-        if task.initial == "demonstrated":
+        if task.initial != "new":
             return cls(task, domain, count, None, None)
         shown = task.learned == (task.goal,) and demonstrations is not None and len(demonstrations) > 0
         drawn = _drawn(domain, task.goal, 2 * count, root, seed)

@@ -66,7 +66,7 @@ class Generation:
 
     def noise(self, task: EvaluationTask, *episode: int) -> torch.Generator:
         """What draws a task's samples, or the plans of one of its episodes: it depends on no other task."""
-        demonstrated = (1,) if task.initial == "demonstrated" else ()
+        demonstrated = {"new": (), "demonstrated": (1,), "last": (2,)}[task.initial]
         return generator("cpu", self.seed, task_key(task.name), *demonstrated, *episode)
 
 
@@ -138,6 +138,8 @@ def _starts(task: EvaluationTask, module: Evaluable, generation: Generation, roo
     (concept,) = task.learned
     if (demonstrations := module.demonstrated(concept)) is None:
         raise UserError(f"evaluation task {task.goal!r}: initial: expected demonstrations of {concept!r}, found none")
+    if task.initial == "last":
+        return demonstrations.final_states.take([sample % len(demonstrations) for sample in range(generation.samples)])
     return demonstrations.initial_states
 
 

@@ -25,7 +25,8 @@ class Judged:
     Attributes:
         task: what was asked.
         states: plans ``(sample, horizon, state)``.
-        measured: what the domain's metrics say of them, by name: ``(sample,)``, or ``()`` for the whole set.
+        measured: what the domain's metrics say of them, by name: ``(sample,)``, or ``()`` for the whole set; NaN where a metric
+            says nothing of a plan.
         starts: initial states that they start from, or ``None``.
         rollout: what happened when they were executed, if they were.
         followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
@@ -73,15 +74,18 @@ class Judged:
 
     @property
     def values(self) -> dict[str, float]:
-        """Every metric's value: those of plans, what happened when they were executed after ``closed loop``, and diversity."""
-        plans = {name: share(values) for name, values in self.measured.items()}
+        """Every metric's value: those of plans, what happened when they were executed after ``closed loop``, and diversity.
+
+        Metrics that say nothing of any plan are left out.
+        """
+        plans = {name: share(values) for name, values in self.measured.items() if not values.isnan().all()}
         plans |= {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
         return {**plans, **{name: value for name, value in self.diversity.items() if name not in plans}}
 
 
 def share(values: Tensor) -> float:
-    """Share of true values, or the mean of numbers."""
-    metric = MeanMetric()
+    """Share of true values, or the mean of numbers; those that are NaN do not count."""
+    metric = MeanMetric(nan_strategy="ignore")
     metric.update(values.float())
     return float(metric.compute())
 

@@ -18,6 +18,9 @@ from ftl_lightning.domains.tasks import training_suite
 
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
 
+_KINEMATIC = ("rule", "level", "strides", "rise", "feet in time", "amplitude of hands", "amplitude of feet", "degrees turned")
+"""Metrics of :mod:`~ftl_lightning.domains.mocap.measures` that need no judge, by name."""
+
 
 def _frozen(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
     """Plans in which nobody moves."""
@@ -38,7 +41,7 @@ DOMAIN = Domain(
     observed=OBSERVED,
     metrics={
         ACCURACY: Metric(deferred(f"{_MEASURES}:recognised"), identity=identity()),
-        "rise": Metric(deferred(f"{_MEASURES}:rise")),
+        **{name: Metric(deferred(f"{_MEASURES}:{name.replace(' ', '_')}")) for name in _KINEMATIC},
         "bone error": Metric(deferred(f"{_MEASURES}:bone_error"), less_is_better=True),
         "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
     },

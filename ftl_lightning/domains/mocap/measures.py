@@ -14,6 +14,7 @@ from torchmetrics.image.fid import FrechetInceptionDistance
 from torchmetrics.image.kid import KernelInceptionDistance
 
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.mocap import kinematics
 from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
 from ftl_lightning.domains.mocap.skeleton import BONES, FPS, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
@@ -24,6 +25,8 @@ POSE = "pose"
 """The observed feature that holds where a window starts."""
 ENOUGH = 500
 """Windows on each side from which distances of distributions say more about motion than about the number of windows."""
+JACKS, CIRCLES = ("jumping jacks",), ("arm circle",)
+"""Goals of which measures of the hands and feet, or of turning arms, say something."""
 _RIGID = [BONES.index(bone) for bone in RIGID]
 
 
@@ -57,6 +60,47 @@ def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     above = joints[..., list(WRISTS), 2] - joints[..., list(SHOULDERS), 2]
     low, high = (above < 0).all(dim=-1), (above > 0).all(dim=-1)
     return (low.int().cummax(dim=1).values.bool() & high).any(dim=1)
+
+
+def _nothing(states: Tensor) -> Tensor:
+    return torch.full((len(states),), torch.nan)
+
+
+def rule(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """Whether the goal's rule of :mod:`~ftl_lightning.domains.mocap.kinematics` holds: ``(sample,)`` of 0 and 1.
+
+    Of goals without a rule it says nothing: NaN.
+    """
+    return kinematics.RULES[goal](states).float() if goal in kinematics.RULES else _nothing(states)
+
+
+def _first(states: Tensor, starts: InitialStates | None) -> Tensor:
+    return states[:, 0] if starts is None else starts.observed[POSE]
+
+
+def level(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """:func:`rule` where somebody starts level; NaN where in a stride."""
+    return rule(goal, states, starts).masked_fill(kinematics.strides(_first(states, starts)), torch.nan)
+
+
+def strides(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    """:func:`rule` where somebody starts in a stride; NaN where level."""
+    return rule(goal, states, starts).masked_fill(~kinematics.strides(_first(states, starts)), torch.nan)
+
+
+def _told(goals: tuple[str, ...], measure: Callable[[Tensor], Tensor]) -> Callable[[str, Tensor, InitialStates | None], Tensor]:
+    """A measure that says something of some goals only."""
+
+    def told(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        return measure(states).float() if goal in goals else _nothing(states)
+
+    return told
+
+
+feet_in_time = _told(JACKS, kinematics.feet_in_time)
+amplitude_of_hands = _told(JACKS, kinematics.hands_amplitude)
+amplitude_of_feet = _told(JACKS, kinematics.feet_amplitude)
+degrees_turned = _told(CIRCLES, kinematics.degrees_turned)
 
 
 def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = None) -> dict[str, float]:
@@ -161,9 +205,16 @@ def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor
 
 
 MEASURES: Mapping[str, Callable[[str, Tensor, InitialStates | None], Tensor]] = {
-    "recognised": recognised,
+    "accuracy": recognised,
     "bone error": bone_error,
     "jerk": jerk,
+    "rule": rule,
+    "level": level,
+    "strides": strides,
     "rise": rise,
+    "feet in time": feet_in_time,
+    "amplitude of hands": amplitude_of_hands,
+    "amplitude of feet": amplitude_of_feet,
+    "degrees turned": degrees_turned,
 }
-"""Metrics of plans by name; of bone error and jerk, less is better."""
+"""Metrics of plans by name; of bone error and jerk, less is better. ``rise`` to ``degrees turned`` are parts of what rules ask."""

@@ -100,11 +100,15 @@ ACTION_OF: Mapping[str, str | None] = {
 """Training concepts, and the action that each shows (:mod:`ftl_lightning.domains.mocap.actions`); ``None`` where it shows none of
 these, or several one after the other. Dances are no action together: each kind was danced by one subject alone."""
 TRAINING_CONCEPTS = tuple(ACTION_OF)
-PAPER_CONCEPTS = ("jumping jacks", "arm circle")
-VALIDATION_CONCEPTS = ("knee raise",)
+PAPER_CONCEPTS = ("jumping jacks",)
+"""New concepts of the paper whose trials most copies of the database hold."""
+STAND_INS = ("arm circle",)
+"""New concepts of ours, in place of the paper's two others."""
 DATABASE_CONCEPTS = ("chop wood", "breaststroke")
 """New concepts of the paper whose trials few copies of the database hold."""
-NEW_CONCEPTS = (*PAPER_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS)
+TEST_CONCEPTS = (*PAPER_CONCEPTS, *STAND_INS)
+VALIDATION_CONCEPTS = ("knee raise", "squat")
+NEW_CONCEPTS = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS)
 AND = " + "
 """Between the parts of a goal that asks for several concepts at once."""
 COMPOSED_WITH = ("walk", "jump")
@@ -159,13 +163,24 @@ def _by_parts(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
     )
 
 
+def _protocol(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
+    """As the paper evaluates: from the demonstrations' last states, alone and composed with training concepts."""
+    pairs = _pairs(concepts)
+    return (
+        *(EvaluationTask("new concept, last states", text, (text,), initial="last") for text in concepts),
+        *(EvaluationTask("new + training, last states", AND.join(pair), pair[:1], pair[1:], initial="last") for pair in pairs),
+    )
+
+
 SUITES = {
-    "paper": Suite(_new(PAPER_CONCEPTS)),
-    "composition": Suite((*_composed(PAPER_CONCEPTS), *_by_parts(PAPER_CONCEPTS))),
-    "whole": Suite(_composed(PAPER_CONCEPTS)),
+    "paper": Suite(_new(TEST_CONCEPTS)),
+    "protocol": Suite(_protocol(TEST_CONCEPTS)),
+    "composition": Suite((*_composed(TEST_CONCEPTS), *_by_parts(TEST_CONCEPTS))),
+    "whole": Suite(_composed(TEST_CONCEPTS)),
     "database": Suite(_new(DATABASE_CONCEPTS)),
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
 }
-"""``'paper'`` is for final evaluation alone, ``'validation'`` for tuning; ``'database'`` needs the trials of
-:data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for methods that cannot compose by parts
-of the body."""
+"""``'paper'`` is for final evaluation alone, and ``'protocol'``, which starts where the paper does; ``'validation'`` is for tuning.
+
+``'database'`` needs the trials of :data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for
+methods that cannot compose by parts of the body."""

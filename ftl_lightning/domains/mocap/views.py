@@ -66,8 +66,8 @@ BLENDED = (8, 12)
 def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
     """Half of the windows from a pose in which somebody stands or walks with arms down, and from there into what was recorded.
 
-    Demonstrations begin at rest; without this, nothing shows how to leave a stride. The first frames are a weighted mean of the pose
-    and of the recorded frame, whose weight grows as half a cosine, with the bones of the one who moves.
+    Demonstrations begin at rest; without this, nothing shows how to leave a stride. The first frames are a weighted mean of the
+    pose and of the recorded frame, whose weight grows as half a cosine, with the bones of the one who moves.
 
     Args:
         states: ``(sample, frame, 42)`` in metres.

@@ -24,8 +24,8 @@ class Codes:
         knots: times.
         size: numbers of a code at a knot.
         noise: standard deviation of what is added to the numbers, which have unit variance.
-        relative: codes tell how far a plan has come from its first state; otherwise where it is. Concepts of where it is lead to the
-            same places from any initial state.
+        relative: codes tell how far a plan has come from its first state; otherwise where it is. Concepts of where it is lead to
+            the same places from any initial state.
     """
 
     share: float = 0.0
