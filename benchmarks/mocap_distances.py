@@ -3,7 +3,10 @@
     python benchmarks/mocap_distances.py --root FOLDER --concepts results/concepts/mocap/seed0 --out results/mocap_distances.json
 
 FOLDER holds recordings as ``prepare mocap`` leaves them. Each row compares as many windows with recordings of a concept by people
-who did not demonstrate it. A second table: a classifier that has learned from generated motion alone, tested on recordings.
+who did not demonstrate it, and with the distance between two people's recordings of it. Walking by its text is compared with
+recordings of walking, and each person's with that of all others. ``variation`` tells how far two samples from one start are apart,
+beside two recordings of one person and of two. Last, a classifier that has learned from generated motion alone, tested on
+recordings.
 """
 
 import argparse
@@ -18,9 +21,10 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.mocap.actions import TESTED, action
+from ftl_lightning.domains.mocap.kinematics import SETTLED
 from ftl_lightning.domains.mocap.measures import distances, diversity, learned_elsewhere, multimodality
 from ftl_lightning.domains.mocap.skeleton import HORIZON
-from ftl_lightning.domains.mocap.source import POSE, Recorded, pieces
+from ftl_lightning.domains.mocap.source import POSE, Recorded, at_rest, pieces
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
 from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -33,6 +37,10 @@ MOST = 500
 """Windows on each side, where there are as many."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
 """As conf/sampling/mocap.yaml."""
+STARTS, EACH = 20, 10
+"""Starts from which variation is measured, and samples from each."""
+FEWEST = 50
+"""Windows of a person who walks, at least."""
 GUIDANCE = 1.2
 """Of training concepts."""
 
@@ -77,10 +85,58 @@ def said(model: ConceptModel, *texts: str) -> Composition:
     return Composition(embeddings, torch.full((len(embeddings),), GUIDANCE if texts else 0.0))
 
 
+def variation(model: ConceptModel, composition: Composition, starts: Tensor, seed: int) -> float:
+    """How far samples from one start are from their mean: metres, root mean square over samples, joints and frames.
+
+    Of frames that no longer come from the start, see :data:`~ftl_lightning.domains.mocap.kinematics.SETTLED`.
+    """
+    each = starts[:STARTS].repeat_interleave(EACH, dim=0)
+    return spread(generated(model, composition, each, seed).unflatten(0, (-1, EACH)))
+
+
+def spread(windows: Tensor) -> float:
+    """The same of windows ``(..., sample, 32, 42)``."""
+    far = windows[..., SETTLED:, :] - windows[..., SETTLED:, :].mean(dim=-3, keepdim=True)
+    share = windows.shape[-3] / (windows.shape[-3] - 1)
+    return float((3 * share * far.square().mean()).sqrt())  # three coordinates of a joint
+
+
+def beginnings(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
+    """Windows of people that start nearest to rest, as demonstrations do."""
+    every, found = source.recordings, []
+    for segment in source.segments:
+        if segment.label != concept or segment.trial_id not in every.trial_id:
+            continue
+        trial = every.trial_id.index(segment.trial_id)
+        if (every.subject[trial] in DEMONSTRATORS) == demonstrators:
+            for states in pieces(every.trial(trial)[segment.start : segment.stop], longest=None):
+                found += [states[start : start + HORIZON] for start in at_rest(states)]
+    return torch.stack(found)
+
+
+def walking(source: Recorded, model: ConceptModel, seed: int) -> dict[str, object]:
+    """Distances of walking by its text to recordings of people who walk, and of each person's recordings to all others'."""
+    training = source.split("train", 0, 0)
+    half = len(training) // 2
+    subjects = [str(trial).split("_")[0] for trial in training.provenance["trials"][:half]]
+    by_subject: dict[str, list[Tensor]] = {}
+    for row, subject in enumerate(subjects):
+        if training.concepts[row] == "walk":
+            by_subject.setdefault(subject, []).extend(windows(training.states[row, : int(training.lengths[row])], 4))
+    every = {subject: torch.stack(own) for subject, own in by_subject.items() if len(own) >= FEWEST}
+    starts = source.starts("walk", MOST, seed).observed[POSE]
+    made = generated(model, said(model, "walk"), starts, seed)
+    rows: dict[str, object] = {"text: walk": distances(made, torch.cat(list(every.values())), seed)}
+    for subject, own in every.items():
+        others = torch.cat([windows for other, windows in every.items() if other != subject])
+        rows[f"recordings of {subject}, against all others"] = distances(own, others, seed)
+    return rows
+
+
 def table(
     source: Recorded, model: ConceptModel, folders: Mapping[str, Sequence[Path]], concept: str, seed: int
-) -> dict[str, object]:
-    """Each row's distances to recordings of people who did not demonstrate a concept."""
+) -> tuple[dict[str, object], dict[str, float]]:
+    """Each row's distances to recordings of people who did not demonstrate a concept; each row's variation in metres."""
     real, shown = recorded(source, concept, False), recorded(source, concept, True)
     number = min(MOST, len(real), len(shown))
     starts = source.starts(concept, number, seed).observed[POSE]
@@ -93,15 +149,24 @@ def table(
         "unconditional": generated(model, said(model), starts, seed),
         "text: walk": generated(model, said(model, "walk"), starts, seed),
     }
+    own, others = (beginnings(source, concept, demonstrators) for demonstrators in (True, False))
+    varied = {"recordings of the demonstrators": spread(own), "recordings of both": spread(torch.cat([own, others]))}
+    varied["text: walk"] = variation(model, said(model, "walk"), starts, seed)
     for name, places in folders.items():
         for place in places:
             path = place / f"{concept.replace(' ', '_')}.safetensors"
             learned = Concept.load(path)
             expect_concept(model, learned, path)
-            rows[name if len(places) == 1 else f"{name}, {place.name}"] = generated(model, learned.composition, starts, seed)
+            row = name if len(places) == 1 else f"{name}, {place.name}"
+            rows[row] = generated(model, learned.composition, starts, seed)
+            varied[row] = variation(model, learned.composition, starts, seed)
     halves = {**distances(real[::2], real[1::2], seed), "diversity": diversity(real, seed)}
-    found = {name: {**distances(own, real, seed), "diversity": diversity(own, seed)} for name, own in rows.items()}
-    return {"recordings of the others, half against half": halves, **found}
+    found: dict[str, dict[str, float]] = {
+        name: {**distances(own, real, seed), "diversity": diversity(own, seed)} for name, own in rows.items()
+    }
+    between = found["recordings of the demonstrators"]["kid"]
+    over = {name: {**row, "kid over that between people": row["kid"] / between} for name, row in found.items()}
+    return {"recordings of the others, half against half": halves, **over}, varied
 
 
 def second_opinion(source: Recorded, model: ConceptModel, seed: int, number: int = 100) -> dict[str, object]:
@@ -135,10 +200,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     source, model = Recorded(chosen.root), load_model(chosen.pretrained)
     folders = {"ours": chosen.concepts, "ours with adapter": chosen.adapters}
     found: dict[str, object] = {"model": model.hash, "seed": chosen.seed}
+    variations: dict[str, dict[str, float]] = {}
     with bar("concepts", len(chosen.tasks) + 1) as advance:
         for concept in chosen.tasks:
-            found[concept] = table(source, model, folders, concept, chosen.seed)
+            found[concept], variations[concept] = table(source, model, folders, concept, chosen.seed)
             advance()
+        found["variation"] = variations
+        found["walk"] = walking(source, model, chosen.seed)
         found["second opinion"] = second_opinion(source, model, chosen.seed)
         advance()
     text = json.dumps(found, indent=1) + "\n"

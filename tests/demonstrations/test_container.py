@@ -92,6 +92,9 @@ def test_a_feature_is_per_step_because_the_file_says_so_not_because_of_its_shape
     assert always.features["map"].shape == (3,)
     assert torch.equal(once.initial_states.observed["map"], square)
     assert torch.equal(always.initial_states.observed["map"], square[:, 0])
+    ending = demonstrations(states, observed={"map": square}, per_step=("map",), lengths=torch.tensor([4, 2]))
+    assert torch.equal(ending.final_states.observed["map"], torch.stack((square[0, 3], square[1, 1])))
+    assert torch.equal(once.final_states.observed["map"], square), "what is observed once"
     rows, starts = torch.tensor([1]), torch.tensor([2])
     assert torch.equal(once.windows(rows, starts, 2)[1]["map"], square[1:])
     assert torch.equal(always.windows(rows, starts, 2)[1]["map"], square[1:, 2])

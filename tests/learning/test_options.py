@@ -110,6 +110,7 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
         "code_knots": 2,
         "code_size": 16,
         "code_noise": 0.3,
+        "code_relative": True,
     }
     assert not {"codes", "budget"} & fit.hparams.keys()
 

@@ -1,0 +1,138 @@
+"""The tables of human motion's page, from the rows of its ablation: results/mocap.md.
+
+    python benchmarks/mocap_table.py
+
+Rules first, the trained judge beside them, level starts and strides apart; then compositions, and the paper's protocol.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from ftl_lightning.tensor_file import write_text
+
+JACKS, CIRCLE = "jumping jacks", "arm circle"
+NEW, PARTS, WHOLE = "new concept", "new + training, by parts of the body", "new + training"
+LAST, LAST_BOTH = "new concept, last states", "new + training, last states"
+METHODS = (
+    ("**over time with modes**", "FTL-IGM", "with modes over time", 1),
+    ("**over time with an adapter**", "FTL-IGM", "over time with adapter", 1),
+    ("form chosen", "FTL-IGM", "over time form chosen", 1),
+    ("over time, one set", "FTL-IGM", "over time", 1),
+    ("one set for the whole plan, K = 2", "FTL-IGM", "", 2),
+    ("the same with modes", "FTL-IGM", "with modes", 2),
+    ("LoRA fine-tuning", "LoRA fine-tuning", "", 1),
+    ("language", "language", "", 0),
+    ("BC", "BC", "", 1),
+    ("CVAE", "CVAE", "", 1),
+    ("in-context", "in-context", "", 0),
+    ("*demonstrations replayed*", "demonstrations replayed", "", 0),
+    ("*frozen frame*", "frozen frame", "", 0),
+)
+"""What a row is called; method, form and K of its results."""
+
+
+def cell(values: "pd.Series[float]", digits: int = 2) -> str:
+    """Mean over seeds, and the spread over them in brackets; a dash where there are none."""
+    if values.empty:
+        return "-"
+    spread = f" ({values.std(ddof=0):.{digits}f})" if len(values) > 1 and digits else ""
+    return f"{values.mean():.{digits}f}{spread}"
+
+
+def selected(rows: pd.DataFrame, method: str, form: str, components: int) -> pd.DataFrame:
+    """Rows of a method in a form, that are not of the protocol."""
+    fitting = (rows["method"] == method) & (rows["form"] == form) & (rows["K"] == components)
+    return rows[fitting & ~rows["setting"].isin((LAST, LAST_BOTH))]
+
+
+def values(rows: pd.DataFrame, setting: str, task: str, metric: str) -> "pd.Series[float]":
+    """One value for each seed."""
+    found = rows[(rows["setting"] == setting) & (rows["task"] == task) & (rows["metric"] == metric)]
+    return found.groupby("seed")["value"].mean()
+
+
+def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines))
+
+
+def new_concepts(rows: pd.DataFrame, task: str, columns: Sequence[tuple[str, str, int]]) -> str:
+    """A line for each method.
+
+    Args:
+        rows: of the results.
+        task: the concept.
+        columns: name, metric and digits of each.
+    """
+    lines = []
+    for name, method, form, components in METHODS:
+        own = selected(rows, method, form, components)
+        line = [cell(values(own, NEW, task, metric), digits) for _, metric, digits in columns]
+        if set(line) != {"-"}:
+            lines.append([name, *line])
+    return table([f"{task} from new initial poses", *(name for name, *_ in columns)], lines)
+
+
+def compositions(rows: pd.DataFrame) -> str:
+    """What the judge says of arms and trunk, and of the legs."""
+    tasks = [f"{concept} + {other}" for concept in (JACKS, CIRCLE) for other in ("walk", "jump")]
+    lines = []
+    for name, method, form, components in METHODS:
+        own = selected(rows, method, form, components)
+        line = [cell(values(own, setting, task, "accuracy")) for setting in (PARTS, WHOLE) for task in tasks]
+        if set(line) != {"-"}:
+            lines.append([name, *line])
+    head = [*(f"{task}, by parts" for task in tasks), *(f"{task}, whole body" for task in tasks)]
+    return table(["compositions, judge", *head], lines)
+
+
+def protocol(rows: pd.DataFrame) -> str:
+    """The paper's form of the concept from the demonstrations' last states."""
+    own = rows[(rows["method"] == "FTL-IGM") & rows["setting"].isin((LAST, LAST_BOTH))]
+    lines = []
+    for (components, shown), part in own.groupby(["K", "demonstrations"]):
+        alone = [cell(values(part, LAST, task, metric)) for task in (JACKS, CIRCLE) for metric in ("rule", "accuracy")]
+        both = [
+            cell(values(part, LAST_BOTH, f"{task} + {other}", "accuracy")) for task in (JACKS, CIRCLE) for other in ("walk", "jump")
+        ]
+        lines.append([f"K = {components}, {shown} demonstrations", *alone, *both])
+    head = [f"{task}, {said}" for task in (JACKS, CIRCLE) for said in ("rule", "judge")]
+    head += [f"{task} + {other}, judge" for task in (JACKS, CIRCLE) for other in ("walk", "jump")]
+    return table(["the paper's form of the concept, from last states", *head], lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=Path("results/mocap.csv"))
+    parser.add_argument("--out", type=Path, default=Path("results/mocap.md"))
+    chosen = parser.parse_args(arguments)
+    rows = pd.read_csv(chosen.results, keep_default_na=False, na_values={"value": [""]})
+    rows["K"] = rows["K"].replace("", 0).astype(int)
+    jacks = (
+        ("rule", "rule", 2),
+        ("level starts", "level", 2),
+        ("strides", "strides", 2),
+        ("feet in time", "feet in time", 2),
+        ("hands, m", "amplitude of hands", 2),
+        ("feet, m", "amplitude of feet", 2),
+        ("judge", "accuracy", 2),
+        ("jerk", "jerk", 0),
+    )
+    circle = (
+        ("rule", "rule", 2),
+        ("level starts", "level", 2),
+        ("strides", "strides", 2),
+        ("degrees turned", "degrees turned", 0),
+        ("judge", "accuracy", 2),
+        ("jerk", "jerk", 0),
+    )
+    parts = [new_concepts(rows, JACKS, jacks), new_concepts(rows, CIRCLE, circle), compositions(rows), protocol(rows)]
+    write_text(chosen.out, "\n\n".join(parts) + "\n")
+
+
+if __name__ == "__main__":
+    main()
