@@ -66,7 +66,8 @@ class _Report:
         labels = len({one["label"] for one in self.kept.values()})
         yield f"kept: {counted(len(self.kept), 'trial')}, {frames} frames at 30 a second, {counted(labels, 'description')}"
         if cuts := {name: one["glitches"] for name, one in self.kept.items() if one["glitches"]}:
-            yield f"kept, cut where a joint is too fast: {counted(len(cuts), 'trial')}, {counted(sum(map(int, cuts.values())), 'frame')}"
+            told = f"{counted(len(cuts), 'trial')}, {counted(sum(map(int, cuts.values())), 'frame')}"
+            yield f"kept, cut where a joint is too fast: {told}"
         if parts := {name: one["too short"] for name, one in self.kept.items() if one["too short"] and name not in self.left_out}:
             told = f"{counted(sum(map(int, parts.values())), 'frame')} of {counted(len(parts), 'trial')}"
             yield f"of these, left out as pieces shorter than {HORIZON} frames: {told}"

@@ -244,7 +244,7 @@ def _validation_trials(found: Sequence[Piece]) -> frozenset[int]:
 
 
 def left_out(every: Recordings) -> dict[int, str]:
-    """Trials that pretraining sees nothing of, by their numbers, and why; those of which it leaves out a part are not among them."""
+    """Trials that pretraining sees nothing of, by their numbers, and why."""
     found = _training_pieces(every)
     validation, used = _validation_trials(found), {piece.trial for piece in found}
     reasons = {}
