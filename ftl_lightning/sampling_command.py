@@ -152,12 +152,18 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
 
 
 def _export_files(export: str, count: int) -> list[Path]:
-    """One for each sample, numbered where there are several; refused before anything is generated where one cannot be written."""
+    """One for each sample, numbered where there are several.
+
+    Raises:
+        UserError: before anything is generated, where one of them is there and no file.
+    """
     from ftl_lightning.targets import expect_file
 
+    if not export:
+        return []
     path, digits = Path(export), len(str(count - 1))
-    numbered = [path.with_stem(f"{path.stem}_{number:0{digits}}") for number in range(count)] if count > 1 else [path]
-    for one in (files := numbered if export else []):
+    files = [path.with_stem(f"{path.stem}_{number:0{digits}}") for number in range(count)] if count > 1 else [path]
+    for one in files:
         expect_file(one, "export")
     return files
 

@@ -163,6 +163,8 @@ def test_samples_are_exported_each_to_a_file(tmp_path: Path, capsys: pytest.Capt
         assert float((found - as_joints(plan)).abs().max()) < 1e-3
     assert main([*told, "--count", "1", "--export", str(tmp_path / "one.bvh")]) == 0
     assert sorted(path.name for path in tmp_path.glob("*.bvh")) == ["one.bvh"]
+    assert main([*told, "--count", "11", "--export", "many.bvh"]) == 0
+    assert sorted(path.name for path in Path().glob("*.bvh"))[::10] == ["many_00.bvh", "many_10.bvh"]
 
 
 @pytest.mark.parametrize(
