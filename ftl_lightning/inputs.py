@@ -79,7 +79,7 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
     "check": {"figure": _written("figure")},
     "encode": _OUT,
-    "sample": {**_OUT, "figure": _written("figure"), "animation": _written("animation")},
+    "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT)},
     "prepare": _FOLDER,

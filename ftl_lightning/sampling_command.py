@@ -41,6 +41,8 @@ class SampleOptions:
         replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 for what the settings name.
         settings: configuration file of invert that says how to sample and how often to plan anew; empty for that of the domain.
         animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
+        export: file to write each sample to for other programs, in domains that can: .bvh of human motion, for Blender. Of several
+            samples each has its own file, with its number: "walk.bvh" becomes walk_0.bvh, walk_1.bvh and so on.
     """
 
     pretrained: str
@@ -58,6 +60,7 @@ class SampleOptions:
     execute: bool = False
     replan: int = 0
     animation: str = ""
+    export: str = ""
     settings: str = ""
 
     def __post_init__(self) -> None:
@@ -78,7 +81,7 @@ def sample(options: SampleOptions) -> None:
 
     from ftl_lightning.evaluation.animation import captioned, gif
     from ftl_lightning.few_shot import FewShot
-    from ftl_lightning.tensor_file import atomic
+    from ftl_lightning.tensor_file import atomic, write_text
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     text = " + ".join(part for part in (options.compose, options.concept) if part)
@@ -87,6 +90,7 @@ def sample(options: SampleOptions) -> None:
     composition = model.compose(text) if known is None else known
     goal, film = options.goal, model.domain.show.film
     starts = _sample_starts(options, model.domain)
+    exported = _export_files(options.export, options.count if starts is None else len(starts))
     plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))
     told = {**plans.provenance, "concept": options.concept, "compose": options.compose}
     plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)
@@ -99,6 +103,10 @@ def sample(options: SampleOptions) -> None:
         with atomic(options.figure) as temporary:
             model.render(plans, goal).savefig(temporary, dpi=110)
         say(options.figure)
+    for path, states in zip(exported, plans.states, strict=False):
+        write_text(path, model.domain.show.exports[path.suffix](states))
+    if exported:
+        say(exported[0] if len(exported) == 1 else f"{exported[0]} to {exported[-1].name}")
     if options.execute and starts is not None:
         done = model.execute(composition, starts, goal, replan=options.replan or None, seed=options.seed, **_sampling(options))
         for name, value in done.outcomes.items():
@@ -127,6 +135,10 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
         domain.expect_goal(options.goal)
     if options.animation and options.execute and domain.closed_loop and domain.closed_loop.film is None:
         raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
+    if options.export and Path(options.export).suffix not in domain.show.exports:
+        known = " or ".join(domain.show.exports)
+        told = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"
+        raise UserError(f"export: expected {told}, found {options.export!r}")
     if options.execute and domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     if options.execute and domain.closed_loop is not None:
@@ -137,6 +149,23 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
         raise UserError(
             f"goal, initial: expected a task or a demonstrations file to start from (domain {domain.name}), found neither"
         )
+
+
+def _export_files(export: str, count: int) -> list[Path]:
+    """One for each sample, numbered where there are several.
+
+    Raises:
+        UserError: before anything is generated, where one of them is there and no file.
+    """
+    from ftl_lightning.targets import expect_file
+
+    if not export:
+        return []
+    path, digits = Path(export), len(str(count - 1))
+    files = [path.with_stem(f"{path.stem}_{number:0{digits}}") for number in range(count)] if count > 1 else [path]
+    for one in files:
+        expect_file(one, "export")
+    return files
 
 
 def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":

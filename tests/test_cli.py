@@ -431,6 +431,7 @@ def test_modes_and_tolerances_that_are_none_are_one_clear_line(
         (["sample", "--pretrained=object_rearrangement", "--out=pipe.safetensors"], "out"),
         (["sample", "--pretrained=object_rearrangement", "--figure=pipe.safetensors"], "figure"),
         (["sample", "--pretrained=object_rearrangement", "--animation", "link"], "animation"),
+        (["sample", "--pretrained=mocap", "--export=pipe.safetensors"], "export"),
         (["encode", "object_rearrangement", "--out=folder"], "out"),
         (["report", "--out=pipe.safetensors"], "out"),
         (["fit", "--config", PRETRAINING, "--model.output=pipe.safetensors"], "model.output"),

@@ -164,12 +164,15 @@ class Show:
             of its size; ``None`` where a plan cannot be drawn in this way.
         beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title) -> figure`` of both on one scale;
             ``None`` for one picture above the other.
+        exports: by the ending of a file, such as ``'.bvh'``, ``states (horizon, state) -> text`` of one plan for other programs
+            (``sample --export``); empty where none reads such behaviour.
     """
 
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
     wireframe: Callable[[Tensor], "Wireframe"] | None = None
     beside: Callable[[Tensor, Tensor, str], "Figure"] | None = None
+    exports: Mapping[str, Callable[[Tensor], str]] = field(default_factory=dict)
 
 
 def line_drawings(plans: Plans) -> Show:

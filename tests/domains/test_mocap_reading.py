@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,13 @@ from ftl_lightning.cli import main
 from ftl_lightning.domains.mocap.asf_amc import INCH, JOINT_BONES, read_amc, read_asf
 from ftl_lightning.domains.mocap.bvh import METRES, NODES, read_bvh
 from ftl_lightning.domains.mocap.normalise import normalised, z_up
-from ftl_lightning.domains.mocap.prepare import REPORT, prepare
+from ftl_lightning.domains.mocap.prepare import LEFT_OUT, REPORT, prepare
 from ftl_lightning.domains.mocap.recordings import FILE, Recordings, read_folder
 from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
+from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.errors import UserError
-from tests.domains.mocap_samples import BONES, amc, asf, database, swing
+from tests.domains.mocap_samples import BONES, amc, asf, database, motion, recordings, swing
 
 UNIT = INCH / 0.45
 WALK, TURN = {"02_01": "walk"}, {"02_01": "walk", "02_02": "Walk, Veer_Left"}
@@ -122,7 +124,7 @@ def test_a_database_becomes_one_file_and_a_report(tmp_path: Path) -> None:
     assert "mocap.cs.cmu.edu" in text
     report = json.loads((tmp_path / "out" / REPORT).read_text())
     assert report["kept"]["02_02"] == {
-        "label": "walk, veer left", "kind": "asf_amc", "file": "02_02.amc", "frames": 40, "glitches": 0,
+        "label": "walk, veer left", "kind": "asf_amc", "file": "02_02.amc", "frames": 40, "glitches": 0, "too short": 0,
     }  # fmt: skip
 
 
@@ -136,7 +138,7 @@ def test_the_command_line_prepares(tmp_path: Path, capsys: pytest.CaptureFixture
     domain = "ftl_lightning.domains.mocap:DOMAIN"
     assert main(["prepare", domain, "--root", str(folder), "--out", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / FILE).is_file()
-    assert "kept: 1 trials" in capsys.readouterr().out
+    assert "kept: 1 trial" in capsys.readouterr().out
     assert main(["prepare", domain]) == 2
     assert "error: root: expected a folder with your copy of the database, found none" in capsys.readouterr().err
     assert main(["prepare", "agent"]) == 2
@@ -155,13 +157,51 @@ def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
     (folder / "readme.amc").write_text("")
     text = prepare(folder)
     assert "kept: 2 trials" in text
-    assert "dropped, description that is no training concept: 1 (02_03 (juggling))" in text
-    assert "dropped, no description in the index: 1 (02_04)" in text
-    assert "dropped, shorter than 128 frames: 1 (02_05 (100 frames))" in text
+    assert "dropped: 7 files\n     1  " in text
+    assert "     1  description that is no training concept: 02_03 (juggling)\n" in text
+    assert "     1  no description in the index: 02_04\n" in text
+    assert "     1  shorter than 128 frames: 02_05 (100 frames)\n" in text
     assert "02_06.amc: line 15: expected numbers, found 'lradius zero'" in text
-    assert "dropped, less than 32 frames without glitches: 1 (02_07 (of 40))" in text
-    assert "dropped, no skeleton of the subject: 1 (05_08 (05.asf))" in text
-    assert "dropped, file not named after a trial, such as 13_29.amc: 1 (readme.amc)" in text
+    assert "     1  less than 32 frames without glitches: 02_07 (of 40)\n" in text
+    assert "     1  no skeleton of the subject: 05_08 (05.asf)\n" in text
+    assert "     1  file not named after a trial, such as 13_29.amc: readme.amc\n" in text
+    assert f"or left out: {folder / REPORT}" in text
+    assert len(json.loads((folder / REPORT).read_text())["dropped"]) == 7
+
+
+def test_a_file_of_a_trial_that_was_read_from_another_is_told(tmp_path: Path) -> None:
+    folder = database(tmp_path, WALK)
+    (folder / "02_01.mb.bvh").write_text("not looked at")
+    assert "     1  trial that was read from another file: 02_01.mb.bvh (02_01 from 02_01.amc)\n" in prepare(folder)
+
+
+def test_what_pretraining_leaves_out_is_told_with_its_reason(tmp_path: Path) -> None:
+    fast = motion(100, 1)
+    fast[[30, 60, 80]] += 1.0  # three glitches leave pieces of 30, 29, 19 and 19 frames
+    cut = motion(100, 2)
+    cut[50:] += 1.0
+    cut[75:] += 1.0
+    made = {f"02_{number:02}": ("walk", motion(40, number)) for number in (1, 2, 3)}
+    made |= {"13_29": ("jumping jacks, side twists, bend over, squats", motion(100, 4))}
+    made |= {"05_01": ("juggling", motion(40, 5)), "05_02": ("run", fast), "05_03": ("jump", cut), "05_04": ("run", motion(40, 6))}
+    whole = recordings(made)
+    replace(whole, kind=(*whole.kind[:-1], "bvh_daz")).save(tmp_path / "cmu14_trials.npz")
+    text = prepare(tmp_path, tmp_path / "out")
+    assert "kept: 8 trials" in text
+    assert "of these, left out as pieces shorter than 32 frames: 50 frames of 1 trial\n" in text
+    assert "dropped: 0 files\nkept, but left out of pretraining: 5 trials\n" in text
+    assert "     1  another figure than the subject's own (bvh_daz): 05_04 (run)\n" in text
+    report = json.loads((tmp_path / "out" / REPORT).read_text())
+    assert {trial: one["reason"] for trial, one in report[LEFT_OUT].items()} == {
+        "02_03": "held out for validation",
+        "05_01": "description that is no training concept",
+        "05_02": "no piece of 32 frames without glitches",
+        "05_04": "another figure than the subject's own (bvh_daz)",
+        "13_29": "held out whole, as it shows a new concept",
+    }
+    trained = set(Recorded(tmp_path / "out").split("train", 0, 0).provenance["trials"])
+    assert trained == report["kept"].keys() - report[LEFT_OUT].keys()
+    assert report["kept"]["05_03"]["too short"] == 50
 
 
 def test_a_glitch_cuts_a_trial_and_does_not_drop_it(tmp_path: Path) -> None:
@@ -170,7 +210,7 @@ def test_a_glitch_cuts_a_trial_and_does_not_drop_it(tmp_path: Path) -> None:
     for frame in frames[200:]:
         frame["thorax"] = "170 0 0"
     (folder / "02_01.amc").write_text(amc(frames))
-    assert "kept, cut where a joint is too fast: 1 trials, 1 frames" in prepare(folder)
+    assert "kept, cut where a joint is too fast: 1 trial, 1 frame" in prepare(folder)
 
 
 def test_first_frames_that_lie_on_the_floor_are_left_out(tmp_path: Path) -> None:
@@ -184,7 +224,7 @@ def test_an_index_as_text_will_do(tmp_path: Path) -> None:
     folder = database(tmp_path, WALK)
     (folder / "cmu-mocap-index.csv").unlink()
     (folder / "cmu-mocap-index-text.txt").write_text("Subject #2\n\n02_01\twalk\n")
-    assert "kept: 1 trials" in prepare(folder)
+    assert "kept: 1 trial" in prepare(folder)
 
 
 def test_recordings_that_are_there_are_listed_and_copied(tmp_path: Path) -> None:

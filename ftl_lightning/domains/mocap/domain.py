@@ -48,7 +48,12 @@ DOMAIN = Domain(
     ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS}"),
     references={"frozen frame": _frozen},
     views=VIEWS,
-    show=Show(*(deferred(f"{_DRAWING}:{name}") for name in ("picture", "film", "wireframe"))),
+    show=Show(
+        deferred(f"{_DRAWING}:picture"),
+        deferred(f"{_DRAWING}:film"),
+        deferred(f"{_DRAWING}:wireframe"),
+        exports={".bvh": deferred("ftl_lightning.domains.mocap.export:bvh")},
+    ),
     prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
     fresh=False,  # there is no more behaviour than what was recorded
 )

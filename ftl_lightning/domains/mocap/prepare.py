@@ -19,14 +19,17 @@ from ftl_lightning.domains.mocap.normalise import Poses, every, normalised, z_up
 from ftl_lightning.domains.mocap.recordings import FILE, FILES, THANKS, WHERE, Recordings
 from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments
 from ftl_lightning.domains.mocap.skeleton import HORIZON, JOINTS, RIGID
-from ftl_lightning.domains.mocap.source import glitches, pieces
+from ftl_lightning.domains.mocap.source import glitches, left_out, pieces, too_short
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, TRAINING_CONCEPTS, cleaned
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.progress import bar
+from ftl_lightning.representation import counted
 from ftl_lightning.tensor_file import write_text
 
 REPORT = "recordings.json"
+LEFT_OUT = "left out of pretraining"
+"""Key of the report: trials that are kept for learning, judging or validation alone."""
 INDEXES = ("cmu-mocap-index.csv", "cmu-mocap-index-text.txt")
 """Names of B. Hahne's index of descriptions, as a spreadsheet or as text; the first one found is read."""
 SLOW = ("60", "61", "75", "87", "88", "89")
@@ -51,32 +54,46 @@ class _Dropped(Exception):
 
 @dataclass
 class _Report:
-    """What became of each file."""
+    """What became of each file, and which trials are kept, but not pretrained on."""
 
     kept: dict[str, dict[str, str | int]] = field(default_factory=dict)
     dropped: dict[str, dict[str, str]] = field(default_factory=dict)
+    left_out: dict[str, dict[str, str]] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
 
     def lines(self) -> Iterable[str]:
         frames = sum(int(one["frames"]) for one in self.kept.values())
         labels = len({one["label"] for one in self.kept.values()})
-        yield f"kept: {len(self.kept)} trials, {frames} frames at 30 a second, {labels} descriptions"
+        yield f"kept: {counted(len(self.kept), 'trial')}, {frames} frames at 30 a second, {counted(labels, 'description')}"
         if cuts := {name: one["glitches"] for name, one in self.kept.items() if one["glitches"]}:
-            yield f"kept, cut where a joint is too fast: {len(cuts)} trials, {sum(map(int, cuts.values()))} frames"
-        for reason, count in Counter(one["reason"] for one in self.dropped.values()).most_common():
-            own = [(name, one["told"]) for name, one in self.dropped.items() if one["reason"] == reason]
-            told = ", ".join(f"{name} ({text})" if text else name for name, text in own[:EXAMPLES])
-            yield f"dropped, {reason}: {count} ({told}{', ...' if count > EXAMPLES else ''})"
+            told = f"{counted(len(cuts), 'trial')}, {counted(sum(map(int, cuts.values())), 'frame')}"
+            yield f"kept, cut where a joint is too fast: {told}"
+        if parts := {name: one["too short"] for name, one in self.kept.items() if one["too short"] and name not in self.left_out}:
+            told = f"{counted(sum(map(int, parts.values())), 'frame')} of {counted(len(parts), 'trial')}"
+            yield f"of these, left out as pieces shorter than {HORIZON} frames: {told}"
+        yield from _counted(f"dropped: {counted(len(self.dropped), 'file')}", self.dropped)
+        yield from _counted(f"kept, but left out of pretraining: {counted(len(self.left_out), 'trial')}", self.left_out)
 
     def text(self) -> str:
         """As JSON."""
-        return json.dumps({"kept": self.kept, "dropped": self.dropped, "thanks": THANKS}, indent=1) + "\n"
+        content = {"kept": self.kept, "dropped": self.dropped, LEFT_OUT: self.left_out, "thanks": THANKS}
+        return json.dumps(content, indent=1) + "\n"
+
+
+def _counted(what: str, trials: Mapping[str, Mapping[str, str]]) -> Iterable[str]:
+    """A table of reasons, the most frequent first, each with its number of trials and a few of them."""
+    yield what
+    for reason, count in Counter(one["reason"] for one in trials.values()).most_common():
+        own = [(name, one["told"]) for name, one in trials.items() if one["reason"] == reason]
+        told = ", ".join(f"{name} ({text})" if text else name for name, text in own[:EXAMPLES])
+        yield f"{count:6}  {reason}: {told}{', ...' if count > EXAMPLES else ''}"
 
 
 def prepare(root: Path | None, out: Path | None = None) -> str:
     """Read a folder with the database's ASF and AMC files, or BVH files, at any depth, and write ``recordings.npz``.
 
-    Beside it stands ``recordings.json``: what was kept, and what was dropped and why. A folder that holds recordings already is
-    checked.
+    Beside it stands ``recordings.json``: what was kept, what was dropped and why, and what is kept but not pretrained on and why. A
+    folder that holds recordings already is checked.
 
     Args:
         root: the folder, with B. Hahne's index of descriptions (:data:`INDEXES`), and maybe ``segments.csv``.
@@ -102,13 +119,15 @@ def prepare(root: Path | None, out: Path | None = None) -> str:
     if (own := root / SEGMENTS).is_file():
         read_segments(own)
     report = _Report()
-    recordings = _read(root, motions, report) if motions else _listed(Recordings.load(ready or root / FILE), report)
+    recordings = _read(root, motions, report) if motions else Recordings.load(ready or root / FILE)
+    _list(recordings, report)
     if motions or out / FILE != ready:
         recordings.save(out / FILE)
     write_text(out / REPORT, report.text())
     if own.is_file() and out.resolve() != root.resolve():
         shutil.copyfile(own, out / SEGMENTS)
-    return "\n".join((*report.lines(), f"written to {out / FILE}, all reasons to {out / REPORT}", THANKS))
+    written = f"recordings: {out / FILE}; every trial, with its reason where it is dropped or left out: {out / REPORT}"
+    return "\n".join((*report.lines(), written, THANKS))
 
 
 def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
@@ -120,13 +139,16 @@ def _read(root: Path, motions: list[Path], report: _Report) -> Recordings:
         for path in sorted(motions, key=lambda path: path.suffix.lower()):  # AMC before BVH of the same trial
             named = _TRIAL.match(path.name)
             trial = named[1] if named else path.name
-            if trial not in found:
+            if trial in found:
+                told = f"{trial} from {report.files[trial]}"
+                report.dropped[path.name] = {"reason": "trial that was read from another file", "told": told}
+            else:
                 report.dropped.pop(trial, None)
                 try:
                     if named is None:
                         raise _Dropped("file not named after a trial, such as 13_29.amc")
                     found[trial] = _trial(path, trial, descriptions.get(trial, ""), skeletons)
-                    report.kept[trial] = _told(descriptions[trial], found[trial][1], path.name, _states(found[trial][0]))
+                    report.files[trial] = path.name
                 except _Dropped as dropped:
                     report.dropped[trial] = {"reason": dropped.reason, "told": dropped.told}
             advance()
@@ -182,16 +204,21 @@ def _states(poses: Poses) -> NDArray[np.float32]:
     return poses.positions.astype(np.float32).reshape(-1, 3 * len(JOINTS))
 
 
-def _told(label: str, kind: str, file: str, states: NDArray[np.float32]) -> dict[str, str | int]:
-    return {"label": label, "kind": kind, "file": file, "frames": len(states), "glitches": len(glitches(states))}
-
-
-def _listed(recordings: Recordings, report: _Report) -> Recordings:
-    """Recordings that are there already, as they are."""
+def _list(recordings: Recordings, report: _Report) -> None:
+    """Tell what was kept, and what of it pretraining leaves out."""
+    reasons = left_out(recordings)
     for number, trial in enumerate(recordings.trial_id):
-        told = _told(recordings.label[number], recordings.kind[number], "", recordings.trial(number))
-        report.kept[trial if trial not in report.kept else f"{trial} ({number})"] = told
-    return recordings
+        name, states = trial if trial not in report.kept else f"{trial} ({number})", recordings.trial(number)
+        report.kept[name] = {
+            "label": recordings.label[number],
+            "kind": recordings.kind[number],
+            "file": report.files.get(trial, ""),
+            "frames": len(states),
+            "glitches": len(glitches(states)),
+            "too short": too_short(states),
+        }
+        if reason := reasons.get(number):
+            report.left_out[name] = {"reason": reason, "told": recordings.label[number]}
 
 
 @cache

@@ -181,25 +181,12 @@ class Recorded:
     @cached_property
     def _pieces(self) -> list[Piece]:
         """Those of training concepts, in the order of the trials."""
-        found, every = [], self.recordings
-        for trial in range(len(every)):
-            if (
-                every.label[trial] not in TRAINING_CONCEPTS
-                or every.trial_id[trial] in HELD_OUT
-                or every.kind[trial] in OTHER_FIGURES
-            ):
-                continue
-            found += [Piece(trial, every.label[trial], states) for states in pieces(every.trial(trial))]
-        return found
+        return _training_pieces(self.recordings)
 
     @cached_property
     def _validation(self) -> frozenset[int]:
         """Trials that are held out for validation."""
-        trials: dict[str, list[int]] = {}
-        for piece in self._pieces:
-            if piece.trial not in (known := trials.setdefault(piece.concept, [])):
-                known.append(piece.trial)
-        return frozenset(trial for known in trials.values() if len(known) > 2 for trial in known[::-10])
+        return _validation_trials(self._pieces)
 
     def _shown(self, task: str) -> list[Piece]:
         """What subjects show of a new concept."""
@@ -228,6 +215,51 @@ class Recorded:
             per_step=(POSE,),
             provenance={"generator": NAME, "trials": trials, **provenance},
         )
+
+
+def _no_training(every: Recordings, trial: int) -> str:
+    """Why a trial is none of those that training and validation take; empty for one of them."""
+    if every.trial_id[trial] in HELD_OUT:
+        return "held out whole, as it shows a new concept"
+    if every.label[trial] not in TRAINING_CONCEPTS:
+        return "description that is no training concept"
+    if every.kind[trial] in OTHER_FIGURES:
+        return f"another figure than the subject's own ({every.kind[trial]})"
+    return ""
+
+
+def _training_pieces(every: Recordings) -> list[Piece]:
+    """Pieces of trials that training and validation take, in the order of the trials."""
+    wanted = [trial for trial in range(len(every)) if not _no_training(every, trial)]
+    return [Piece(trial, every.label[trial], states) for trial in wanted for states in pieces(every.trial(trial))]
+
+
+def _validation_trials(found: Sequence[Piece]) -> frozenset[int]:
+    """Of the trials of each concept with three or more, the last one, the eleventh last and so on."""
+    trials: dict[str, list[int]] = {}
+    for piece in found:
+        if piece.trial not in (known := trials.setdefault(piece.concept, [])):
+            known.append(piece.trial)
+    return frozenset(trial for known in trials.values() if len(known) > 2 for trial in known[::-10])
+
+
+def left_out(every: Recordings) -> dict[int, str]:
+    """Trials that pretraining sees nothing of, by their numbers, and why."""
+    found = _training_pieces(every)
+    validation, used = _validation_trials(found), {piece.trial for piece in found}
+    reasons = {}
+    for trial in range(len(every)):
+        short = "" if trial in used else f"no piece of {HORIZON} frames without glitches"
+        held_out = "held out for validation" if trial in validation else ""
+        if reason := _no_training(every, trial) or short or held_out:
+            reasons[trial] = reason
+    return reasons
+
+
+def too_short(states: NDArray[np.float32]) -> int:
+    """Frames of a trial ``(frame, 42)`` in pieces that are shorter than a window."""
+    ends = pairwise((0, *glitches(states), len(states)))
+    return sum(stop - start for start, stop in ends if stop - start < HORIZON)
 
 
 def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[Tensor]:

@@ -1,0 +1,206 @@
+"""Motion as BVH files: read back by forward kinematics of their own, as Blender reads them."""
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.mocap import skeleton
+from ftl_lightning.domains.mocap.export import HIPS, TREE, bvh
+from ftl_lightning.domains.mocap.recordings import read_folder
+from ftl_lightning.domains.mocap.skeleton import as_joints
+from ftl_lightning.domains.mocap.standing import standing_poses
+from ftl_lightning.domains.mocap.views import with_rigid_bones
+from ftl_lightning.errors import UserError
+from tests.conftest import ROOT
+from tests.domains.test_mocap_rendering import waving
+
+SHIPPED = ROOT / "pretrained" / "mocap"
+JACKS = SHIPPED / "jumping_jacks.safetensors"
+ENDS = {
+    "RightLeg": skeleton.R_ANKLE,
+    "LeftLeg": skeleton.L_ANKLE,
+    "RightForeArm": skeleton.R_WRIST,
+    "LeftForeArm": skeleton.L_WRIST,
+}
+
+
+def rotation(axis: str, degrees: float) -> NDArray[np.float64]:
+    angle = math.radians(degrees)
+    one, other = {"X": (1, 2), "Y": (2, 0), "Z": (0, 1)}[axis]
+    turn = np.eye(3)
+    turn[one, one] = turn[other, other] = math.cos(angle)
+    turn[one, other], turn[other, one] = -math.sin(angle), math.sin(angle)
+    return turn
+
+
+def read(text: str) -> tuple[dict[str, NDArray[np.float64]], float]:
+    """Where joints and end sites are ``(frame, 3)`` by name, the latter with ``.end``, and seconds a frame.
+
+    Positions of a joint stand in place of its offset.
+    """
+    head, motion = text.split("MOTION\n")
+    found: list[tuple[str, int, list[float], list[str]]] = []
+    path: list[int] = []
+    for words in map(str.split, head.splitlines()):
+        match words:
+            case ["ROOT" | "JOINT", name]:
+                found.append((name, path[-1] if path else -1, [], []))
+            case ["End", "Site"]:
+                found.append((f"{found[path[-1]][0]}.end", path[-1], [], []))
+            case ["{"]:
+                path.append(len(found) - 1)
+            case ["}"]:
+                path.pop()
+            case ["OFFSET", *numbers]:
+                found[path[-1]][2].extend(map(float, numbers))
+            case ["CHANNELS", count, *channels]:
+                assert int(count) == len(channels)
+                found[path[-1]][3].extend(channels)
+    assert not path
+    frames, seconds, *rows = motion.splitlines()
+    assert int(frames.removeprefix("Frames: ")) == len(rows)
+    places: dict[str, list[NDArray[np.float64]]] = {name: [] for name, *_ in found}
+    for row in rows:
+        values = iter(map(float, row.split()))
+        turns, at = [], []
+        for name, parent, offset, channels in found:
+            own, turn = np.array(offset), np.eye(3)
+            for channel in channels:
+                if channel.endswith("position"):
+                    own["XYZ".index(channel[0])] = next(values)
+                else:
+                    turn = turn @ rotation(channel[0], next(values))
+            at.append(at[parent] + turns[parent] @ own if parent >= 0 else own)
+            turns.append(turns[parent] @ turn if parent >= 0 else turn)
+            places[name].append(at[-1])
+        assert next(values, None) is None
+    return {name: np.stack(own) for name, own in places.items()}, float(seconds.removeprefix("Frame Time: "))
+
+
+def joints(text: str) -> Tensor:
+    """Joints ``(frame, 14, 3)`` of a file, in the domain's axes."""
+    places, _ = read(text)
+    found = [places[f"{name}.end"] for name in ENDS] + [places[joint.name] for joint in TREE if joint.place != HIPS]
+    numbers = [*ENDS.values(), *(joint.place for joint in TREE if joint.place != HIPS)]
+    x, y, z = np.moveaxis(np.stack(found, axis=1)[:, np.argsort(numbers)], -1, 0)
+    return torch.from_numpy(np.stack((-x, z, y), axis=-1)).float()
+
+
+def far(states: Tensor) -> float:
+    """Metres by which a joint is elsewhere in the file, at most."""
+    return float(torch.linalg.vector_norm(joints(bvh(states)) - as_joints(states), dim=-1).max())
+
+
+def wild(frames: int, seed: int) -> Tensor:
+    """Somebody whose every joint goes anywhere ``(frames, 42)``, with rigid bones, turned by any angle."""
+    draw = torch.Generator().manual_seed(seed)
+    (pose,) = standing_poses(1, draw)
+    states = pose + 0.4 * torch.randn(frames, 42, generator=draw).cumsum(dim=0)
+    return with_rigid_bones(states[None], {"pose": pose[None]})[0]
+
+
+def test_forward_kinematics_of_a_file_gives_the_joints_back() -> None:
+    for states in (waving(), standing_poses(1, torch.Generator().manual_seed(3)), wild(40, 0), wild(40, 1)):
+        rigid = with_rigid_bones(states[None], {"pose": states[:1]})[0]
+        assert far(rigid) < 1e-4
+
+
+def test_a_file_is_of_metres_y_up_facing_z_at_thirty_frames_a_second() -> None:
+    places, seconds = read(bvh(standing_poses(1, torch.Generator().manual_seed(0))))
+    assert seconds == pytest.approx(1 / 30, abs=1e-6)
+    assert 0.6 < places["Head"][0, 1] < 0.8
+    assert places["LeftUpLeg"][0, 0] > 0.08  # the person's left
+    assert places["Head"][0, 2] > 0.05  # the head is before the hips
+    assert np.allclose(places["Hips"], 0)
+
+
+def test_bones_have_the_first_frames_lengths_and_at_rest_somebody_stands() -> None:
+    states = standing_poses(1, torch.Generator().manual_seed(5))
+    text = bvh(states)
+    rows = text.splitlines()[-1].split()
+    still = text.replace(text.splitlines()[-1], " ".join("0" if abs(float(one)) < 1e-3 else one for one in rows))
+    assert float((joints(still) - as_joints(states)).abs().max()) < 1e-4  # it stands as it would at rest, and so nothing turns
+
+
+def test_an_arm_overhead_does_not_spin() -> None:
+    up = as_joints(standing_poses(1, torch.Generator().manual_seed(0)).repeat(30, 1)).clone()
+    for frame in range(30):  # round the place straight above the shoulder, close to it
+        around = 2 * math.pi * frame / 30
+        way = torch.tensor((0.02 * math.cos(around), 0.02 * math.sin(around), 1.0))
+        for shoulder, elbow, wrist in ((6, 7, 8), (9, 10, 11)):
+            up[frame, elbow], up[frame, wrist] = up[frame, shoulder] + 0.28 * way, up[frame, shoulder] + 0.5 * way
+    rows = [[float(number) for number in line.split()] for line in bvh(up.flatten(1)).splitlines()[-30:]]
+    assert np.abs(np.diff(rows, axis=0)).max() < 5  # degrees
+    assert far(up.flatten(1)) < 1e-3
+
+
+def test_half_a_turn_and_a_bone_without_a_direction_are_written() -> None:
+    (pose,) = standing_poses(1, torch.Generator().manual_seed(0))
+    states = torch.stack((pose, -pose, pose))
+    assert far(states) < 1e-4
+    gone = as_joints(states.clone())
+    gone[:, skeleton.R_ELBOW] = gone[:, skeleton.R_SHOULDER]
+    assert "nan" not in bvh(gone.flatten(1))
+    with pytest.raises(UserError, match="export: expected motion of finite numbers"):
+        bvh(states * math.nan)
+
+
+def test_samples_are_exported_each_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = ["sample", "--pretrained", str(SHIPPED), "--concept", str(JACKS), "--out", "jj.safetensors", "--steps", "2"]
+    assert main([*told, "--count", "3", "--export", str(tmp_path / "new" / "jj.bvh")]) == 0
+    assert "jj_0.bvh to jj_2.bvh" in capsys.readouterr().out
+    states = Demonstrations.load("jj.safetensors").states
+    for number, plan in enumerate(states):
+        found = joints((tmp_path / "new" / f"jj_{number}.bvh").read_text())
+        assert float((found - as_joints(plan)).abs().max()) < 1e-3
+    assert main([*told, "--count", "1", "--export", str(tmp_path / "one.bvh")]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.bvh")) == ["one.bvh"]
+    assert main([*told, "--count", "11", "--export", "many.bvh"]) == 0
+    assert sorted(path.name for path in Path().glob("*.bvh"))[::10] == ["many_00.bvh", "many_10.bvh"]
+
+
+@pytest.mark.parametrize(
+    ("export", "expected"),
+    [
+        ("jj.fbx", "error: export: expected a name that ends in .bvh, found 'jj.fbx'"),
+        ("taken.bvh", "error: export: taken_1.bvh: expected a file or nothing there, found a folder"),
+        ("jj.safetensors/jj.bvh", "error: export: jj.safetensors/jj.bvh: cannot be written"),
+        ("/proc/nowhere/jj.bvh", "error: export: /proc/nowhere/jj.bvh: cannot be written"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_before_anything_is_generated(
+    export: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("taken_1.bvh").mkdir()
+    Path("jj.safetensors").write_text("of the user")
+    told = ["--concept", str(JACKS), "--out", "out.safetensors", "--count", "2", "--export", export]
+    assert main(["sample", "--pretrained", str(SHIPPED), *told]) == 2
+    found = capsys.readouterr().err
+    assert found.startswith(expected)
+    assert found.count("\n") == 1
+    assert not Path("out.safetensors").exists()
+
+
+def test_a_domain_that_exports_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    told = ["--compose", "circle above square", "--export", "scene.bvh"]
+    assert main(["sample", "--pretrained", "object_rearrangement", *told]) == 2
+    told_error = "error: export: expected none, as nothing else reads plans of object_rearrangement, found 'scene.bvh'\n"
+    assert capsys.readouterr().err == told_error
+
+
+def test_recorded_motion_comes_back_too() -> None:
+    """Where recordings are named: those whose bones are rigid, as all that ``prepare`` keeps are."""
+    named = os.environ.get("FTL_LIGHTNING_DATA")
+    if not named:
+        pytest.skip("FTL_LIGHTNING_DATA names no folder of recordings")
+    recorded, _ = read_folder(Path(named))
+    for number in range(0, len(recorded), 9):
+        assert far(torch.from_numpy(recorded.trial(number)[:32])) < 1e-3
