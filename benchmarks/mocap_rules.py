@@ -1,0 +1,63 @@
+"""How often the rules of human motion hold in recordings: of the action, of other actions, and of what training concepts show.
+
+python benchmarks/mocap_rules.py --root FOLDER --out results/mocap_rules.json
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.domains.mocap.kinematics import RULES
+from ftl_lightning.domains.mocap.skeleton import HORIZON
+from ftl_lightning.domains.mocap.source import Recorded, pieces
+from ftl_lightning.tensor_file import write_text
+
+STRIDE = 8
+"""Frames between windows of the training concepts' trials."""
+
+
+def windows(states: Tensor, stride: int) -> list[Tensor]:
+    """As long as a plan, of ``(frame, 42)``."""
+    return [states[start : start + HORIZON] for start in range(0, len(states) - HORIZON + 1, stride)]
+
+
+def shown(source: Recorded, action: str) -> dict[str, Tensor]:
+    """All windows ``(window, 32, 42)`` of an action's segments by person."""
+    every, found = source.recordings, dict[str, list[Tensor]]()
+    for segment in source.segments:
+        if segment.label == action and segment.trial_id in every.trial_id:
+            trial = every.trial_id.index(segment.trial_id)
+            for states in pieces(every.trial(trial)[segment.start : segment.stop], longest=None):
+                found.setdefault(every.subject[trial], []).extend(windows(states, 1))
+    return {subject: torch.stack(own) for subject, own in found.items()}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, required=True, help="recordings, as `prepare mocap` leaves them")
+    parser.add_argument("--out", type=Path, default=Path("results/mocap_rules.json"))
+    chosen = parser.parse_args(arguments)
+    source = Recorded(chosen.root)
+    training = source.split("train", 0, 0)
+    half = range(len(training) // 2)  # the others are mirror images
+    others = torch.stack([one for row in half for one in windows(training.states[row, : int(training.lengths[row])], STRIDE)])
+    found = {}
+    for action, rule in RULES.items():
+        own = shown(source, action)
+        held = {subject: round(float(rule(states).float().mean()), 4) for subject, states in own.items()}
+        number = {subject: len(states) for subject, states in own.items()}
+        demonstrations = float(rule(source.draw(action, 5, 0).states).float().mean())
+        wrong = round(float(rule(others).float().mean()), 5)
+        found[action] = {"windows": number, "holds": held, "demonstrations": demonstrations, "training concepts": wrong}
+    text = json.dumps({"windows of training concepts": len(others), **found}, indent=1) + "\n"
+    print(text)
+    write_text(chosen.out, text)
+
+
+if __name__ == "__main__":
+    main()
