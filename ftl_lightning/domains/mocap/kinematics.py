@@ -25,7 +25,7 @@ from ftl_lightning.domains.mocap.skeleton import (
 STRIDE = 0.3
 """Metres between the ankles from which a pose is a stride; below it, a person stands level."""
 SETTLED = 12
-"""Frames after which a plan no longer comes from where it started; what the arms draw is judged from here on."""
+"""Frames after which a plan no longer comes from where it started; what goes together, and what arms draw, is judged from here."""
 OVERHEAD = -0.12
 """Metres above the top of the head that both wrists reach at once in jumping jacks; with bent arms they stay a little below."""
 OPENED, OPEN = 0.2, 0.4
@@ -34,11 +34,9 @@ HANGING = 0.15
 """Metres that the hands are below the shoulders at one time in jumping jacks."""
 IN_TIME = 0.6
 """Correlation of hands' height and feet's opening from which they go together, or one against the other."""
-ALIKE = 0.25
-"""Metres in height by which the hands differ at most in jumping jacks."""
 TURN = 240.0
 """Degrees that the arms turn at least in an arm circle, as a mean; each, two thirds of it."""
-WIDTH, ROUND = 0.12, 0.3
+WIDTH, ROUND = 0.12, 0.2
 """Metres that the wrists' path is wide at least, and its width compared to its length: it is no line."""
 RAISED, LOWERED = 0.15, 0.3
 """Metres below the hips: a raised knee is higher than the first, and lower than the second at another time, as the other one is."""
@@ -88,23 +86,23 @@ def feet_amplitude(states: Tensor) -> Tensor:
 def feet_in_time(states: Tensor) -> Tensor:
     """Whether feet open and close in time with the hands: ``(sample,)`` of bool.
 
-    People open their feet while the hands rise; some, while they sink.
+    People open their feet while the hands rise; some, while they sink. Judged from :data:`SETTLED` on.
     """
-    hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(states), _feet(states)))
+    settled = states[:, SETTLED:]
+    hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(settled), _feet(settled)))
     size = torch.linalg.vector_norm(hands, dim=1) * torch.linalg.vector_norm(feet, dim=1)
     together = (hands * feet).sum(dim=1) / size.clamp_min(1e-6)
-    wide = (feet_amplitude(states) >= OPENED) & (_feet(states).amax(dim=1) >= OPEN)
+    wide = (feet_amplitude(settled) >= OPENED) & (_feet(settled).amax(dim=1) >= OPEN)
     return (together.abs() >= IN_TIME) & wide
 
 
 def hands_overhead(states: Tensor) -> Tensor:
-    """Whether both hands are overhead at one time, and below the shoulders at another, always together: ``(sample,)`` of bool."""
+    """Whether both hands are overhead at one time, and below the shoulders at another: ``(sample,)`` of bool."""
     joints = as_joints(states)
     wrists = joints[..., list(WRISTS), 2]
     up = wrists.amin(dim=-1) - joints[..., HEAD, 2] > OVERHEAD
     down = (wrists < joints[..., list(SHOULDERS), 2] - HANGING).all(dim=-1)
-    alike = (wrists[..., 0] - wrists[..., 1]).abs().amax(dim=1) < ALIKE
-    return up.any(dim=1) & down.any(dim=1) & alike
+    return up.any(dim=1) & down.any(dim=1)
 
 
 def jumping_jacks(states: Tensor) -> Tensor:
