@@ -2,7 +2,10 @@
 
 Three kinds of recognisers vote: small convolutional networks over time, and two linear ones on numbers of the whole window. There
 is such a jury for the whole body, one for arms and trunk, and one for the legs, so that actions at the same time are judged apart.
-None has seen generated motion, or people who demonstrate new concepts. ``benchmarks/mocap_judge.py`` trains it.
+A jury picks the likeliest action, also where half of it is missing. Therefore the one for the whole body has verifiers: networks
+that have learned to tell each action from motion made to look like it, such as its arms on the legs of somebody who walks, or a
+third of its size. An action that they do not confirm is not said. None has seen generated motion, or people who demonstrate new
+concepts. ``benchmarks/mocap_judge.py`` trains it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +40,10 @@ WIDTH, EMBEDDING = 40, 32
 STILL = 0.3
 """Metres a second. Where every joint is slower over a sixth of a second, nobody does anything, however it may look."""
 RESTING = ("pose", STAND, OTHER)
-"""Classes that are seen in windows without movement."""
+"""Classes that are seen in windows without movement. No verifier excludes them, so that there is always something to say."""
+CONFIRMED = -1.0
+"""Mean verifier logit from which an action is confirmed: a probability of .27 that it is whole. Lower than one half, since people
+whom the judge has not seen do an action a little otherwise than those it has learned from."""
 _SIXTH = FPS // 6
 _OUTLIER = 5.0
 """Standard deviations beyond which a feature says no more."""
@@ -79,15 +85,17 @@ class Recogniser(nn.Module):
         joints: that it sees.
         classes: that it tells apart.
         members: number of networks.
+        verifiers: number of networks that say of each class whether a window shows the whole of it; without any, all is confirmed.
     """
 
-    def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2) -> None:
+    def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2, verifiers: int = 0) -> None:
         super().__init__()
         self.joints, self.classes = tuple(joints), tuple(classes)
         still = torch.zeros(1, HORIZON, len(COLUMNS))
         channels = signals(still, joints).shape[1]
         numbers = {name: of(still, joints).shape[1] for name, of in NUMBERS.items()}
         self.networks = nn.ModuleList(Network(channels, len(classes)) for _ in range(members))
+        self.verifiers = nn.ModuleList(Network(channels, len(classes)) for _ in range(verifiers))
         self.linear = nn.ModuleDict({name: nn.Linear(size, len(classes)) for name, size in numbers.items()})
         for name, size in {"signals": channels, "embedding": EMBEDDING, **numbers}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -125,10 +133,21 @@ class Recogniser(nn.Module):
         return {"networks": networks, **linear}
 
     def forward(self, states: Tensor) -> Tensor:
-        """The mean of all votes: scores ``(sample, class)``; of actions, minus infinity where no joint that it sees moves."""
+        """The mean of all votes: scores ``(sample, class)``.
+
+        Of actions, minus infinity where no joint that it sees moves, or where verifiers do not confirm that it is the whole action.
+        """
         scores = torch.stack(list(self.votes(states).values())).mean(dim=0)
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
-        return scores.masked_fill(self._still(states)[:, None] & actions_only, -torch.inf)
+        excluded = self._still(states)[:, None]
+        if len(self.verifiers):
+            excluded = excluded | (self.verified(states) < CONFIRMED)
+        return scores.masked_fill(excluded & actions_only, -torch.inf)
+
+    def verified(self, states: Tensor) -> Tensor:
+        """Of each class, mean logit ``(sample, class)`` that a window shows the whole genuine action, given that it looks like it."""
+        courses = self.courses(states)
+        return torch.stack([verifier(courses) for verifier in self.verifiers]).mean(dim=0)
 
     def _still(self, states: Tensor) -> Tensor:
         """Whether no joint gets anywhere within a sixth of a second: ``(sample,)``. Trembling joints do not."""
@@ -148,13 +167,18 @@ class Judge(nn.Module):
     Called like a module, it gives the whole body's features, as metrics of torchmetrics ask for it.
 
     Args:
-        members: networks of each.
+        members: networks of each, and verifiers of the one that sees the whole body.
     """
 
     def __init__(self, members: int = 2) -> None:
         super().__init__()
         self.members = members
-        self.parts = nn.ModuleDict({name: Recogniser(joints, classes, members) for name, (joints, classes) in PARTS.items()})
+        self.parts = nn.ModuleDict(
+            {
+                name: Recogniser(joints, classes, members, members if name == WHOLE else 0)
+                for name, (joints, classes) in PARTS.items()
+            }
+        )
         self.num_features = EMBEDDING
         self.eval()
 
