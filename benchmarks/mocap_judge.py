@@ -47,7 +47,7 @@ from ftl_lightning.domains.mocap.features import (
     signals,
     sizes,
 )
-from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, RESTING, WHOLE, Judge, Network, Recogniser
+from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, RESTING, VERIFIED_BY, WHOLE, Judge, Network, Recogniser
 from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
 from ftl_lightning.tensor_file import file_hash, write_text
@@ -83,7 +83,7 @@ RARE = 0.6
 SPOILED = 1200
 HARD, HARD_STEPS = 10000, 1000
 """Windows that hard negatives are made of; steps of a verifier."""
-SMALL, MORPHED = (0.15, 0.45), (0.35, 0.65)
+SMALL, MORPHED = (0.15, 0.38), (0.35, 0.65)
 """Hard negatives: sizes of movement, compared to those that were recorded; an action's share of a mixture of two."""
 BILATERAL = ("jumping jacks", "jump", "squat", "walk", "run", "arm circle")
 """Actions of both sides of the body. Whoever was recorded circling arms circled both: the wrist that moves less goes .92 or more of
@@ -227,7 +227,10 @@ def _turned(joints: Tensor, angles: Tensor) -> Tensor:
 
 
 def augmented(
-    windows: Windows, draw: torch.Generator, change: Callable[[Tensor, Tensor, torch.Generator], Tensor] | None = None
+    windows: Windows,
+    draw: torch.Generator,
+    change: Callable[[Tensor, Tensor, torch.Generator], Tensor] | None = None,
+    larger: tuple[float, float] = LARGER,
 ) -> Tensor:
     """``(window, 32, 42)`` of other paces, sides, sizes of movement, bodies and postures, slightly blurred or noisy.
 
@@ -235,6 +238,7 @@ def augmented(
         windows: as recorded.
         draw: of all that is random.
         change: what else happens to bones ``(window, frame, 14, 3)`` with labels ``(window,)``, before noise.
+        larger: sizes of movement.
     """
     count = len(windows)
 
@@ -255,7 +259,7 @@ def augmented(
     relative = _exchange(bones(as_joints(states)), windows.label, other, chance(0.5))
     length = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     middle = relative.mean(dim=1, keepdim=True)
-    larger = uniform(*LARGER, count, 1, 1, 1) * (1 + 0.1 * normal(count, 1, len(JOINTS), 1))
+    larger = uniform(*larger, count, 1, 1, 1) * (1 + 0.1 * normal(count, 1, len(JOINTS), 1))
     relative = middle + larger * (relative - middle)
     relative = relative * length / torch.linalg.vector_norm(relative, dim=-1, keepdim=True).clamp_min(1e-3)
     relative = relative * (1 + 0.08 * normal(count, 1, len(JOINTS), 1)).clamp(0.75, 1.25)
@@ -288,7 +292,7 @@ _HARD = torch.tensor(
             name not in STANDING or name in IN_PLACE,
             name not in STEPPING,
             name in STRAIGHT,
-            True,
+            name not in ("walk", "run"),
             name in BILATERAL,
             True,
         ]
@@ -479,7 +483,13 @@ def fit(recogniser: Recogniser, states: Tensor, label: Tensor, seed: int, steps:
 
 
 def _fit_network(
-    network: torch.nn.Module, courses: Tensor, loss: Callable[[Tensor, Tensor], Tensor], seed: int, steps: int
+    network: torch.nn.Module,
+    courses: Tensor,
+    loss: Callable[[Tensor, Tensor], Tensor],
+    seed: int,
+    steps: int,
+    hidden: float = HIDDEN,
+    decay: float = 0.05,
 ) -> None:
     """Train a network from the start on courses ``(window, channel, frame)``.
 
@@ -495,11 +505,11 @@ def _fit_network(
     for layer in network.modules():
         if isinstance(layer, torch.nn.Conv1d | torch.nn.Linear | torch.nn.GroupNorm):
             layer.reset_parameters()
-    optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=0.05)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
     for _ in range(steps):
         rows = torch.randint(len(courses), (BATCH,))
-        seen = (torch.rand(BATCH, courses.shape[1], 1) > HIDDEN) / (1 - HIDDEN)
+        seen = (torch.rand(BATCH, *courses.shape[1:-1], 1) > hidden) / (1 - hidden) if hidden else 1.0
         found = loss(network(courses[rows] * seen), rows)
         optimiser.zero_grad()
         found.backward()
@@ -528,8 +538,9 @@ def fit_verifiers(
         seed: of the networks' weights and of the order of windows.
         steps: of a network.
     """
-    courses = recogniser.courses(torch.cat([whole[0], hard[0]]))
-    label = torch.cat([whole[1], hard[1]])
+    states, label = torch.cat([whole[0], hard[0]]), torch.cat([whole[1], hard[1]])
+    recogniser.set_scale("turns", VERIFIED_BY["turns"](states, recogniser.joints), 0.02)
+    numbers = torch.cat([recogniser.all_numbers(some) for some in states.split(2000)])
     shown = torch.cat([torch.ones(len(whole[1])), torch.zeros(len(hard[1]))])
 
     def loss(logits: Tensor, rows: Tensor) -> Tensor:
@@ -537,7 +548,7 @@ def fit_verifiers(
         return functional.binary_cross_entropy_with_logits(asked, shown[rows])
 
     for member, verifier in enumerate(recogniser.verifiers):
-        _fit_network(verifier, courses, loss, 1000 * seed + 100 + member, steps)
+        _fit_network(verifier, numbers, loss, 1000 * seed + 100 + member, steps, hidden=0.0, decay=0.1)
 
 
 def train(

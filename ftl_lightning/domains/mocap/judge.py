@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
-from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary
+from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary, turns
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import shipped
@@ -35,6 +35,10 @@ PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
 """Joints that each part of the judge sees, and the classes it tells apart; the trunk belongs to the arms."""
 NUMBERS = {"summary": summary, "extremes": extremes}
 """What linear recognisers see, by name."""
+VERIFIED_BY = {**NUMBERS, "turns": turns}
+"""What verifiers see, by name."""
+VERIFIER = 32
+"""Hidden units of a verifier."""
 WIDTH, EMBEDDING = 40, 32
 """Channels of a network; numbers that its last layer decides by."""
 STILL = 0.3
@@ -78,6 +82,18 @@ class Network(nn.Module):
         return self.head(self.embedding(courses))
 
 
+class Verifier(nn.Sequential):
+    """A perceptron on numbers of the whole window: logits ``(sample, class)`` that it shows the whole of an action.
+
+    Args:
+        numbers: that it sees.
+        classes: that it verifies.
+    """
+
+    def __init__(self, numbers: int, classes: int) -> None:
+        super().__init__(nn.Dropout(0.2), nn.Linear(numbers, VERIFIER), nn.ReLU(), nn.Dropout(0.3), nn.Linear(VERIFIER, classes))
+
+
 class Recogniser(nn.Module):
     """Networks and linear recognisers of the same joints and classes.
 
@@ -85,7 +101,7 @@ class Recogniser(nn.Module):
         joints: that it sees.
         classes: that it tells apart.
         members: number of networks.
-        verifiers: number of networks that say of each class whether a window shows the whole of it; without any, all is confirmed.
+        verifiers: number of perceptrons that say of each class whether a window shows the whole of it; without any, all is confirmed.
     """
 
     def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2, verifiers: int = 0) -> None:
@@ -93,10 +109,11 @@ class Recogniser(nn.Module):
         self.joints, self.classes = tuple(joints), tuple(classes)
         still = torch.zeros(1, HORIZON, len(COLUMNS))
         channels = signals(still, joints).shape[1]
-        numbers = {name: of(still, joints).shape[1] for name, of in NUMBERS.items()}
+        seen = VERIFIED_BY if verifiers else NUMBERS
+        numbers = {name: of(still, joints).shape[1] for name, of in seen.items()}
         self.networks = nn.ModuleList(Network(channels, len(classes)) for _ in range(members))
-        self.verifiers = nn.ModuleList(Network(channels, len(classes)) for _ in range(verifiers))
-        self.linear = nn.ModuleDict({name: nn.Linear(size, len(classes)) for name, size in numbers.items()})
+        self.verifiers = nn.ModuleList(Verifier(sum(numbers.values()), len(classes)) for _ in range(verifiers))
+        self.linear = nn.ModuleDict({name: nn.Linear(numbers[name], len(classes)) for name in NUMBERS})
         for name, size in {"signals": channels, "embedding": EMBEDDING, **numbers}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -117,8 +134,8 @@ class Recogniser(nn.Module):
         return self._scaled("signals", signals(states, self.joints))
 
     def numbers(self, name: str, states: Tensor) -> Tensor:
-        """What a linear recogniser of :data:`NUMBERS` sees of them."""
-        return self._scaled(name, NUMBERS[name](states, self.joints))
+        """What of :data:`VERIFIED_BY` is seen of them."""
+        return self._scaled(name, VERIFIED_BY[name](states, self.joints))
 
     def features(self, states: Tensor) -> Tensor:
         """What the first network decides by: ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
@@ -146,8 +163,12 @@ class Recogniser(nn.Module):
 
     def verified(self, states: Tensor) -> Tensor:
         """Of each class, mean logit ``(sample, class)`` that a window shows the whole genuine action, given that it looks like it."""
-        courses = self.courses(states)
-        return torch.stack([verifier(courses) for verifier in self.verifiers]).mean(dim=0)
+        numbers = self.all_numbers(states)
+        return torch.stack([verifier(numbers) for verifier in self.verifiers]).mean(dim=0)
+
+    def all_numbers(self, states: Tensor) -> Tensor:
+        """What verifiers see of windows ``(sample, 32, 42)``: ``(sample, number)``."""
+        return torch.cat([self.numbers(name, states) for name in VERIFIED_BY], dim=1)
 
     def _still(self, states: Tensor) -> Tensor:
         """Whether no joint gets anywhere within a sixth of a second: ``(sample,)``. Trembling joints do not."""
