@@ -47,7 +47,7 @@ from ftl_lightning.domains.mocap.features import (
     signals,
     sizes,
 )
-from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, RESTING, VERIFIED_BY, WHOLE, Judge, Network, Recogniser
+from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, VERIFIED, VERIFIED_BY, WHOLE, Judge, Network, Recogniser
 from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
 from ftl_lightning.tensor_file import file_hash, write_text
@@ -81,8 +81,13 @@ HIDDEN = 0.3
 RARE = 0.6
 """How often windows of a class that cannot be tested are drawn, compared to others."""
 SPOILED = 1200
-HARD, HARD_STEPS = 10000, 1000
-"""Windows that hard negatives are made of; steps of a verifier."""
+HARD, HARD_STEPS = 8000, 1500
+"""Windows of verified actions that verifiers learn from, and as many hard negatives; steps of a verifier."""
+KEPT, KEPT_CIRCLE = (0.7, 1.2), (0.9, 1.2)
+"""Sizes of movement that are still the whole of an action. Recorded circles of arms are small and large; a third of a large one is
+hardly smaller than a small one, so that these are not made smaller."""
+AS_LARGE = (0.95, 1.05)
+"""Sizes of movement that hard negatives are made of."""
 SMALL, MORPHED = (0.15, 0.38), (0.35, 0.65)
 """Hard negatives: sizes of movement, compared to those that were recorded; an action's share of a mixture of two."""
 BILATERAL = ("jumping jacks", "jump", "squat", "walk", "run", "arm circle")
@@ -230,7 +235,7 @@ def augmented(
     windows: Windows,
     draw: torch.Generator,
     change: Callable[[Tensor, Tensor, torch.Generator], Tensor] | None = None,
-    larger: tuple[float, float] = LARGER,
+    larger: Tensor | None = None,
 ) -> Tensor:
     """``(window, 32, 42)`` of other paces, sides, sizes of movement, bodies and postures, slightly blurred or noisy.
 
@@ -238,7 +243,7 @@ def augmented(
         windows: as recorded.
         draw: of all that is random.
         change: what else happens to bones ``(window, frame, 14, 3)`` with labels ``(window,)``, before noise.
-        larger: sizes of movement.
+        larger: least and greatest size of movement of each class ``(class, 2)``, otherwise :data:`LARGER`.
     """
     count = len(windows)
 
@@ -259,8 +264,9 @@ def augmented(
     relative = _exchange(bones(as_joints(states)), windows.label, other, chance(0.5))
     length = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     middle = relative.mean(dim=1, keepdim=True)
-    larger = uniform(*larger, count, 1, 1, 1) * (1 + 0.1 * normal(count, 1, len(JOINTS), 1))
-    relative = middle + larger * (relative - middle)
+    low, high = (torch.tensor(LARGER).expand(len(CLASSES), 2) if larger is None else larger)[windows.label].T[..., None, None, None]
+    scale = (low + (high - low) * uniform(0, 1, count, 1, 1, 1)) * (1 + 0.1 * normal(count, 1, len(JOINTS), 1))
+    relative = middle + scale * (relative - middle)
     relative = relative * length / torch.linalg.vector_norm(relative, dim=-1, keepdim=True).clamp_min(1e-3)
     relative = relative * (1 + 0.08 * normal(count, 1, len(JOINTS), 1)).clamp(0.75, 1.25)
     # Each bone leans a little otherwise through the whole window: posture differs from person to person.
@@ -292,7 +298,7 @@ _HARD = torch.tensor(
             name not in STANDING or name in IN_PLACE,
             name not in STEPPING,
             name in STRAIGHT,
-            name not in ("walk", "run"),
+            3 * (name == "arm circle") or name != "walk",
             name in BILATERAL,
             True,
         ]
@@ -518,13 +524,22 @@ def _fit_network(
     network.eval()
 
 
-def hard_pool(windows: Windows, seed: int) -> tuple[Tensor, Tensor]:
-    """Hard negatives ``(window, 32, 42)`` of actions, and the classes that they are not the whole of."""
+def hard_pools(windows: Windows, seed: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Windows ``(window, 32, 42)`` of verified actions, and hard negatives of them, each with numbers of their classes."""
     draw = torch.Generator().manual_seed(10_000 + seed)
-    chosen = windows[torch.multinomial(chances(windows), HARD, replacement=True, generator=draw)]
-    states = augmented(chosen, draw, hard_negatives)
-    acts = torch.tensor([name not in RESTING for name in CLASSES])[chosen.label]
-    return states[acts], chosen.label[acts]
+    often = chances(windows) * torch.tensor([2.0 if name in STRAIGHT else 1.0 for name in CLASSES])[windows.label]
+    asked = torch.tensor([name in VERIFIED for name in CLASSES])
+    kept = torch.tensor([KEPT_CIRCLE if name == "arm circle" else KEPT for name in CLASSES])
+
+    def drawn(weight: Tensor, count: int) -> Tensor:
+        return torch.multinomial(weight, count, replacement=True, generator=draw)
+
+    whole = windows[drawn(often * asked[windows.label], HARD)]
+    shown = augmented(whole, draw, larger=kept)
+    # Half as many windows of all classes follow, which only lend what hard negatives take from others.
+    nearly_whole = windows[torch.cat([drawn(often * asked[windows.label], HARD), drawn(chances(windows), HARD // 2)])]
+    hard = augmented(nearly_whole, draw, hard_negatives, torch.tensor(AS_LARGE).expand(len(CLASSES), 2))
+    return (shown, whole.label), (hard[:HARD], nearly_whole.label[:HARD])
 
 
 def fit_verifiers(
@@ -560,7 +575,7 @@ def train(
     for name in parts:
         fit(judge.part(name), states, labels_of(name, label), seed, steps)
     if WHOLE in parts:
-        fit_verifiers(judge.part(WHOLE), (states[:POOL], label[:POOL]), hard_pool(windows, seed), seed, hard_steps)
+        fit_verifiers(judge.part(WHOLE), *hard_pools(windows, seed), seed, hard_steps)
     return judge
 
 

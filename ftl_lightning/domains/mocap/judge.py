@@ -44,7 +44,9 @@ WIDTH, EMBEDDING = 40, 32
 STILL = 0.3
 """Metres a second. Where every joint is slower over a sixth of a second, nobody does anything, however it may look."""
 RESTING = ("pose", STAND, OTHER)
-"""Classes that are seen in windows without movement. No verifier excludes them, so that there is always something to say."""
+"""Classes that are seen in windows without movement."""
+VERIFIED = ("walk", "jump", "jumping jacks", "knee raise", "arm circle")
+"""Actions that verifiers confirm or exclude. For others, verifiers learned from few people refuse too many whom they have not seen."""
 CONFIRMED = -1.0
 """Mean verifier logit from which an action is confirmed: a probability of .27 that it is whole. Lower than one half, since people
 whom the judge has not seen do an action a little otherwise than those it has learned from."""
@@ -158,11 +160,15 @@ class Recogniser(nn.Module):
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
         excluded = self._still(states)[:, None]
         if len(self.verifiers):
-            excluded = excluded | (self.verified(states) < CONFIRMED)
+            asked = torch.tensor([name in VERIFIED for name in self.classes])
+            excluded = excluded | (asked & (self.verified(states) < CONFIRMED))
         return scores.masked_fill(excluded & actions_only, -torch.inf)
 
     def verified(self, states: Tensor) -> Tensor:
-        """Of each class, mean logit ``(sample, class)`` that a window shows the whole genuine action, given that it looks like it."""
+        """Of each class, mean logit ``(sample, class)`` that a window which looks like it shows the whole of it.
+
+        It means something for those of :data:`VERIFIED`.
+        """
         numbers = self.all_numbers(states)
         return torch.stack([verifier(numbers) for verifier in self.verifiers]).mean(dim=0)
 
