@@ -276,7 +276,7 @@ def test_hard_negatives_are_nearly_the_action(training: ModuleType, monkeypatch:
     assert not same(arms, UPPER)
     extent = (relative[:8].amax(dim=1) - relative[:8].amin(dim=1))[:, [R_WRIST, R_ANKLE]].amax(dim=-1)
     small = made(training.SMALLER)
-    assert ((small.amax(dim=1) - small.amin(dim=1))[:, [R_WRIST, R_ANKLE]].amax(dim=-1) < 0.6 * extent).all()
+    assert ((small.amax(dim=1) - small.amin(dim=1))[:, [R_WRIST, R_ANKLE]].amax(dim=-1) < 0.7 * extent).all()  # bones stay as long
     moves = made(training.ONE_SIDE).std(dim=1).amax(dim=-1) > 1e-4
     assert (moves[:, R_WRIST] != moves[:, L_WRIST]).logical_or(moves[:, R_ANKLE] != moves[:, L_ANKLE]).all()
     for kind in (training.STRAIGHT_WAY, training.MORPH):

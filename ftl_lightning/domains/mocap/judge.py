@@ -45,15 +45,14 @@ STILL = 0.3
 """Metres a second. Where every joint is slower over a sixth of a second, nobody does anything, however it may look."""
 RESTING = ("pose", STAND, OTHER)
 """Classes that are seen in windows without movement."""
-CONFIRMED = -1.5
-"""Mean verifier logit from which an action is confirmed: a probability of .18 that it is whole. Lower than one half, since people
-whom the judge has not seen do an action a little otherwise than those it has learned from."""
-VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": -3.5, "knee raise": CONFIRMED, "arm circle": 0.5}
+CONFIRMED = -3.0
+"""Mean verifier logit from which an action is confirmed: a probability of .05 that it is whole. Far lower than one half, since people
+whom the judge has not seen do an action a little otherwise than those it has learned from; hard negatives get lower logits still."""
+VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": CONFIRMED, "knee raise": CONFIRMED, "arm circle": 0.5}
 """Actions that verifiers confirm or exclude, each with the least mean logit.
 
-What is nearly jumping jacks gets far lower logits; less is asked of them, since legs hardly part in a first one. More is asked of
-circles: they were recorded in all sizes, and a third of a large one is hardly smaller than a small one. Of actions that are not
-listed, verifiers refuse too many people whom they have not seen.
+More is asked of circles: they were recorded in all sizes, and a third of a large one is hardly smaller than a small one. Of actions
+that are not listed, verifiers refuse too many people whom they have not seen.
 """
 _SIXTH = FPS // 6
 _OUTLIER = 5.0
