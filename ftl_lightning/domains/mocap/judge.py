@@ -46,8 +46,8 @@ STILL = 0.3
 RESTING = ("pose", STAND, OTHER)
 """Classes that are seen in windows without movement."""
 CONFIRMED = -3.0
-"""Mean verifier logit from which an action is confirmed: a probability of .05 that it is whole. Far lower than one half, since people
-whom the judge has not seen do an action a little otherwise than those it has learned from; hard negatives get lower logits still."""
+"""Mean verifier logit from which an action is confirmed: a probability of .05 that it is whole. Far lower than one half, as people
+whom the judge has not seen do an action a little otherwise than those it has learned from. Hard negatives get less still."""
 VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": CONFIRMED, "knee raise": CONFIRMED, "arm circle": 0.5}
 """Actions that verifiers confirm or exclude, each with the least mean logit.
 
