@@ -2,16 +2,19 @@
 
     python benchmarks/mocap_judge.py --root FOLDER
 
-FOLDER holds recordings as ``prepare mocap`` leaves them. Writes the judge (a minute on one thread) and a table of numbers; with
-``--folds``, also of judges that are trained without the people they are tested on (ten minutes for a seed, five for each further
-one).
+FOLDER holds recordings as ``prepare mocap`` leaves them. Writes the judge (a minute or two on one thread) and a table of numbers;
+with ``--folds``, also of judges that are trained without the people they are tested on (ten minutes or more for a seed, half of it
+for each further one). The table is written after every seed.
+
+Verifiers learn from hard negatives: motion that is nearly an action, made from its recordings. The table says how often such
+motion, made by other rules from people whom the judge has not seen, passes for the action.
 """
 
 import argparse
 import json
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +27,27 @@ from torch import Tensor
 from torch.nn import functional
 
 from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, REVERSIBLE, STANDING, STEPPING, TESTED, action, of_legs
-from ftl_lightning.domains.mocap.features import LOWER, UPPER, bones, places, signals, sizes
-from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, WHOLE, Judge, Network, Recogniser
+from ftl_lightning.domains.mocap.features import (
+    LA,
+    LE,
+    LH,
+    LK,
+    LOWER,
+    LS,
+    LW,
+    RA,
+    RE,
+    RH,
+    RK,
+    RS,
+    RW,
+    UPPER,
+    bones,
+    places,
+    signals,
+    sizes,
+)
+from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, VERIFIED_BY, WHOLE, Judge, Network, Recogniser
 from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
 from ftl_lightning.tensor_file import file_hash, write_text
@@ -59,6 +81,22 @@ HIDDEN = 0.3
 RARE = 0.6
 """How often windows of a class that cannot be tested are drawn, compared to others."""
 SPOILED = 1200
+HARD, HARD_STEPS = 10000, 1500
+"""Windows of tested actions that verifiers learn from, and as many hard negatives; steps of a verifier."""
+KEPT, KEPT_CIRCLE = (0.7, 1.2), (0.9, 1.2)
+"""Sizes of movement that are still the whole of an action. Recorded circles of arms are small and large; a third of a large one is
+hardly smaller than a small one, so that these are not made smaller."""
+AS_LARGE = (0.95, 1.05)
+"""Sizes of movement that hard negatives are made of."""
+SMALL, MORPHED = (0.15, 0.38), (0.35, 0.65)
+"""Hard negatives: sizes of movement, compared to those that were recorded; an action's share of a mixture of two."""
+BILATERAL = ("jumping jacks", "jump", "squat", "walk", "run", "arm circle")
+"""Actions of both sides of the body. Whoever was recorded circling arms circled both: in nine of ten windows, the wrist that moves
+less goes .92 or more of the other's way."""
+STRAIGHT = ("jumping jacks", "arm circle")
+"""Actions that a straight way between two of their poses is not; of a squat, for example, it is all there is in a second."""
+IN_PLACE = ("signals", "twist", "arm circle", "toe touch")
+"""Actions of arms and trunk for which people stand: on legs that step they are not the whole action."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +231,24 @@ def _turned(joints: Tensor, angles: Tensor) -> Tensor:
     return torch.einsum("nij,ntkj->ntki", torch.linalg.matrix_exp(about), joints)
 
 
-def augmented(windows: Windows, draw: torch.Generator) -> Tensor:
-    """``(window, 32, 42)`` of other paces, sides, sizes of movement, bodies and postures, slightly blurred or noisy."""
+def _joints(*chosen: int) -> Tensor:
+    return torch.zeros(len(JOINTS), 1, dtype=torch.bool).index_fill(0, torch.tensor(chosen), True)
+
+
+def augmented(
+    windows: Windows,
+    draw: torch.Generator,
+    change: Callable[[Tensor, Tensor, torch.Generator], Tensor] | None = None,
+    larger: Tensor | None = None,
+) -> Tensor:
+    """``(window, 32, 42)`` of other paces, sides, sizes of movement, bodies and postures, slightly blurred or noisy.
+
+    Args:
+        windows: as recorded.
+        draw: of all that is random.
+        change: what else happens to bones ``(window, frame, 14, 3)`` with labels ``(window,)``, before noise.
+        larger: least and greatest size of movement of each class ``(class, 2)``, otherwise :data:`LARGER`.
+    """
     count = len(windows)
 
     def normal(*shape: int) -> Tensor:
@@ -214,17 +268,149 @@ def augmented(windows: Windows, draw: torch.Generator) -> Tensor:
     relative = _exchange(bones(as_joints(states)), windows.label, other, chance(0.5))
     length = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     middle = relative.mean(dim=1, keepdim=True)
-    larger = uniform(*LARGER, count, 1, 1, 1) * (1 + 0.1 * normal(count, 1, len(JOINTS), 1))
-    relative = middle + larger * (relative - middle)
+    noise = 1 + 0.1 * normal(count, 1, len(JOINTS), 1)
+    low, high = (torch.tensor(LARGER).expand(len(CLASSES), 2) if larger is None else larger)[windows.label].T[..., None, None, None]
+    scale = (low + (high - low) * uniform(0, 1, count, 1, 1, 1)) * noise
+    relative = middle + scale * (relative - middle)
     relative = relative * length / torch.linalg.vector_norm(relative, dim=-1, keepdim=True).clamp_min(1e-3)
     relative = relative * (1 + 0.08 * normal(count, 1, len(JOINTS), 1)).clamp(0.75, 1.25)
     # Each bone leans a little otherwise through the whole window: posture differs from person to person.
     relative = relative + 0.1 * length.mean(dim=1, keepdim=True) * normal(count, 1, len(JOINTS), 3)
+    if change is not None:
+        relative = change(relative, windows.label, draw)
     joints = _turned(places(relative), normal(count, 3) * torch.tensor([0.05, 0.05, 0.12]))
     drift = functional.interpolate(0.015 * normal(count, 3 * len(JOINTS), 6), size=HORIZON, mode="linear", align_corners=True)
     states = joints.flatten(2) + drift.transpose(1, 2) + uniform(0, 0.005, count, 1, 1) * normal(*states.shape)
     padded = functional.pad(states.transpose(1, 2), (1, 1), mode="replicate")
     return torch.where(chance(0.4)[:, None, None], functional.avg_pool1d(padded, 3, stride=1).transpose(1, 2), states)
+
+
+def _lenders(c: str) -> tuple[list[bool], list[bool], list[bool]]:
+    """Of each class, whether its legs, its arms or its whole motion make hard negatives of action ``c``."""
+    common = [name in TESTED or name == OTHER for name in CLASSES]
+    steps = [name in TESTED and name not in STANDING for name in CLASSES]
+    others = [of_legs(name) not in (of_legs(c), OTHER if c in IN_PLACE else None) for name in CLASSES]
+    legs = [a and b for a, b in zip(steps if c in IN_PLACE else common, others, strict=True)]
+    return legs, [a and name != c for a, name in zip(common, CLASSES, strict=True)], [name != c for name in CLASSES]
+
+
+_LENDERS = torch.tensor([_lenders(name) for name in CLASSES])
+"""``(class, 3, class)``."""
+LEGS_OF_OTHERS, ARMS_OF_OTHERS, STRAIGHT_WAY, SMALLER, ONE_SIDE, MORPH = range(6)
+_HARD = torch.tensor(
+    [
+        [
+            name not in STANDING or name in IN_PLACE,
+            name not in STEPPING,
+            2 * (name == "arm circle") or name in STRAIGHT,
+            3 * (name == "arm circle") or name not in ("walk", "run"),
+            name in BILATERAL,
+            True,
+        ]
+        for name in CLASSES
+    ]
+).float()
+"""Of each class, how often each kind of hard negative is made of its windows, compared to others ``(class, 6)``."""
+_RIGHT_ARM, _LEFT_ARM, _RIGHT_LEG, _LEFT_LEG = (RS, RE, RW), (LS, LE, LW), (RH, RK, RA), (LH, LK, LA)
+
+
+def _partners(label: Tensor, lenders: Tensor, draw: torch.Generator) -> Tensor:
+    """For each window the row of another, of a class ``(class, class)`` that lends to its own."""
+    found = torch.arange(len(label))
+    for name in label.unique():
+        rows, others = (label == name).nonzero()[:, 0], lenders[name][label].nonzero()[:, 0]
+        if len(others):
+            found[rows] = others[torch.randint(len(others), (len(rows),), generator=draw)]
+    return found
+
+
+def _as_long(relative: Tensor, like: Tensor) -> Tensor:
+    """Bones as long as others."""
+    length = torch.linalg.vector_norm(like, dim=-1, keepdim=True)
+    return relative * length / torch.linalg.vector_norm(relative, dim=-1, keepdim=True).clamp_min(1e-3)
+
+
+def _at(relative: Tensor, frame: Tensor) -> Tensor:
+    """One frame ``(window,)`` of each window, as a window of one frame."""
+    return relative[torch.arange(len(relative)), frame][:, None]
+
+
+def _straight_ways(relative: Tensor, label: Tensor, draw: torch.Generator) -> Tensor:
+    """From a frame straight to the one that is farthest from it, after a while, at some speed; held, or back on the same way.
+
+    Some begin as somebody else stands. Nobody returns in jumping jacks: there and back would be one.
+    """
+    count = len(relative)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, 1, 1, 1, generator=draw)
+
+    frame = torch.randint(HORIZON, (count,), generator=draw)
+    distance = torch.linalg.vector_norm(relative - _at(relative, frame), dim=-1)[..., list(UPPER)].sum(dim=-1)
+    end = _at(relative, distance.argmax(dim=1))
+    standing = torch.tensor([name in (OTHER, "walk", "signals") for name in CLASSES])
+    partner = _partners(label, standing.expand(len(CLASSES), -1), draw)
+    size = sizes(relative)
+    start = torch.where(uniform(0, 1) < 0.3, _at(relative[partner] / size[partner] * size, frame), _at(relative, frame))
+    lasts = uniform(0.3, 1)
+    time = (torch.linspace(0, 1, HORIZON)[:, None, None] - uniform(0, 0.6) * (1 - lasts)) / lasts
+    returns = (uniform(0, 1) < 0.5) & (label != CLASSES.index("jumping jacks"))[:, None, None, None]
+    time = torch.where(returns, 1 - (2 * time - 1).abs(), time).clamp(0, 1)
+    share = torch.where(uniform(0, 1) < 0.7, time**2 * (3 - 2 * time), time)
+    found = (1 - share) * start + share * end
+    found = torch.where(uniform(0, 1) < 0.5, _as_long(found, relative), found)
+    legs_stay = (uniform(0, 1) < 0.5) & torch.tensor([name in STANDING for name in CLASSES])[label][:, None, None, None]
+    return torch.where(legs_stay & _joints(*LOWER), relative, found)
+
+
+def _one_sided(relative: Tensor, label: Tensor, draw: torch.Generator) -> Tensor:
+    """One arm, one leg or both of a side do nothing, of those that matter."""
+    count = len(relative)
+    side = torch.stack([_joints(*_RIGHT_ARM), _joints(*_LEFT_ARM), _joints(*_RIGHT_LEG), _joints(*_LEFT_LEG)])
+    right, which = torch.randint(2, (count,), generator=draw), torch.randint(3, (count,), generator=draw)
+    kind = _EXCHANGED[label]
+    legs_only, arms_only = (kind == 2) | (label == CLASSES.index("jump")), kind == 1
+    arm = (which != 0) & ~legs_only | (which == 0) & arms_only
+    leg = (which != 1) & ~arms_only | (which == 1) & legs_only
+    frozen = arm[:, None, None] & side[right] | leg[:, None, None] & side[2 + right]
+    some = _at(relative, torch.randint(HORIZON, (count,), generator=draw))
+    mean = _as_long(relative.mean(dim=1, keepdim=True), some)
+    rest = torch.where(torch.rand(count, 1, 1, 1, generator=draw) < 0.5, some, mean)
+    return torch.where(frozen[:, None], rest, relative)
+
+
+def hard_negatives(relative: Tensor, label: Tensor, draw: torch.Generator) -> Tensor:
+    """What is nearly an action, but not the whole: of bones ``(window, frame, 14, 3)``, the same number.
+
+    Arms and trunk on another action's legs, legs with another's arms, a straight way between two poses, a third of the movement,
+    one side only, mixtures with other actions.
+    """
+    size = sizes(relative)
+    kind = torch.multinomial(_HARD[label], 1, generator=draw)[:, :, None, None]
+    legs, arms, whole = (
+        relative[other] / size[other] * size for other in (_partners(label, _LENDERS[:, n], draw) for n in range(3))
+    )
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(len(relative), 1, 1, 1, generator=draw)
+
+    middle = relative.mean(dim=1, keepdim=True)
+    small = _as_long(middle + uniform(*SMALL) * (relative - middle), relative)
+    share = uniform(*MORPHED)
+    morph = share * relative + (1 - share) * whole
+    morph = torch.where(uniform(0, 1) < 0.5, _as_long(morph, relative), morph)
+    lower = _joints(*LOWER)
+    found = {
+        LEGS_OF_OTHERS: torch.where(lower, legs, relative),
+        ARMS_OF_OTHERS: torch.where(lower, relative, arms),
+        STRAIGHT_WAY: _straight_ways(relative, label, draw),
+        SMALLER: small,
+        ONE_SIDE: _one_sided(relative, label, draw),
+        MORPH: morph,
+    }
+    for number, changed in found.items():
+        relative = torch.where(kind == number, changed, relative)
+    return relative
 
 
 def spoiled(states: Tensor, draw: torch.Generator) -> Tensor:
@@ -291,34 +477,109 @@ def fit(recogniser: Recogniser, states: Tensor, label: Tensor, seed: int, steps:
     for name, strength in (("summary", 1e-3), ("extremes", 2e-3)):
         recogniser.set_scale(name, NUMBERS[name](states, recogniser.joints), 0.02)
         _fit_linear(recogniser.linear[name], recogniser.numbers(name, states), label, strength)
-    recogniser.train()
-    networks = [network for network in recogniser.networks if isinstance(network, Network)]
-    for member, network in enumerate(networks):
-        torch.manual_seed(1000 * seed + member)
-        for layer in network.modules():
-            if isinstance(layer, torch.nn.Conv1d | torch.nn.Linear | torch.nn.GroupNorm):
-                layer.reset_parameters()
-        optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=0.05)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
-        for _ in range(steps):
-            rows = torch.randint(len(states), (BATCH,))
-            seen = (torch.rand(BATCH, courses.shape[1], 1) > HIDDEN) / (1 - HIDDEN)
-            loss = functional.cross_entropy(network(courses[rows] * seen), label[rows], label_smoothing=0.1)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-    recogniser.eval()
+
+    def loss(logits: Tensor, rows: Tensor) -> Tensor:
+        return functional.cross_entropy(logits, label[rows], label_smoothing=0.1)
+
+    for member, network in enumerate(recogniser.networks):
+        _fit_network(network, courses, loss, 1000 * seed + member, steps)
+    first = recogniser.networks[0]
+    assert isinstance(first, Network)
     with torch.no_grad():
-        recogniser.set_scale("embedding", torch.cat([networks[0].embedding(some) for some in courses.split(1000)]), 1e-3)
+        recogniser.set_scale("embedding", torch.cat([first.embedding(some) for some in courses.split(1000)]), 1e-3)
 
 
-def train(windows: Windows, seed: int, parts: Sequence[str] = tuple(PARTS), steps: int = STEPS) -> Judge:
+def _fit_network(
+    network: torch.nn.Module,
+    courses: Tensor,
+    loss: Callable[[Tensor, Tensor], Tensor],
+    seed: int,
+    steps: int,
+    hidden: float = HIDDEN,
+    decay: float = 0.05,
+) -> None:
+    """Train a network from the start on courses ``(window, channel, frame)``.
+
+    Args:
+        network: is changed.
+        courses: that it sees.
+        loss: of its logits ``(row, class)`` for rows of the courses.
+        seed: of its weights and of the order of windows.
+        steps: how many.
+    """
+    network.train()
+    torch.manual_seed(seed)
+    for layer in network.modules():
+        if isinstance(layer, torch.nn.Conv1d | torch.nn.Linear | torch.nn.GroupNorm):
+            layer.reset_parameters()
+    optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
+    for _ in range(steps):
+        rows = torch.randint(len(courses), (BATCH,))
+        seen = (torch.rand(BATCH, *courses.shape[1:-1], 1) > hidden) / (1 - hidden) if hidden else 1.0
+        found = loss(network(courses[rows] * seen), rows)
+        optimiser.zero_grad()
+        found.backward()
+        optimiser.step()
+        schedule.step()
+    network.eval()
+
+
+def hard_pools(windows: Windows, seed: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Windows ``(window, 32, 42)`` of tested actions, and hard negatives of them, each with numbers of their classes.
+
+    Verifiers learn more actions than they are asked about: where they learned five, they refused more people.
+    """
+    draw = torch.Generator().manual_seed(10_000 + seed)
+    often = chances(windows) * torch.tensor([2.0 if name in STRAIGHT else 1.0 for name in CLASSES])[windows.label]
+    asked = torch.tensor([name in TESTED for name in CLASSES])
+    kept = torch.tensor([KEPT_CIRCLE if name == "arm circle" else KEPT for name in CLASSES])
+
+    def drawn(weight: Tensor, count: int) -> Tensor:
+        return torch.multinomial(weight, count, replacement=True, generator=draw)
+
+    whole = windows[drawn(often * asked[windows.label], HARD)]
+    shown = augmented(whole, draw, larger=kept)
+    # Half as many windows of all classes follow, which only lend what hard negatives take from others.
+    nearly_whole = windows[torch.cat([drawn(often * asked[windows.label], HARD), drawn(chances(windows), HARD // 2)])]
+    hard = augmented(nearly_whole, draw, hard_negatives, torch.tensor(AS_LARGE).expand(len(CLASSES), 2))
+    return (shown, whole.label), (hard[:HARD], nearly_whole.label[:HARD])
+
+
+def fit_verifiers(
+    recogniser: Recogniser, whole: tuple[Tensor, Tensor], hard: tuple[Tensor, Tensor], seed: int, steps: int = HARD_STEPS
+) -> None:
+    """Train verifiers of a recogniser whose scale is known.
+
+    Args:
+        recogniser: is changed.
+        whole, hard: windows ``(window, 32, 42)`` that show an action and that nearly do, each with the numbers of their classes.
+        seed: of the networks' weights and of the order of windows.
+        steps: of a network.
+    """
+    states, label = torch.cat([whole[0], hard[0]]), torch.cat([whole[1], hard[1]])
+    recogniser.set_scale("turns", VERIFIED_BY["turns"](states, recogniser.joints), 0.02)
+    numbers = torch.cat([recogniser.all_numbers(some) for some in states.split(2000)])
+    shown = torch.cat([torch.ones(len(whole[1])), torch.zeros(len(hard[1]))])
+
+    def loss(logits: Tensor, rows: Tensor) -> Tensor:
+        asked = logits.gather(1, label[rows][:, None])[:, 0]
+        return functional.binary_cross_entropy_with_logits(asked, shown[rows])
+
+    for member, verifier in enumerate(recogniser.verifiers):
+        _fit_network(verifier, numbers, loss, 1000 * seed + 100 + member, steps, hidden=0.0, decay=0.1)
+
+
+def train(
+    windows: Windows, seed: int, parts: Sequence[str] = tuple(PARTS), steps: int = STEPS, hard_steps: int = HARD_STEPS
+) -> Judge:
     """A judge that has seen these windows."""
     states, label = pool(windows, seed)
     judge = Judge()
     for name in parts:
         fit(judge.part(name), states, labels_of(name, label), seed, steps)
+    if WHOLE in parts:
+        fit_verifiers(judge.part(WHOLE), *hard_pools(windows, seed), seed, hard_steps)
     return judge
 
 
@@ -328,7 +589,7 @@ def _tested(part: str) -> list[str]:
 
 
 def _recalls(part: str, scores: Tensor, label: Tensor) -> dict[str, float]:
-    names, said = PARTS[part][1], scores.argmax(dim=-1)
+    names, said = PARTS[part][1], scores.argmax(dim=-1).masked_fill(scores.isinf().all(dim=-1), -1)
     return {name: float((said[label == names.index(name)] == names.index(name)).float().mean()) for name in _tested(part)}
 
 
@@ -339,19 +600,96 @@ def _closed(part: str, scores: Tensor) -> Tensor:
     return scores.masked_fill(~allowed, -torch.inf)
 
 
+def _of_class(windows: Windows, *names: str) -> Tensor:
+    """Windows ``(window, 32, 42)`` of these classes."""
+    classes = [CLASSES.index(name) for name in names]
+    return windows[torch.from_numpy(np.flatnonzero(np.isin(windows.label, classes)))].states()
+
+
+def nearly(name: str, shown: Tensor, walks: Tensor, stands: Tensor) -> dict[str, Tensor]:
+    """Windows that nearly show an action, by rules without chance.
+
+    Args:
+        name: 'jumping jacks' or 'arm circle'.
+        shown, walks, stands: windows ``(window, 32, 42)`` that show it, and of people who walk and who stand.
+    """
+    rows = torch.arange(len(shown))
+    relative = bones(as_joints(shown))
+    size = sizes(relative)
+    lower = _joints(*LOWER)
+
+    def of(others: Tensor) -> Tensor:
+        lent = bones(as_joints(others[rows * 7 % len(others)]))
+        return lent / sizes(lent) * size
+
+    hands = as_joints(shown)[:, :, [RW, LW], 2].mean(dim=-1)
+    hanging, raised = _at(relative, hands.argmin(dim=1)), _at(relative, hands.argmax(dim=1))
+    share = torch.linspace(0, 1, HORIZON)[:, None, None]
+    middle = relative.mean(dim=1, keepdim=True)
+    found = {
+        "arms on walking legs": torch.where(lower, of(walks), relative),
+        "straight line from hanging arms to the raised pose": hanging + share * (raised - hanging),
+        "the same in half the time, then held": hanging + (2 * share).clamp(max=1) * (raised - hanging),
+        "a third of the amplitude": _as_long(middle + (relative - middle) / 3, relative),
+        "one arm only": torch.cat([torch.where(_joints(*arm), hanging, relative) for arm in (_RIGHT_ARM, _LEFT_ARM)]),
+        "half walking": (relative + of(walks)) / 2,
+    }
+    if name == "arm circle":
+        back = 1 - (2 * share - 1).abs()
+        return found | {"straight up and straight back": hanging + back * (raised - hanging)}
+    sides = ((_RIGHT_ARM, _RIGHT_LEG), (_LEFT_ARM, _LEFT_LEG))
+    return found | {
+        "arms on standing legs": torch.where(lower, of(stands), relative),
+        "legs with walking arms": torch.where(lower, relative, of(walks)),
+        "legs with standing arms": torch.where(lower, relative, of(stands)),
+        "one leg only": torch.cat([torch.where(_joints(*leg), hanging, relative) for _, leg in sides]),
+        "one side only": torch.cat([torch.where(_joints(*arm, *leg), hanging, relative) for arm, leg in sides]),
+    }
+
+
+def hard_shares(judge: Judge, unseen: Windows, others: Windows) -> dict[str, dict[str, float]]:
+    """How often the judge says an action of what is nearly one, and of what is one, by action and person.
+
+    Args:
+        judge: has not seen the people of ``unseen``.
+        unseen: windows that show the actions, from which all is made.
+        others: windows whose people lend what is exchanged or mixed, where those of ``unseen`` neither walk nor stand.
+    """
+    found: dict[str, dict[str, float]] = {}
+    walks, stands = (
+        own if len(own := _of_class(unseen, *classes)) else _of_class(others, *classes) for classes in (("walk",), (OTHER,))
+    )
+    for name, person in ((name, str(person)) for name in STRAIGHT for person in np.unique(unseen.subject)):
+        shown = _of_class(unseen.of((person,)), name)
+        if not len(shown):
+            continue
+        relative = bones(as_joints(shown))
+        middle = relative.mean(dim=1, keepdim=True)
+        seven_tenths = places(_as_long(middle + 0.7 * (relative - middle), relative)).flatten(2)
+        made = {kind: places(windows).flatten(2) for kind, windows in nearly(name, shown, walks, stands).items()}
+        with torch.no_grad():
+            found[f"{name} of subject {person}"] = {
+                kind: float(judge.part(WHOLE).says(states, name).float().mean())
+                for kind, states in {"as recorded": shown, "seven tenths of the amplitude": seven_tenths, **made}.items()
+            }
+    return found
+
+
 def across_people(root: Path, seed: int, parts: Sequence[str]) -> dict[str, Any]:
     """How judges recognise people they have not seen: every subject is judged by one that was trained without."""
     learned, asked = read(root, 2), read(root, 6)
     scores: dict[str, list[Tensor]] = {}
     tests = [asked.of(fold) for fold in FOLDS]
+    hard: dict[str, dict[str, float]] = {}
     for fold, test in zip(FOLDS, tests, strict=True):
         judge = train(learned.of(fold, others=True), seed, parts)
+        hard |= hard_shares(judge, learned.of(fold), learned)
         with torch.no_grad():
             for part in parts:
                 recogniser, states = judge.part(part), test.states()
                 for name, vote in {**recogniser.votes(states), "together": recogniser(states)}.items():
                     scores.setdefault(f"{part} {name}", []).append(vote)
-    found: dict[str, Any] = {"seed": seed, "windows": sum(map(len, tests))}
+    found: dict[str, Any] = {"seed": seed, "windows": sum(map(len, tests)), "hard negatives": hard}
     label = torch.cat([test.label for test in tests])
     subject = np.concatenate([test.subject for test in tests])
     for key, votes_of_folds in scores.items():
@@ -424,25 +762,50 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     began = time.time()
     judge = train(read(chosen.root, 2).of(UNSEEN, others=True), chosen.seed)
-    settings = {"seed": chosen.seed, "without subjects": UNSEEN, "windows": POOL, "steps": STEPS, "tested classes": TESTED}
+    settings = {
+        "seed": chosen.seed,
+        "without subjects": UNSEEN,
+        "windows": POOL,
+        "steps": STEPS,
+        "windows for hard negatives": HARD,
+        "steps of a verifier": HARD_STEPS,
+        "tested classes": TESTED,
+    }
     judge.save(chosen.out, settings)
     judge = Judge.load(chosen.out)
     table = json.loads(chosen.table.read_text()) if chosen.table.is_file() else {}
-    table |= {"judge": file_hash(chosen.out), "training": settings, "references": references(judge, chosen.root)}
-    print(f"{chosen.out}: {chosen.out.stat().st_size / 1000:.0f} kB, {time.time() - began:.0f} s")
-    if chosen.folds:
-        runs = [
-            across_people(chosen.root, chosen.seed + number, (WHOLE,) if number else tuple(PARTS)) for number in range(chosen.folds)
-        ]
-        table["across people"] = runs
-        for key in runs[0]:
-            if isinstance(runs[0][key], dict):
-                values = [run[key]["balanced accuracy"] for run in runs if key in run]
-                alone = [run[key]["of the tested classes alone"] for run in runs if key in run]
-                print(f"{key:18} {np.mean(values):.3f} ({np.std(values):.3f}), tested classes alone {np.mean(alone):.3f}")
+    every = read(chosen.root, 2)
+    table |= {
+        "judge": file_hash(chosen.out),
+        "training": settings,
+        "references": references(judge, chosen.root),
+        "hard negatives": hard_shares(judge, every.of(UNSEEN), every),
+    }
+
+    def write() -> None:
+        write_text(chosen.table, json.dumps(table, indent=1) + "\n")
+
+    write()
+    print(f"{chosen.out}: {chosen.out.stat().st_size / 1000:.0f} kB, {time.time() - began:.0f} s", flush=True)
     for name, value in table["references"].items():
         print(f"{name:68} {value:.2f}")
-    write_text(chosen.table, json.dumps(table, indent=1) + "\n")
+    _print_hard(table["hard negatives"])
+    runs: list[dict[str, Any]] = []
+    for number in range(chosen.folds):
+        runs.append(across_people(chosen.root, chosen.seed + number, (WHOLE,) if number else tuple(PARTS)))
+        table["across people"] = runs
+        write()
+        print(f"seed {runs[-1]['seed']}: balanced accuracy {runs[-1][f'{WHOLE} together']['balanced accuracy']:.3f}", flush=True)
+        _print_hard(runs[-1]["hard negatives"])
+    for key in [key for key, value in runs[0].items() if isinstance(value, dict) and "balanced accuracy" in value] if runs else []:
+        values = [run[key]["balanced accuracy"] for run in runs if key in run]
+        alone = [run[key]["of the tested classes alone"] for run in runs if key in run]
+        print(f"{key:18} {np.mean(values):.3f} ({np.std(values):.3f}), tested classes alone {np.mean(alone):.3f}")
+
+
+def _print_hard(shares: dict[str, dict[str, float]]) -> None:
+    for name, of_kind in shares.items():
+        print(f"{name}: {', '.join(f'{kind} {share:.2f}' for kind, share in of_kind.items())}", flush=True)
 
 
 if __name__ == "__main__":

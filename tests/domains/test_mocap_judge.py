@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ftl_lightning.domains.mocap import judge as judging
 from ftl_lightning.domains.mocap.actions import CLASSES, OTHER, TESTED, action, actions, judged
-from ftl_lightning.domains.mocap.features import JOINTS, LOWER, UPPER, bones, extremes, places, signals, summary
+from ftl_lightning.domains.mocap.features import JOINTS, LOWER, UPPER, bones, extremes, places, signals, summary, turns
 from ftl_lightning.domains.mocap.judge import ARMS, LEGS, PARTS, PATH, WHOLE, Judge, identity, shipped_judge
 from ftl_lightning.domains.mocap.recordings import FILE
 from ftl_lightning.domains.mocap.skeleton import (
@@ -106,13 +106,13 @@ def test_bones_put_together_again_are_the_same_places() -> None:
 
 def test_a_larger_body_looks_the_same() -> None:
     states = moving(3)
-    for seen in (signals, summary, extremes):
+    for seen in (signals, summary, extremes, turns):
         assert torch.allclose(seen(states, ALL), seen(1.3 * states, ALL), atol=1e-3), seen.__name__
 
 
 def test_numbers_of_the_mirror_image_are_the_same() -> None:
     states = moving(4)
-    for seen in (summary, extremes):
+    for seen in (summary, extremes, turns):
         for joints, _ in PARTS.values():
             assert torch.allclose(seen(states, joints), seen(mirrored(states), joints), atol=1e-4), seen.__name__
 
@@ -124,6 +124,17 @@ def test_a_frozen_frame_and_trembling_look_different() -> None:
     for seen in (signals, summary, extremes):
         for other in (frozen, trembling):
             assert (seen(states, ALL) - seen(other, ALL)).abs().max() > 0.3, seen.__name__
+
+
+def test_a_way_on_a_line_encloses_nothing_and_a_circle_does() -> None:
+    angle = torch.linspace(0, 2 * torch.pi, HORIZON)
+    joints = as_joints(standing_poses(2, torch.Generator().manual_seed(0))[:, None].repeat(1, HORIZON, 1)).clone()
+    joints[:, :, [R_WRIST, L_WRIST], 2] += 0.2 * torch.sin(angle)[:, None]
+    joints[1, :, [R_WRIST, L_WRIST], 1] += 0.2 * torch.cos(angle)[:, None]
+    line, circle = turns(joints.flatten(2), ALL)[:, : 4 * 7].unflatten(1, (4, 7))[:, -1]  # wrists, the mean of both sides
+    second_extent, area = 3, 5
+    assert line[second_extent] < 0.02 < 0.5 < circle[second_extent] <= 1
+    assert line[area] < 0.05 < 2 < circle[area]
 
 
 def test_arms_are_judged_without_the_legs_and_legs_without_the_arms(untrained: Judge) -> None:
@@ -161,6 +172,20 @@ def test_who_does_not_move_shows_no_action(untrained: Judge) -> None:
         for states in (frozen, trembling):
             said = {part.classes[index] for index in part(states).argmax(dim=-1).tolist()}
             assert said <= set(judging.RESTING)
+
+
+def test_what_verifiers_do_not_confirm_is_not_said(untrained: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
+    states, whole = moving(6), untrained.part(WHOLE)
+    logits = torch.full((6, len(CLASSES)), 5.0)
+    logits[::2, CLASSES.index("walk")] = -5.0
+    logits[:, [CLASSES.index("climb"), CLASSES.index(OTHER)]] = -5.0  # no verifier is asked about these
+    monkeypatch.setattr(type(whole), "verified", lambda self, states: logits)
+    scores = whole(states)
+    assert scores[::2, CLASSES.index("walk")].isneginf().all()
+    assert scores[1::2].isfinite().all()
+    assert scores.isneginf().sum() == 3
+    assert not len(untrained.part(ARMS).verifiers) + len(untrained.part(LEGS).verifiers), "arms alone are no whole action"
+    assert set(judging.VERIFIED) <= set(TESTED) - set(judging.RESTING)
 
 
 def test_a_goal_without_a_class_is_refused(untrained: Judge) -> None:
@@ -205,9 +230,10 @@ def test_training_tells_made_up_actions_apart_and_repeats_itself(
     recordings(trials).save(tmp_path / FILE)
     monkeypatch.setattr(training, "POOL", 200)
     monkeypatch.setattr(training, "SPOILED", 30)
+    monkeypatch.setattr(training, "HARD", 200)
     windows = training.read(tmp_path, 8)
     assert {str(name) for name in windows.subject} == {"02", "13"}
-    first, second = (training.train(windows.of(("13",), others=True), 0, (WHOLE,), 30).part(WHOLE) for _ in range(2))
+    first, second = (training.train(windows.of(("13",), others=True), 0, (WHOLE,), 30, 60).part(WHOLE) for _ in range(2))
     assert all(torch.equal(value, second.state_dict()[name]) for name, value in first.state_dict().items())
     test = windows.of(("13",))
     assert (first(test.states()).argmax(dim=-1) == test.label).float().mean() > 0.9
@@ -224,8 +250,41 @@ def test_windows_at_another_pace_stay_within_their_action(training: ModuleType) 
     assert torch.allclose(fast.diff(dim=1), torch.tensor([1.5, 1.5, 0.5])[:, None].expand(3, 31), atol=1e-4)
 
 
+def test_hard_negatives_are_nearly_the_action(training: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    walk, jacks = CLASSES.index("walk"), CLASSES.index("jumping jacks")
+    states = torch.cat([jumping_jacks(8), moving(8)])
+    label = torch.tensor([jacks] * 8 + [walk] * 8)
+    relative = bones(as_joints(states))
+
+    def made(kind: int) -> Tensor:
+        only = torch.zeros(len(CLASSES), 6)
+        only[:, kind] = 1
+        monkeypatch.setattr(training, "_HARD", only)
+        found = training.hard_negatives(relative, label, torch.Generator().manual_seed(0))
+        assert found.shape == relative.shape
+        assert found.isfinite().all()
+        assert torch.equal(found, training.hard_negatives(relative, label, torch.Generator().manual_seed(0)))
+        return found[:8]
+
+    def same(found: Tensor, joints: tuple[int, ...]) -> bool:
+        return torch.equal(found[:, :, list(joints)], relative[:8, :, list(joints)])
+
+    legs, arms = made(training.LEGS_OF_OTHERS), made(training.ARMS_OF_OTHERS)
+    assert same(legs, UPPER)
+    assert not same(legs, LOWER)
+    assert same(arms, LOWER)
+    assert not same(arms, UPPER)
+    extent = (relative[:8].amax(dim=1) - relative[:8].amin(dim=1))[:, [R_WRIST, R_ANKLE]].amax(dim=-1)
+    small = made(training.SMALLER)
+    assert ((small.amax(dim=1) - small.amin(dim=1))[:, [R_WRIST, R_ANKLE]].amax(dim=-1) < 0.7 * extent).all()  # bones stay as long
+    moves = made(training.ONE_SIDE).std(dim=1).amax(dim=-1) > 1e-4
+    assert (moves[:, R_WRIST] != moves[:, L_WRIST]).logical_or(moves[:, R_ANKLE] != moves[:, L_ANKLE]).all()
+    for kind in (training.STRAIGHT_WAY, training.MORPH):
+        assert not same(made(kind), ALL)
+
+
 def test_the_shipped_judge_is_small_and_knows_made_up_jumping_jacks_from_standing() -> None:
-    assert shipped(PATH).stat().st_size < 1_000_000
+    assert shipped(PATH).stat().st_size < 1_300_000
     assert len(identity()) == 16
     states = jumping_jacks(8)
     judge = shipped_judge()
@@ -234,6 +293,18 @@ def test_the_shipped_judge_is_small_and_knows_made_up_jumping_jacks_from_standin
     frozen = states[:, 10:11].repeat(1, HORIZON, 1)
     assert not judge.recognised("jumping jacks", frozen).any()
     assert not judge.recognised("jumping jacks", moving(8)).any()
+
+
+def test_the_shipped_judge_refuses_what_is_nearly_jumping_jacks(training: ModuleType) -> None:
+    jacks, stands = jumping_jacks(8), standing_poses(8, torch.Generator().manual_seed(1))[:, None].repeat(1, HORIZON, 1)
+    walks = as_joints(stands).clone()
+    swing = 0.3 * torch.sin(torch.arange(HORIZON) / FPS * 2 * torch.pi)
+    for ankle, side in ((R_ANKLE, 1), (L_ANKLE, -1)):
+        walks[:, :, ankle, 1] += side * swing
+        walks[:, :, ankle - 1, 1] += side * swing / 2
+    for kind, relative in training.nearly("jumping jacks", jacks, walks.flatten(2), stands).items():
+        made = places(relative).flatten(2)
+        assert shipped_judge().recognised("jumping jacks", made).float().mean() <= 0.15, kind
 
 
 def test_the_shipped_judge_knows_people_it_has_not_seen(training: ModuleType) -> None:

@@ -229,6 +229,29 @@ def summary(states: Tensor, joints: Sequence[int]) -> Tensor:
     return torch.cat(found, dim=1)
 
 
+def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
+    """How round joints' ways are, the same for the mirror image: ``(sample, feature)``.
+
+    A way there and back on one line has one extent and encloses no area; a circle has two alike.
+
+    Args:
+        states: windows ``(sample, frame, 42)``.
+        joints: :data:`LOWER`, :data:`UPPER` or all; what of others is not looked at.
+    """
+    where = places(_in_sizes(states))
+    right = [joint for joint in (RK, RA, RE, RW) if joint in joints]
+    found: list[Tensor] = []
+    for side in (right, [skeleton.MIRROR[joint] for joint in right]):
+        way = (where[:, :, side] - where[:, :, side].mean(dim=1, keepdim=True)).transpose(1, 2)
+        extents = torch.linalg.eigvalsh(way.transpose(2, 3) @ way / way.shape[2]).flip(-1).clamp_min(0).sqrt()
+        steps = torch.diff(way, dim=2)
+        area = torch.linalg.vector_norm(torch.linalg.cross(way[:, :, :-1], steps).sum(dim=2), dim=-1, keepdim=True) / 2
+        length = torch.linalg.vector_norm(steps, dim=-1).sum(dim=2, keepdim=False)[..., None]
+        first = extents[..., :1] + 0.02
+        found.append(torch.cat([_log(extents, 0.01), extents[..., 1:] / first, area / first**2, length / first], dim=-1))
+    return torch.cat([values.flatten(1) for values in _sides(*found)], dim=1)
+
+
 def _extremes(values: Tensor) -> Tensor:
     """Of both sides' courses ``(sample, frame, 2)``: ``(sample, 8)``.
 

@@ -2,7 +2,10 @@
 
 Three kinds of recognisers vote: small convolutional networks over time, and two linear ones on numbers of the whole window. There
 is such a jury for the whole body, one for arms and trunk, and one for the legs, so that actions at the same time are judged apart.
-None has seen generated motion, or people who demonstrate new concepts. ``benchmarks/mocap_judge.py`` trains it.
+A jury picks the likeliest action, also where half of it is missing. Therefore the one for the whole body has verifiers: they have
+learned to tell an action from motion made to look like it, such as its arms on the legs of somebody who walks, or a third of its
+size. Where they do not confirm an action, it is not said. None has seen generated motion, or people who demonstrate new concepts.
+``benchmarks/mocap_judge.py`` trains it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
-from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary
+from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary, turns
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints
 from ftl_lightning.errors import UserError
 from ftl_lightning.shipped import shipped
@@ -32,12 +35,25 @@ PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
 """Joints that each part of the judge sees, and the classes it tells apart; the trunk belongs to the arms."""
 NUMBERS = {"summary": summary, "extremes": extremes}
 """What linear recognisers see, by name."""
+VERIFIED_BY = {**NUMBERS, "turns": turns}
+"""What verifiers see, by name."""
+VERIFIER = 32
+"""Hidden units of a verifier."""
 WIDTH, EMBEDDING = 40, 32
 """Channels of a network; numbers that its last layer decides by."""
 STILL = 0.3
 """Metres a second. Where every joint is slower over a sixth of a second, nobody does anything, however it may look."""
 RESTING = ("pose", STAND, OTHER)
 """Classes that are seen in windows without movement."""
+CONFIRMED = -3.0
+"""Mean verifier logit from which an action is confirmed: a probability of .05 that it is whole. Far lower than one half, as people
+whom the judge has not seen do an action a little otherwise than those it has learned from. Hard negatives get less still."""
+VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": CONFIRMED, "knee raise": CONFIRMED, "arm circle": 0.5}
+"""Actions that verifiers confirm or exclude, each with the least mean logit.
+
+More is asked of circles: they were recorded in all sizes, and a third of a large one is hardly smaller than a small one. Of actions
+that are not listed, verifiers refuse too many people whom they have not seen.
+"""
 _SIXTH = FPS // 6
 _OUTLIER = 5.0
 """Standard deviations beyond which a feature says no more."""
@@ -72,6 +88,18 @@ class Network(nn.Module):
         return self.head(self.embedding(courses))
 
 
+class Verifier(nn.Sequential):
+    """A perceptron on numbers of the whole window: logits ``(sample, class)`` that it shows the whole of an action.
+
+    Args:
+        numbers: that it sees.
+        classes: that it verifies.
+    """
+
+    def __init__(self, numbers: int, classes: int) -> None:
+        super().__init__(nn.Dropout(0.2), nn.Linear(numbers, VERIFIER), nn.ReLU(), nn.Dropout(0.3), nn.Linear(VERIFIER, classes))
+
+
 class Recogniser(nn.Module):
     """Networks and linear recognisers of the same joints and classes.
 
@@ -79,16 +107,19 @@ class Recogniser(nn.Module):
         joints: that it sees.
         classes: that it tells apart.
         members: number of networks.
+        verifiers: number of perceptrons that say of each class whether a window shows all of it; without any, all is confirmed.
     """
 
-    def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2) -> None:
+    def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2, verifiers: int = 0) -> None:
         super().__init__()
         self.joints, self.classes = tuple(joints), tuple(classes)
         still = torch.zeros(1, HORIZON, len(COLUMNS))
         channels = signals(still, joints).shape[1]
-        numbers = {name: of(still, joints).shape[1] for name, of in NUMBERS.items()}
+        seen = VERIFIED_BY if verifiers else NUMBERS
+        numbers = {name: of(still, joints).shape[1] for name, of in seen.items()}
         self.networks = nn.ModuleList(Network(channels, len(classes)) for _ in range(members))
-        self.linear = nn.ModuleDict({name: nn.Linear(size, len(classes)) for name, size in numbers.items()})
+        self.verifiers = nn.ModuleList(Verifier(sum(numbers.values()), len(classes)) for _ in range(verifiers))
+        self.linear = nn.ModuleDict({name: nn.Linear(numbers[name], len(classes)) for name in NUMBERS})
         for name, size in {"signals": channels, "embedding": EMBEDDING, **numbers}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -109,8 +140,8 @@ class Recogniser(nn.Module):
         return self._scaled("signals", signals(states, self.joints))
 
     def numbers(self, name: str, states: Tensor) -> Tensor:
-        """What a linear recogniser of :data:`NUMBERS` sees of them."""
-        return self._scaled(name, NUMBERS[name](states, self.joints))
+        """What of :data:`VERIFIED_BY` is seen of them."""
+        return self._scaled(name, VERIFIED_BY[name](states, self.joints))
 
     def features(self, states: Tensor) -> Tensor:
         """What the first network decides by: ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
@@ -125,10 +156,29 @@ class Recogniser(nn.Module):
         return {"networks": networks, **linear}
 
     def forward(self, states: Tensor) -> Tensor:
-        """The mean of all votes: scores ``(sample, class)``; of actions, minus infinity where no joint that it sees moves."""
+        """The mean of all votes: scores ``(sample, class)``.
+
+        Of actions, minus infinity where no joint that it sees moves, or where verifiers do not confirm that it is the whole action.
+        """
         scores = torch.stack(list(self.votes(states).values())).mean(dim=0)
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
-        return scores.masked_fill(self._still(states)[:, None] & actions_only, -torch.inf)
+        excluded = self._still(states)[:, None]
+        if len(self.verifiers):
+            least = torch.tensor([VERIFIED.get(name, -torch.inf) for name in self.classes])
+            excluded = excluded | (self.verified(states) < least)
+        return scores.masked_fill(excluded & actions_only, -torch.inf)
+
+    def verified(self, states: Tensor) -> Tensor:
+        """Of each class, mean logit ``(sample, class)`` that a window which looks like it shows the whole of it.
+
+        It means something for those of :data:`VERIFIED`.
+        """
+        numbers = self.all_numbers(states)
+        return torch.stack([verifier(numbers) for verifier in self.verifiers]).mean(dim=0)
+
+    def all_numbers(self, states: Tensor) -> Tensor:
+        """What verifiers see of windows ``(sample, 32, 42)``: ``(sample, number)``."""
+        return torch.cat([self.numbers(name, states) for name in VERIFIED_BY], dim=1)
 
     def _still(self, states: Tensor) -> Tensor:
         """Whether no joint gets anywhere within a sixth of a second: ``(sample,)``. Trembling joints do not."""
@@ -148,13 +198,18 @@ class Judge(nn.Module):
     Called like a module, it gives the whole body's features, as metrics of torchmetrics ask for it.
 
     Args:
-        members: networks of each.
+        members: networks of each, and verifiers of the one that sees the whole body.
     """
 
     def __init__(self, members: int = 2) -> None:
         super().__init__()
         self.members = members
-        self.parts = nn.ModuleDict({name: Recogniser(joints, classes, members) for name, (joints, classes) in PARTS.items()})
+        self.parts = nn.ModuleDict(
+            {
+                name: Recogniser(joints, classes, members, members if name == WHOLE else 0)
+                for name, (joints, classes) in PARTS.items()
+            }
+        )
         self.num_features = EMBEDDING
         self.eval()
 
