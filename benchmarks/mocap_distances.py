@@ -26,6 +26,7 @@ from ftl_lightning.domains.mocap.measures import distances, diversity, learned_e
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.mocap.source import POSE, Recorded, at_rest, pieces
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
+from ftl_lightning.domains.mocap.views import begun_elsewhere
 from ftl_lightning.learning.concept_check import expect_concept
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
@@ -142,9 +143,12 @@ def table(
     starts = source.starts(concept, number, seed).observed[POSE]
     turns = torch.arange(number)
     demonstrations = source.draw(concept, 5, seed).states
+    many = demonstrations[torch.arange(4 * number) % len(demonstrations)]
+    begun, _ = begun_elsewhere(many, {POSE: many[:, 0]}, generator("cpu", seed))
     rows = {
         "recordings of the demonstrators": shown,
         "demonstrations replayed": demonstrations[turns % len(demonstrations)],
+        "demonstrations begun in other poses": begun[(begun[:, 0] != many[:, 0]).any(dim=1)][:number],
         "frozen frame": starts[:, None].repeat(1, HORIZON, 1),
         "unconditional": generated(model, said(model), starts, seed),
         "text: walk": generated(model, said(model, "walk"), starts, seed),

@@ -50,6 +50,8 @@ from ftl_lightning.domains.mocap.features import (
 from ftl_lightning.domains.mocap.judge import LEGS, NUMBERS, PARTS, PATH, VERIFIED_BY, WHOLE, Judge, Network, Recogniser
 from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
+from ftl_lightning.domains.mocap.source import POSE
+from ftl_lightning.domains.mocap.views import begun_elsewhere
 from ftl_lightning.tensor_file import file_hash, write_text
 
 UNSEEN = ("13",)
@@ -241,7 +243,7 @@ def augmented(
     change: Callable[[Tensor, Tensor, torch.Generator], Tensor] | None = None,
     larger: Tensor | None = None,
 ) -> Tensor:
-    """``(window, 32, 42)`` of other paces, sides, sizes of movement, bodies and postures, slightly blurred or noisy.
+    """``(window, 32, 42)`` of other paces, sides, sizes, bodies and postures, half begun elsewhere, slightly blurred or noisy.
 
     Args:
         windows: as recorded.
@@ -281,6 +283,8 @@ def augmented(
     joints = _turned(places(relative), normal(count, 3) * torch.tensor([0.05, 0.05, 0.12]))
     drift = functional.interpolate(0.015 * normal(count, 3 * len(JOINTS), 6), size=HORIZON, mode="linear", align_corners=True)
     states = joints.flatten(2) + drift.transpose(1, 2) + uniform(0, 0.005, count, 1, 1) * normal(*states.shape)
+    # Who is judged may come from another pose, as generated motion does.
+    states, _ = begun_elsewhere(states, {POSE: states[:, 0]}, draw)
     padded = functional.pad(states.transpose(1, 2), (1, 1), mode="replicate")
     return torch.where(chance(0.4)[:, None, None], functional.avg_pool1d(padded, 3, stride=1).transpose(1, 2), states)
 
@@ -667,10 +671,17 @@ def hard_shares(judge: Judge, unseen: Windows, others: Windows) -> dict[str, dic
         middle = relative.mean(dim=1, keepdim=True)
         seven_tenths = places(_as_long(middle + 0.7 * (relative - middle), relative)).flatten(2)
         made = {kind: places(windows).flatten(2) for kind, windows in nearly(name, shown, walks, stands).items()}
+        begun, _ = begun_elsewhere(shown, {POSE: shown[:, 0]}, torch.Generator().manual_seed(0))
+        begun = begun[(begun[:, 0] != shown[:, 0]).any(dim=1)]
         with torch.no_grad():
             found[f"{name} of subject {person}"] = {
                 kind: float(judge.part(WHOLE).says(states, name).float().mean())
-                for kind, states in {"as recorded": shown, "seven tenths of the amplitude": seven_tenths, **made}.items()
+                for kind, states in {
+                    "as recorded": shown,
+                    "begun in another pose": begun,
+                    "seven tenths of the amplitude": seven_tenths,
+                    **made,
+                }.items()
             }
     return found
 

@@ -18,7 +18,7 @@ NEW, PARTS, WHOLE = "new concept", "new + training, by parts of the body", "new 
 LAST, LAST_BOTH = "new concept, last states", "new + training, last states"
 METHODS = (
     ("**over time with modes**", "FTL-IGM", "with modes over time", 1),
-    ("**over time with an adapter**", "FTL-IGM", "over time with adapter", 1),
+    ("**the same with an adapter**", "FTL-IGM", "with modes over time with adapter", 1),
     ("form chosen", "FTL-IGM", "over time form chosen", 1),
     ("over time, one set", "FTL-IGM", "over time", 1),
     ("one set for the whole plan, K = 2", "FTL-IGM", "", 2),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
+from ftl_lightning.evaluation.results import read_rows
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -134,6 +135,52 @@ def test_the_page_of_own_data_tells_what_check_finds() -> None:
         assert f"| {row} | {cells} |" in page
     paths, relations = (content["odd one, after learning"][name]["found"] for name in ("paths", "relations"))
     assert f"in {paths:.2f} of the sets of paths and in {relations:.2f} of those of relations" in page
+
+
+def test_the_tables_of_human_motion_are_what_the_results_say(tmp_path: Path) -> None:
+    tables = runpy.run_path(str(ROOT / "benchmarks" / "mocap_table.py"))
+    tables["main"]([f"--results={ROOT / 'results' / 'mocap.csv'}", f"--out={tmp_path / 'found.md'}"])
+    kept = (ROOT / "results" / "mocap.md").read_text(encoding="utf-8")
+    assert (tmp_path / "found.md").read_text(encoding="utf-8") == kept, "run benchmarks/mocap_table.py"
+
+
+def test_the_page_of_human_motion_tells_how_often_rules_hold_in_recordings() -> None:
+    content = json.loads((ROOT / "results" / "mocap_rules.json").read_text(encoding="utf-8"))
+    jacks, circle = content["jumping jacks"], content["arm circle"]
+    page = (ROOT / "docs" / "domains" / "human-motion.md").read_text(encoding="utf-8")
+    held = [f"{value:.2f}".lstrip("0") for one in (jacks, circle) for value in one["holds"].values()]
+    assert f"They hold in {held[0]} and {held[1]} of the windows of two people's jumping jacks" in page
+    assert f"in {held[2]} and {held[3]} of those of arm circles" in page
+    assert jacks["demonstrations"] == circle["demonstrations"] == 1
+    wrong = [f"{one['training concepts']:.4f}".lstrip("0") for one in (jacks, circle)]
+    assert f"in all demonstrations, and in {wrong[0]} and {wrong[1]} of the training concepts' windows" in page
+
+
+def test_texts_tell_the_numbers_of_human_motion() -> None:
+    rows = read_rows(ROOT / "results" / "mocap.csv")
+
+    def told(form: str, task: str, metric: str) -> str:
+        own = rows[(rows["method"] == "FTL-IGM") & (rows["form"] == form) & (rows["setting"] == "new concept")]
+        values = own[(own["task"] == task) & (own["metric"] == metric)]["value"]
+        assert len(values) == 3
+        return f"{values.mean():.2f}".lstrip("0")
+
+    ours, adapted = "with modes over time", "with modes over time with adapter"
+    jacks, circle = (told(ours, task, "rule") for task in ("jumping jacks", "arm circle"))
+    strides, judged = (told(ours, "jumping jacks", metric) for metric in ("strides", "accuracy"))
+    readme, limits, page = (
+        (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/limits.md", "docs/domains/human-motion.md")
+    )
+    assert f"in {jacks} of new samples (from strides {strides}; paper's form, text .00), arm circles in {circle}." in readme
+    assert f"right in {jacks} of the samples (from strides {strides}); the trained judge recognises {judged}." in limits
+    assert f"Arm circles turn fully in {circle}." in limits
+    assert f"The rule holds in {jacks} of the samples of ours, from strides in {strides}; the judge recognises {judged}." in page
+    assert f"- **Arm circles** satisfy the rule in {circle}:" in page
+    both = [told(adapted, task, metric) for metric in ("rule", "accuracy") for task in ("jumping jacks", "arm circle")]
+    assert "({} and {} by the rule, {} and {} by the judge)".format(*both) in page
+    chosen, single = "mixtures of them), an adapter alone in one: {} and {}.", "({} and {}), nor can one set"
+    for form, text in (("over time form chosen", chosen), ("over time", single)):
+        assert text.format(*(told(form, task, "rule") for task in ("jumping jacks", "arm circle"))) in page
 
 
 def test_a_docstring_that_leaves_out_a_field_is_an_error() -> None:

@@ -61,6 +61,8 @@ def test_a_jumping_jack_needs_hands_and_feet_in_time() -> None:
     lying = jack()[..., [*range(42)]].clone()
     as_joints(lying)[..., 2] *= 0.3
     assert rule(lying).tolist() == [False], "nobody upright"
+    trembling = jack() + 0.03 * torch.randn(1, HORIZON, 42, generator=torch.Generator().manual_seed(0))
+    assert rule(trembling).tolist() == [False]
 
 
 def test_an_arm_circle_needs_a_turn_on_a_round_path() -> None:

@@ -1,4 +1,4 @@
-"""Rules that say what the body does: how high, how far, how often, in time with what.
+"""Rules that say what the body does: how high, how far, how often, in time with what. Trembling shows nothing.
 
 They look at joints alone, know nothing of recordings, and are calibrated on them (docs/experiments-mocap.md): a second opinion
 beside the judge that has learned what actions look like.
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ftl_lightning.domains.mocap.skeleton import (
     ANKLES,
+    FPS,
     HEAD,
     HIPS,
     KNEES,
@@ -42,6 +43,8 @@ RAISED, LOWERED = 0.15, 0.3
 """Metres below the hips: a raised knee is higher than the first, and lower than the second at another time, as the other one is."""
 BENT, STRETCHED = 70.0, 30.0
 """Degrees: in a squat both knees are bent by more than the first at once, and at another time by less, by the second at least."""
+TREMBLING = 900.0
+"""Jerk in metres a second cubed that no action has: that of 99 windows of 100 of recordings is less."""
 UPRIGHT, ON_FEET = 0.35, 0.5
 """Metres from the hips up to the neck, and down to each ankle, at least, of somebody who stands or hops."""
 
@@ -71,6 +74,17 @@ def upright(states: Tensor) -> Tensor:
     """Whether somebody stands or hops upright on both feet all the time: ``(sample,)`` of bool."""
     height = as_joints(states)[..., 2]
     return (height[..., NECK] > UPRIGHT).all(dim=1) & (height[..., list(ANKLES)] < -ON_FEET).all(dim=-1).all(dim=1)
+
+
+def jerk(states: Tensor) -> Tensor:
+    """How much motion trembles: ``(sample,)``, mean size of the joints' third derivative, metres a second cubed."""
+    third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
+    return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
+
+
+def calm(states: Tensor) -> Tensor:
+    """Whether motion trembles no more than people's: ``(sample,)`` of bool. Joints that jump about pass through anything."""
+    return jerk(states) < TREMBLING
 
 
 def hands_amplitude(states: Tensor) -> Tensor:
@@ -107,7 +121,7 @@ def hands_overhead(states: Tensor) -> Tensor:
 
 def jumping_jacks(states: Tensor) -> Tensor:
     """Hands overhead and down, feet open and closed in time with them, upright: ``(sample,)`` of bool."""
-    return hands_overhead(states) & feet_in_time(states) & upright(states)
+    return hands_overhead(states) & feet_in_time(states) & upright(states) & calm(states)
 
 
 def _paths(states: Tensor) -> Tensor:
@@ -141,7 +155,7 @@ def arm_circle(states: Tensor) -> Tensor:
     width = 8**0.5 * size / frames**0.5  # of a circle, its diameter
     wide = (width[..., 1] >= WIDTH) & (size[..., 1] >= ROUND * size[..., 0])
     turned = _turned(states)
-    return upright(states) & (wide & (turned >= TURN * 2 / 3)).all(dim=-1) & (turned.mean(dim=-1) >= TURN)
+    return calm(states) & upright(states) & (wide & (turned >= TURN * 2 / 3)).all(dim=-1) & (turned.mean(dim=-1) >= TURN)
 
 
 def _centred(values: Tensor) -> Tensor:
@@ -152,7 +166,7 @@ def knee_raise(states: Tensor) -> Tensor:
     """A knee is raised, and hangs at another time: ``(sample,)`` of bool."""
     below = as_joints(states)[..., list(HIPS), 2] - as_joints(states)[..., list(KNEES), 2]
     raised = (below < RAISED) & (below.flip(-1) > LOWERED)
-    return (raised.any(dim=1) & (below.amax(dim=1) > LOWERED)).any(dim=-1)
+    return (raised.any(dim=1) & (below.amax(dim=1) > LOWERED)).any(dim=-1) & calm(states)
 
 
 def squat(states: Tensor) -> Tensor:
@@ -162,7 +176,7 @@ def squat(states: Tensor) -> Tensor:
     shank = joints[..., list(ANKLES), :] - joints[..., list(KNEES), :]
     bend = torch.rad2deg(torch.arccos(torch.cosine_similarity(thigh, shank, dim=-1).clamp(-1, 1)))
     both = bend.amin(dim=-1)
-    return (both.amax(dim=1) > BENT) & (_range(both) > STRETCHED)
+    return (both.amax(dim=1) > BENT) & (_range(both) > STRETCHED) & calm(states)
 
 
 RULES: Mapping[str, Callable[[Tensor], Tensor]] = {

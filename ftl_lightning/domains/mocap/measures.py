@@ -17,7 +17,7 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.mocap import kinematics
 from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
-from ftl_lightning.domains.mocap.skeleton import BONES, FPS, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
+from ftl_lightning.domains.mocap.skeleton import BONES, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
 from ftl_lightning.errors import UserError
 from ftl_lightning.extras import expect_extra
 
@@ -46,9 +46,8 @@ def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
 
 
 def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """How much motion trembles: ``(sample,)``, mean size of the joints' third derivative, metres a second cubed."""
-    third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
-    return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
+    """How much motion trembles: ``(sample,)``, see :func:`~ftl_lightning.domains.mocap.kinematics.jerk`."""
+    return kinematics.jerk(states)
 
 
 def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:

@@ -42,9 +42,10 @@ def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
 
 
 def smoothed(states: Tensor, observed: Observed) -> Tensor:
-    """Motion as a running mean over three frames, with rigid bones; first and last frame stay.
+    """Motion as a running mean over three frames of such a mean, with rigid bones; first and last frame stay.
 
-    Errors of a network are independent between frames, motion is not: the mean over three frames keeps a third of their variance.
+    Errors of a network are independent between frames, motion is not: the weighted mean of five frames keeps a quarter of their
+    variance.
 
     Args:
         states: ``(sample, horizon, 42)`` in metres.
@@ -53,8 +54,10 @@ def smoothed(states: Tensor, observed: Observed) -> Tensor:
     Returns:
         ``(sample, horizon, 42)``.
     """
-    inside = (states[:, :-2] + states[:, 1:-1] + states[:, 2:]) / 3
-    return with_rigid_bones(torch.cat((states[:, :1], inside, states[:, -1:]), dim=1), observed)
+    for _ in range(2):
+        inside = (states[:, :-2] + states[:, 1:-1] + states[:, 2:]) / 3
+        states = torch.cat((states[:, :1], inside, states[:, -1:]), dim=1)
+    return with_rigid_bones(states, observed)
 
 
 SHARE = 0.5
