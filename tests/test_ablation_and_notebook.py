@@ -101,7 +101,7 @@ def test_a_notebook_shows_the_committed_results(name: str, tables: int, checkout
     assert sum("| paper |" in text for text in run(name, checkout)) == tables
 
 
-@pytest.mark.parametrize(("name", "tables"), [("comparison", 4), ("curves", 3), ("concepts", 0), ("mocap", 1)])
+@pytest.mark.parametrize(("name", "tables"), [("comparison", 4), ("curves", 3), ("concepts", 0), ("mocap", 2)])
 def test_a_notebook_beyond_one_domain_shows_the_committed_results(
     name: str, tables: int, checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
