@@ -175,6 +175,9 @@ def test_texts_tell_the_numbers_of_human_motion() -> None:
     assert f"right in {jacks} of the samples (from strides {strides}); the trained judge recognises {judged}." in limits
     assert f"Arm circles turn fully in {circle}." in limits
     assert f"The rule holds in {jacks} of the samples of ours, from strides in {strides}; the judge recognises {judged}." in page
+    card = (ROOT / "pretrained" / "mocap" / "README.md").read_text(encoding="utf-8")
+    assert f"{jacks} by a rule of hands and feet (from strides {strides}), {judged} by the trained judge" in card
+    assert f"arm circles {circle} and {told(ours, 'arm circle', 'accuracy')}; see" in card
     assert f"- **Arm circles** satisfy the rule in {circle}:" in page
     both = [told(adapted, task, metric) for metric in ("rule", "accuracy") for task in ("jumping jacks", "arm circle")]
     assert "({} and {} by the rule, {} and {} by the judge)".format(*both) in page
