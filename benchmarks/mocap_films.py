@@ -21,7 +21,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.mocap.domain import DOMAIN
 from ftl_lightning.domains.mocap.skeleton import COLUMNS
 from ftl_lightning.domains.mocap.source import NAME, Recorded
-from ftl_lightning.domains.mocap.tasks import PAPER_CONCEPTS
+from ftl_lightning.domains.mocap.tasks import TEST_CONCEPTS
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.text_concept_model import TextConceptModel
@@ -92,7 +92,7 @@ def write(options: argparse.Namespace) -> None:
     if (options.out / "films").exists():
         raise UserError(f"out: expected a folder without films, which may be those of another page, found some in {options.out}")
     model, source = FewShot.from_pretrained(options.pretrained), Recorded(options.root)
-    made = {concept: films(options, concept, model, source) for concept in PAPER_CONCEPTS}
+    made = {concept: films(options, concept, model, source) for concept in TEST_CONCEPTS}
     if alone := [concept for concept in made if not len(made[concept][PEOPLE])]:
         print(f"no condition {PEOPLE!r}: nobody but the demonstrators shows {', '.join(alone)} in {options.root}")
     for concept, conditions in made.items():

@@ -35,7 +35,7 @@ def test_committed_files_are_read_and_written_with_the_same_bytes() -> None:
     assert len(COMMITTED) >= 48
     for path in COMMITTED:
         found = Concept.load(path)
-        assert (found.modes is not None) == any(part in path.as_posix() for part in ("_modes/", "/mocap/"))
+        assert (found.modes is not None) == any(part in path.as_posix() for part in ("_modes/", "/mocap/", "/mocap_adapter/"))
         found.save("again.safetensors")
         assert Path("again.safetensors").read_bytes() == path.read_bytes()
 
