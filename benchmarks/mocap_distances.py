@@ -51,17 +51,28 @@ def windows(states: Tensor, stride: int) -> list[Tensor]:
     return [states[start : start + HORIZON] for start in range(0, len(states) - HORIZON + 1, stride)]
 
 
-def recorded(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
-    """Windows ``(window, 32, 42)`` of a new concept by those who demonstrate it, or by others."""
-    every, found = source.recordings, []
+def shown_by(source: Recorded, concept: str, demonstrators: bool) -> list[Tensor]:
+    """Stretches ``(frame, 42)`` in which those who demonstrate a new concept show it, or others."""
+    every, found = source.recordings, list[Tensor]()
     for segment in source.segments:
         if segment.label != concept or segment.trial_id not in every.trial_id:
             continue
         trial = every.trial_id.index(segment.trial_id)
         if (every.subject[trial] in DEMONSTRATORS) == demonstrators:
-            for states in pieces(every.trial(trial)[segment.start : segment.stop], longest=None):
-                found += windows(states, 1)
+            found += pieces(every.trial(trial)[segment.start : segment.stop], longest=None)
+    return found
+
+
+def recorded(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
+    """Windows ``(window, 32, 42)`` of a new concept by those who demonstrate it, or by others."""
+    found = [window for states in shown_by(source, concept, demonstrators) for window in windows(states, 1)]
     return torch.stack(found) if found else torch.zeros(0, HORIZON, 42)
+
+
+def beginnings(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
+    """Of these, those that start nearest to rest, as demonstrations do."""
+    parts = shown_by(source, concept, demonstrators)
+    return torch.stack([states[start : start + HORIZON] for states in parts for start in at_rest(states)])
 
 
 def actions(source: Recorded, stride: int) -> dict[str, Tensor]:
@@ -100,19 +111,6 @@ def spread(windows: Tensor) -> float:
     far = windows[..., SETTLED:, :] - windows[..., SETTLED:, :].mean(dim=-3, keepdim=True)
     share = windows.shape[-3] / (windows.shape[-3] - 1)
     return float((3 * share * far.square().mean()).sqrt())  # three coordinates of a joint
-
-
-def beginnings(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
-    """Windows of people that start nearest to rest, as demonstrations do."""
-    every, found = source.recordings, []
-    for segment in source.segments:
-        if segment.label != concept or segment.trial_id not in every.trial_id:
-            continue
-        trial = every.trial_id.index(segment.trial_id)
-        if (every.subject[trial] in DEMONSTRATORS) == demonstrators:
-            for states in pieces(every.trial(trial)[segment.start : segment.stop], longest=None):
-                found += [states[start : start + HORIZON] for start in at_rest(states)]
-    return torch.stack(found)
 
 
 def walking(source: Recorded, model: ConceptModel, seed: int) -> dict[str, object]:

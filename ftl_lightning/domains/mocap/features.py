@@ -246,7 +246,7 @@ def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
         extents = torch.linalg.eigvalsh(way.transpose(2, 3) @ way / way.shape[2]).flip(-1).clamp_min(0).sqrt()
         steps = torch.diff(way, dim=2)
         area = torch.linalg.vector_norm(torch.linalg.cross(way[:, :, :-1], steps).sum(dim=2), dim=-1, keepdim=True) / 2
-        length = torch.linalg.vector_norm(steps, dim=-1).sum(dim=2, keepdim=False)[..., None]
+        length = torch.linalg.vector_norm(steps, dim=-1).sum(dim=2)[..., None]
         first = extents[..., :1] + 0.02
         found.append(torch.cat([_log(extents, 0.01), extents[..., 1:] / first, area / first**2, length / first], dim=-1))
     return torch.cat([values.flatten(1) for values in _sides(*found)], dim=1)
