@@ -5,6 +5,7 @@ import re
 import runpy
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean, pstdev
 
 import pytest
 
@@ -188,20 +189,23 @@ def test_texts_tell_the_numbers_of_human_motion() -> None:
 
 def test_the_notes_tell_how_well_the_judge_of_motion_recognises_unseen_people() -> None:
     content = json.loads((ROOT / "results" / "mocap_judge.json").read_text(encoding="utf-8"))
-    (run,) = content["across people"]
+    runs = content["across people"]
     notes = (ROOT / "docs" / "experiments-mocap.md").read_text(encoding="utf-8")
-    shares = [run["whole together"][key] for key in ("balanced accuracy", "of the tested classes alone")]
-    assert "| **whole body, with verifiers** | **{}** | **{}** |".format(*(f"{share:.3f}".lstrip("0") for share in shares)) in notes
-    nearly = [
-        run["hard negatives"][f"{name} of subject {person}"] for name in ("jumping jacks", "arm circle") for person in (13, 14)
-    ]
+    cells = []
+    for key in ("balanced accuracy", "of the tested classes alone"):
+        shares = [run["whole together"][key] for run in runs]
+        cells.append(f"**{mean(shares):.3f}** ({pstdev(shares):.3f})".replace("0.", "."))
+    assert f"| **whole body, with verifiers** | {' | '.join(cells)} |" in notes
+    first = runs[0]["hard negatives"]
+    nearly = [first[f"{name} of subject {person}"] for name in ("jumping jacks", "arm circle") for person in (13, 14)]
     nearly += [content["hard negatives"][f"{name} of subject 13"] for name in ("jumping jacks", "arm circle")]
     for kind in dict.fromkeys(kind for found in nearly for kind in found):
         cells = [f"{found[kind]:.2f}".replace("0.", ".") if kind in found else "" for found in nearly]
         assert f"| {kind} | {' | '.join(cells)} |" in notes, kind
     kept = ("as recorded", "begun in another pose", "seven tenths of the amplitude")
-    worst = max(share for found in nearly for kind, share in found.items() if kind not in kept)
-    assert f"Worst: {worst:.2f}".replace("0.", ".") in notes
+    every = [found for run in runs for found in run["hard negatives"].values()] + nearly
+    worst = max(share for found in every for kind, share in found.items() if kind not in kept)
+    assert f"over all seeds {worst:.2f}".replace("0.", ".") in notes
 
 
 def test_a_docstring_that_leaves_out_a_field_is_an_error() -> None:
