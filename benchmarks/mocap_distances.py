@@ -51,16 +51,20 @@ def windows(states: Tensor, stride: int) -> list[Tensor]:
     return [states[start : start + HORIZON] for start in range(0, len(states) - HORIZON + 1, stride)]
 
 
-def shown_by(source: Recorded, concept: str, demonstrators: bool) -> list[Tensor]:
-    """Stretches ``(frame, 42)`` in which those who demonstrate a new concept show it, or others."""
-    every, found = source.recordings, list[Tensor]()
+def stretches(source: Recorded, concept: str) -> list[tuple[str, Tensor]]:
+    """Who shows a new concept, and a stretch ``(frame, 42)`` in which it is shown."""
+    every, found = source.recordings, list[tuple[str, Tensor]]()
     for segment in source.segments:
-        if segment.label != concept or segment.trial_id not in every.trial_id:
-            continue
-        trial = every.trial_id.index(segment.trial_id)
-        if (every.subject[trial] in DEMONSTRATORS) == demonstrators:
-            found += pieces(every.trial(trial)[segment.start : segment.stop], longest=None)
+        if segment.label == concept and segment.trial_id in every.trial_id:
+            trial = every.trial_id.index(segment.trial_id)
+            states = every.trial(trial)[segment.start : segment.stop]
+            found += [(every.subject[trial], piece) for piece in pieces(states, longest=None)]
     return found
+
+
+def shown_by(source: Recorded, concept: str, demonstrators: bool) -> list[Tensor]:
+    """Those of people who demonstrate it, or of others."""
+    return [states for subject, states in stretches(source, concept) if (subject in DEMONSTRATORS) == demonstrators]
 
 
 def recorded(source: Recorded, concept: str, demonstrators: bool) -> Tensor:

@@ -1,4 +1,4 @@
-"""How often the rules of human motion hold in recordings: of the action, of other actions, and of what training concepts show.
+"""How often the rules of human motion hold in recordings: of the action, and of what training concepts show.
 
 python benchmarks/mocap_rules.py --root FOLDER --out results/mocap_rules.json
 """
@@ -9,30 +9,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from mocap_distances import stretches, windows
 from torch import Tensor
 
 from ftl_lightning.domains.mocap.kinematics import RULES
-from ftl_lightning.domains.mocap.skeleton import HORIZON
-from ftl_lightning.domains.mocap.source import Recorded, pieces
+from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.tensor_file import write_text
 
 STRIDE = 8
 """Frames between windows of the training concepts' trials."""
 
 
-def windows(states: Tensor, stride: int) -> list[Tensor]:
-    """As long as a plan, of ``(frame, 42)``."""
-    return [states[start : start + HORIZON] for start in range(0, len(states) - HORIZON + 1, stride)]
-
-
 def shown(source: Recorded, action: str) -> dict[str, Tensor]:
-    """All windows ``(window, 32, 42)`` of an action's segments by person."""
-    every, found = source.recordings, dict[str, list[Tensor]]()
-    for segment in source.segments:
-        if segment.label == action and segment.trial_id in every.trial_id:
-            trial = every.trial_id.index(segment.trial_id)
-            for states in pieces(every.trial(trial)[segment.start : segment.stop], longest=None):
-                found.setdefault(every.subject[trial], []).extend(windows(states, 1))
+    """All windows ``(window, 32, 42)`` of an action by person."""
+    found = dict[str, list[Tensor]]()
+    for subject, states in stretches(source, action):
+        found.setdefault(subject, []).extend(windows(states, 1))
     return {subject: torch.stack(own) for subject, own in found.items()}
 
 

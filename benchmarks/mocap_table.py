@@ -14,6 +14,7 @@ import pandas as pd
 from ftl_lightning.tensor_file import write_text
 
 JACKS, CIRCLE = "jumping jacks", "arm circle"
+BOTH = tuple(f"{concept} + {other}" for concept in (JACKS, CIRCLE) for other in ("walk", "jump"))
 NEW, PARTS, WHOLE = "new concept", "new + training, by parts of the body", "new + training"
 LAST, LAST_BOTH = "new concept, last states", "new + training, last states"
 METHODS = (
@@ -78,14 +79,13 @@ def new_concepts(rows: pd.DataFrame, task: str, columns: Sequence[tuple[str, str
 
 def compositions(rows: pd.DataFrame) -> str:
     """What the judge says of arms and trunk, and of the legs."""
-    tasks = [f"{concept} + {other}" for concept in (JACKS, CIRCLE) for other in ("walk", "jump")]
     lines = []
     for name, method, form, components in METHODS:
         own = selected(rows, method, form, components)
-        line = [cell(values(own, setting, task, "accuracy")) for setting in (PARTS, WHOLE) for task in tasks]
+        line = [cell(values(own, setting, task, "accuracy")) for setting in (PARTS, WHOLE) for task in BOTH]
         if set(line) != {"-"}:
             lines.append([name, *line])
-    head = [*(f"{task}, by parts" for task in tasks), *(f"{task}, whole body" for task in tasks)]
+    head = [*(f"{task}, by parts" for task in BOTH), *(f"{task}, whole body" for task in BOTH)]
     return table(["compositions, judge", *head], lines)
 
 
@@ -95,12 +95,10 @@ def protocol(rows: pd.DataFrame) -> str:
     lines = []
     for (components, shown), part in own.groupby(["K", "demonstrations"]):
         alone = [cell(values(part, LAST, task, metric)) for task in (JACKS, CIRCLE) for metric in ("rule", "accuracy")]
-        both = [
-            cell(values(part, LAST_BOTH, f"{task} + {other}", "accuracy")) for task in (JACKS, CIRCLE) for other in ("walk", "jump")
-        ]
+        both = [cell(values(part, LAST_BOTH, task, "accuracy")) for task in BOTH]
         lines.append([f"K = {components}, {shown} demonstrations", *alone, *both])
     head = [f"{task}, {said}" for task in (JACKS, CIRCLE) for said in ("rule", "judge")]
-    head += [f"{task} + {other}, judge" for task in (JACKS, CIRCLE) for other in ("walk", "jump")]
+    head += [f"{task}, judge" for task in BOTH]
     return table(["the paper's form of the concept, from last states", *head], lines)
 
 

@@ -187,6 +187,28 @@ def test_texts_tell_the_numbers_of_human_motion() -> None:
         assert text.format(*(told(form, task, "rule") for task in ("jumping jacks", "arm circle"))) in page
 
 
+def test_the_page_of_human_motion_tells_distances_and_compositions() -> None:
+    content = json.loads((ROOT / "results" / "mocap_distances.json").read_text(encoding="utf-8"))
+    page, limits = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("domains/human-motion.md", "limits.md"))
+
+    def far(concept: str, form: str) -> str:
+        rows = [row["kid over that between people"] for name, row in content[concept].items() if name.startswith(f"{form}, ")]
+        assert len(rows) == 3
+        return f"{mean(rows):.1f}"
+
+    jacks, circles = ([far(concept, form) for form in ("ours", "ours with adapter")] for concept in ("jumping jacks", "arm circle"))
+    assert f"jumping jacks are {jacks[0]} times as far from another person as two people are from each other" in page
+    assert f"(with an adapter {jacks[1]}), arm circles {circles[0]} times ({circles[1]})" in page
+    assert f"is {jacks[0]} times the distance between two people's; with an adapter {jacks[1]} times." in limits
+    rows = read_rows(ROOT / "results" / "mocap.csv")
+    own = rows[(rows["form"] == "with modes over time") & (rows["metric"] == "accuracy")]
+    own = own[own["setting"] == "new + training, by parts of the body"]
+    rates = own.groupby("task")["value"].mean()
+    tasks = [f"{concept} + {other}" for concept in ("jumping jacks", "arm circle") for other in ("walk", "jump")]
+    told = [f"{rates[task]:.2f}".lstrip("0") for task in tasks]
+    assert "recognises both concepts in {} (jumping jacks + walk), {}, {} and {};".format(*told) in page
+
+
 def test_the_notes_tell_how_well_the_judge_of_motion_recognises_unseen_people() -> None:
     content = json.loads((ROOT / "results" / "mocap_judge.json").read_text(encoding="utf-8"))
     runs = content["across people"]

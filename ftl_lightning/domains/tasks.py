@@ -21,8 +21,8 @@ class EvaluationTask:
         without: training concepts in the composition with the negative weight :data:`WITHOUT_WEIGHT`: what behaviour should not be.
         component: number (from 1) of the only component of the learned concept that is used, or ``None`` for all.
         on: concepts, learned or texts, that act on some groups of a state's columns only, each with the names of the groups.
-        initial: where plans start, in domains with initial states: in new ones, or in those that the demonstrations that the
-            concept was learned from start in, or end in.
+        initial: where plans start, in domains with initial states: in new ones, or where the demonstrations of the learned concept
+            start (``'demonstrated'``) or end (``'last'``).
 
     Raises:
         UserError: at construction, for ``learned``, ``texts`` or ``without`` that are no tuples, or where a single component or the

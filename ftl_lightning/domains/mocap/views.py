@@ -1,6 +1,7 @@
 """How a model may see motion: as it stands in files, or with bones that keep their lengths; begun from other poses."""
 
 import itertools
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -103,23 +104,17 @@ def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
     return with_rigid_bones(torch.stack(list(states)[1:], dim=1), observed)
 
 
+_RIGID = View(
+    OBSERVED,
+    observe=lambda observed: observed,
+    encode=lambda states, observed: states,
+    decode=with_rigid_bones,
+    perturb=begun_elsewhere,
+    same_columns=True,
+)
 VIEWS = {
-    "rigid": View(
-        OBSERVED,
-        observe=lambda observed: observed,
-        encode=lambda states, observed: states,
-        decode=with_rigid_bones,
-        perturb=begun_elsewhere,
-        same_columns=True,
-    ),
-    "smooth": View(
-        OBSERVED,
-        observe=lambda observed: observed,
-        encode=lambda states, observed: states,
-        decode=smoothed,
-        perturb=begun_elsewhere,
-        same_columns=True,
-    ),
+    "rigid": _RIGID,
+    "smooth": replace(_RIGID, decode=smoothed),
     "steps": View(OBSERVED, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps),
 }
 """Seen as ``rigid``, what is learned from is as it stands in files, and what is generated has rigid bones; ``smooth`` is the same
