@@ -26,7 +26,7 @@ class Normalization(nn.Module):
         self.register_buffer("high", high.float().clone())
 
     @classmethod
-    def fit(cls, states: Tensor, shared: Sequence[Sequence[int]] = (), resolution: float = 0.0) -> Self:
+    def fit(cls, states: Tensor, shared: Sequence[Sequence[int]] = (), resolution: float = 0.0, plane: Sequence[int] = ()) -> Self:
         """From states ``(..., state)``.
 
         Args:
@@ -35,6 +35,7 @@ class Normalization(nn.Module):
                 they share their extremes.
             resolution: in the domain's units: what varies less is rounding, which scaling to [-1, 1] would blow up, and counts as
                 constant.
+            plane: columns that are turned together: they share one scale, whose middle is 0.
         """
         flat = states.flatten(0, -2)
         low, high = flat.amin(dim=0), flat.amax(dim=0)
@@ -42,6 +43,10 @@ class Normalization(nn.Module):
             columns = torch.tensor([list(entity) for entity in shared])
             low[columns] = low[columns].amin(dim=0).expand(columns.shape)
             high[columns] = high[columns].amax(dim=0).expand(columns.shape)
+        if plane:
+            columns = torch.tensor(list(plane))
+            high[columns] = torch.maximum(high[columns], -low[columns]).amax()
+            low[columns] = -high[columns]
         rounding = RELATIVE * torch.maximum(low.abs(), high.abs())
         return cls(low, torch.where(high - low < torch.clamp(rounding, min=resolution), low, high))
 

@@ -5,7 +5,7 @@ paper's encoder takes vectors as one, and so does another that sees the concept,
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.image_encoder import POINT
 from ftl_lightning.errors import UserError
 
 
@@ -26,6 +27,10 @@ class ConditionEncoder(nn.Module, ABC):
     @abstractmethod
     def attend(self, context: Context, concept: Tensor) -> Tensor:
         """Features ``(batch, width)`` of that for ``concept (batch, n)``."""
+
+    def direction(self, context: Context, concept: Tensor) -> Tensor | None:
+        """A unit vector ``(batch, 2)``, from which directions in a plan are told; ``None`` where they are told as they are."""
+        return None
 
 
 class FlatEncoder(ConditionEncoder):
@@ -165,11 +170,96 @@ class SetEncoder(ConditionEncoder):
         return context[0]
 
 
+class PointEncoder(ConditionEncoder):
+    """Points that were read of images: the concept chooses some, of which is read how they lie to each other and to the origin.
+
+    Each of :data:`CHOSEN` choices is a mean of all points, weighed by the concept alone (attention whose keys are the points'
+    names), so that another concept may mean another thing by the same plan. Of every chosen point, and of every difference between
+    two, the network is given the vector, its direction and the logarithm of its length: what is near and what is far differ in
+    scale. Where plans have a plane, all vectors are told from the direction from the first chosen point to the second, and so is
+    the plan: whatever is learned holds in every direction.
+
+    Args:
+        sizes: with the numbers that are read of images, which have to be points.
+        width: of the features.
+
+    Raises:
+        UserError: for an encoder of images that does not read points.
+    """
+
+    def __init__(self, sizes: Sizes, width: int) -> None:
+        super().__init__()
+        if not sizes.image_dim or sizes.image_dim % POINT:
+            raise UserError("denoiser_args.initial_encoder: expected flat, found points: no points are read of images")
+        self.count, self.turns = sizes.image_dim // POINT, bool(sizes.plane)
+        self.choice = nn.Linear(sizes.concept_dim, CHOSEN * self.count)
+        with torch.no_grad():  # every choice starts with a favourite of its own
+            self.choice.bias.copy_(2.0 * torch.eye(self.count)[torch.arange(CHOSEN) % self.count].flatten())
+        vectors = CHOSEN * (CHOSEN + 1) // 2
+        inputs = sizes.measured_dim + 5 * vectors + 2 * CHOSEN
+        self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+
+    def observe(self, vector: Tensor) -> Context:
+        """What was measured, and the points ``(batch, point, 4)``."""
+        measured, points = vector.split((vector.shape[1] - POINT * self.count, POINT * self.count), dim=1)
+        return measured, points.unflatten(1, (POINT, self.count)).transpose(1, 2)
+
+    def _chosen(self, context: Context, concept: Tensor) -> Tensor:
+        """``(batch, choice, 4)``."""
+        weights = self.choice(concept / concept.shape[-1] ** 0.5).unflatten(1, (CHOSEN, self.count)).softmax(dim=-1)
+        chosen: Tensor = weights @ context[1]
+        return chosen
+
+    def direction(self, context: Context, concept: Tensor) -> Tensor | None:
+        if not self.turns:
+            return None
+        first, second = self._chosen(context, concept)[:, :2, :2].unbind(dim=1)
+        return functional.normalize(second - first + 1e-6, dim=-1)
+
+    def attend(self, context: Context, concept: Tensor) -> Tensor:
+        chosen = self._chosen(context, concept)
+        places = chosen[..., :2]
+        first, second = torch.triu_indices(CHOSEN, CHOSEN, 1, device=places.device)
+        vectors = torch.cat((places, places[:, second] - places[:, first]), dim=1)
+        if (direction := self.direction(context, concept)) is not None:
+            vectors = turned(vectors, direction, (0, 1), back=False)
+        length = (vectors.square().sum(dim=-1, keepdim=True) + SMALLEST**2).sqrt()
+        rest = torch.cat((10 * chosen[..., 2], chosen[..., 3].sigmoid()), dim=1)
+        parts = (context[0], vectors.flatten(1), (vectors / length).flatten(1), (length / SMALLEST).log()[..., 0] / 3, rest)
+        features: Tensor = self.net(torch.cat(parts, dim=1))
+        return features
+
+
+CHOSEN = 4
+"""Points that a concept chooses."""
+SMALLEST = 0.02
+"""Length of a vector below which its direction counts less and less."""
+
+
+def turned(values: Tensor, direction: Tensor, plane: Sequence[int], back: bool) -> Tensor:
+    """Vectors told from a direction, or, back, told as they are.
+
+    Args:
+        values: ``(batch, ..., column)``.
+        direction: unit vectors ``(batch, 2)``.
+        plane: the two columns of x and y.
+        back: whether they are told from the direction.
+    """
+    x, y = (values[..., column] for column in plane)
+    cos, sin = (part.reshape(-1, *(1,) * (x.dim() - 1)) for part in direction.unbind(dim=1))
+    if back:
+        sin = -sin
+    found = list(values.unbind(dim=-1))
+    found[plane[0]], found[plane[1]] = cos * x + sin * y, cos * y - sin * x
+    return torch.stack(found, dim=-1)
+
+
 ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {
     "flat": FlatEncoder,
     "joint": JointEncoder,
     "entities": EntityEncoder,
     "set": SetEncoder,
+    "points": PointEncoder,
 }
 
 

@@ -21,6 +21,7 @@ class Sizes:
         concept_dim: columns of a concept embedding.
         observed: features that it is conditioned on, by name; empty where there are none.
         image_dim: numbers that are read of the observed images, which stand behind the observed vectors.
+        plane: columns of a state that are x and y in the coordinates of points that are read of images.
     """
 
     horizon: int
@@ -28,6 +29,7 @@ class Sizes:
     concept_dim: int
     observed: Mapping[str, Feature] = field(default_factory=dict)
     image_dim: int = 0
+    plane: tuple[int, ...] = ()
 
     @property
     def measured_dim(self) -> int:

@@ -14,15 +14,18 @@ from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.schema import built
 
+MOST_POINTS = 1000
 MOST_PIXELS = 100_000_000
 """Numbers of an image."""
 GROUPS = 8
 """Of group normalisation, which replaces batch normalisation: that keeps statistics beside the weights, which no running average
 of weights holds (Chi et al., 2023)."""
-QUARTER = 4
+STRIDES = (2, 4)
 RESNET18 = "resnet18"
 NETWORKS = ("small", RESNET18)
-HEADS = ("keypoints", "grid")
+KEYPOINTS, POINTS, GRID = HEADS = ("keypoints", "points", "grid")
+POINT = 4
+"""Numbers of a point: x, y, height, and the logit of being seen."""
 
 
 class ResidualBlock(nn.Module):
@@ -61,12 +64,33 @@ class SpatialSoftmax(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, channels, height, width)`` to column, row (-1 to 1) and height of each keypoint ``(batch, 3 * keypoints)``."""
-        maps = self.maps(x)
-        height, width = maps.shape[2:]
-        share = maps.flatten(2).softmax(dim=-1).unflatten(-1, (height, width))
-        column = share.sum(dim=2) @ torch.linspace(-1, 1, width, device=x.device)
-        row = share.sum(dim=3) @ torch.linspace(-1, 1, height, device=x.device)
-        return torch.cat((column, row, (share * maps).sum(dim=(2, 3)).tanh()), dim=-1)
+        height, width = x.shape[2:]
+        rows, columns = (torch.linspace(-1, 1, side, device=x.device) for side in (height, width))
+        grid = torch.stack((columns.repeat(height), rows.repeat_interleave(width)), dim=-1)
+        maps = self.maps(x).flatten(2)
+        share = maps.softmax(dim=-1)
+        column, row = (share @ grid).unbind(dim=-1)  # one product: sums over maps of many pixels take most of the time
+        return torch.cat((column, row, (share * maps).sum(dim=-1).tanh()), dim=-1)
+
+
+class Points(nn.Module):
+    """Where some things are, told by all keypoints together; what they are, pretraining teaches (``model.privileged``).
+
+    Args:
+        channels: of the feature map.
+        keypoints: how many are looked at.
+        points: how many things there are.
+    """
+
+    def __init__(self, channels: int, keypoints: int, points: int) -> None:
+        super().__init__()
+        self.keypoints = SpatialSoftmax(channels, keypoints)
+        self.read = nn.Linear(3 * keypoints, POINT * points)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to x, y, height and logit of being seen, all x first: ``(batch, 4 * points)``."""
+        out: Tensor = self.read(self.keypoints(x))
+        return out
 
 
 class Grid(nn.Module):
@@ -89,14 +113,14 @@ class Grid(nn.Module):
         return out
 
 
-def _small(channels: int, widths: Sequence[int], height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
-    """A residual network whose feature map is a quarter of the image in each direction, and that map's shape.
+def _small(channels: int, widths: Sequence[int], stride: int, height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
+    """A residual network whose feature map is smaller by a stride in each direction, and that map's shape.
 
     The first convolution goes there at once: convolutions of few channels on many pixels take most of the time of deeper stems.
     """
-    first = nn.Conv2d(channels, widths[0], 2 * QUARTER, QUARTER, padding=QUARTER // 2, bias=False)
+    first = nn.Conv2d(channels, widths[0], 2 * stride, stride, padding=stride // 2, bias=False)
     blocks = [ResidualBlock(before, after, 1) for before, after in itertools.pairwise(widths)]
-    height, width = ((side + 2 * (QUARTER // 2) - 2 * QUARTER) // QUARTER + 1 for side in (height, width))
+    height, width = ((side + 2 * (stride // 2) - 2 * stride) // stride + 1 for side in (height, width))
     return nn.Sequential(first, nn.GroupNorm(GROUPS, widths[0]), nn.ReLU(), *blocks), (widths[-1], height, width)
 
 
@@ -129,12 +153,16 @@ class ImageEncoder(nn.Module):
         shape: of the image, ``(channels, height, width)``.
         network: ``'small'``, or ``'resnet18'`` (11 million weights).
         widths: channels of the small network's first convolution and of its residual blocks, multiples of 8; its map is a quarter
-            of the image in each direction.
-        head: ``'keypoints'`` (spatial softmax), or ``'grid'``, all of the last map, which suits ResNet-18, whose map is small.
+            of the image in each direction, or what ``stride`` says.
+        stride: of the small network's first convolution, 2 or 4; 2 tells places more sharply.
+        head: ``'keypoints'`` (spatial softmax), ``'points'``, a few things that pretraining names, or ``'grid'``, all of the last
+            map, which suits ResNet-18, whose map is small.
         keypoints: how many; of the grid, how many channels.
+        points: how many things are told apart; of ``'points'``.
         crop: pixels by which each side is smaller after cropping: at random in training, in the middle else; 0 for none.
-        origin: name of an observed vector, column and row (-1 to 1) of a place in the image, that keypoints are told relative to:
-            of a hand, for example, for which it matters where things are from there; empty for the image's middle.
+        origin: name of an observed vector, the place that keypoints or points are told relative to: of a hand, for example, for
+            which it matters where things are from there. Column and row (-1 to 1) in the image for keypoints, x and y for points.
+            Empty for the image's middle.
 
     Raises:
         UserError: for a value that is none.
@@ -145,8 +173,10 @@ class ImageEncoder(nn.Module):
         shape: Sequence[int],
         network: str = "small",
         widths: Sequence[int] = (32,),
+        stride: int = 4,
         head: str = "keypoints",
         keypoints: int = 32,
+        points: int = 0,
         crop: int = 0,
         origin: str = "",
     ) -> None:
@@ -156,27 +186,40 @@ class ImageEncoder(nn.Module):
                 raise UserError(f"model.image_encoder.{name}: expected one of {', '.join(known)}, found {value!r}")
         if not widths or any(width < GROUPS or width % GROUPS for width in widths):
             raise UserError(f"model.image_encoder.widths: expected multiples of {GROUPS}, found {list(widths)}")
+        if stride not in STRIDES:
+            raise UserError(f"model.image_encoder.stride: expected one of {', '.join(map(str, STRIDES))}, found {stride!r}")
         if len(shape) != 3 or not 0 < math.prod(shape) <= MOST_PIXELS:
             raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {shown(tuple(shape))}")
         channels, height, width = shape
         expect_range("model.image_encoder.keypoints", keypoints, 1)
         expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
-        if origin and head != "keypoints":
+        if (points > 0) != (head == POINTS):
+            raise UserError(
+                f"model.image_encoder.points: expected {'1 or more' if head == POINTS else 0} for {head}, found {points}"
+            )
+        expect_range("model.image_encoder.points", points, 0, MOST_POINTS)
+        if origin and head == GRID:
             raise UserError(f"model.image_encoder.origin: expected none for a head without keypoints, found {origin!r}")
         self.crop, self.origin = crop, origin
         height, width = height - crop, width - crop
-        if network == "small" and min(height, width) < 2 * QUARTER:
+        if network == "small" and min(height, width) < 2 * stride:
             raise UserError(
-                f"model.image_encoder.crop: expected images of {2 * QUARTER} x {2 * QUARTER} or more for the small network, "
+                f"model.image_encoder.crop: expected images of {2 * stride} x {2 * stride} or more for the small network, "
                 f"found {height} x {width}"
             )
         if network == RESNET18:
             self.network: nn.Module = _ResNet18(channels)
             size = (512, -(-height // 32), -(-width // 32))
         else:
-            self.network, size = _small(channels, widths, height, width)
-        self.head = SpatialSoftmax(size[0], keypoints) if head == "keypoints" else Grid(size[0], keypoints, *size[1:])
-        self.size = 3 * keypoints if isinstance(self.head, SpatialSoftmax) else self.head.size
+            self.network, size = _small(channels, widths, stride, height, width)
+        if head == KEYPOINTS:
+            self.head: nn.Module = SpatialSoftmax(size[0], keypoints)
+            self.size = 3 * keypoints
+        elif head == POINTS:
+            self.head, self.size = Points(size[0], keypoints, points), POINT * points
+        else:
+            grid = Grid(size[0], keypoints, *size[1:])
+            self.head, self.size = grid, grid.size
         """Numbers that are read of an image."""
 
     def forward(self, images: Tensor) -> Tensor:
@@ -210,6 +253,8 @@ class ImageEncoders(nn.Module):
         self.names = [name for name, feature in observed.items() if feature.kind == "image"]
         encoders = [built(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
         self.origins = [encoder.origin for encoder in encoders]
+        self.columns = [POINT if isinstance(encoder.head, Points) else 3 for encoder in encoders]
+        """Numbers of a keypoint or point."""
         for origin in self.origins:
             if origin and (origin not in observed or observed[origin].shape != (2,)):
                 raise UserError(f"model.image_encoder.origin: expected an observed vector of 2 columns, found {short(origin)!r}")
@@ -230,9 +275,10 @@ class ImageEncoders(nn.Module):
             observed: vectors by name, of which origins are the present ones.
         """
         parts = []
-        for part, origin in zip(read.split(self.sizes, dim=1), self.origins, strict=True):
+        for part, origin, columns in zip(read.split(self.sizes, dim=1), self.origins, self.columns, strict=True):
             if origin:
-                places, heights = part.split((2 * part.shape[1] // 3, part.shape[1] // 3), dim=1)
-                part = torch.cat((places - observed[origin].repeat_interleave(part.shape[1] // 3, dim=1), heights), dim=1)
+                count = part.shape[1] // columns
+                places, rest = part[:, : 2 * count], part[:, 2 * count :]
+                part = torch.cat((places - observed[origin].repeat_interleave(count, dim=1), rest), dim=1)
             parts.append(part)
         return torch.cat(parts, dim=1)

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ftl_lightning.concepts.branches import Context
-from ftl_lightning.diffusion.conditions import condition_encoder
+from ftl_lightning.diffusion.conditions import condition_encoder, turned
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
 from ftl_lightning.ranges import expect_range
@@ -24,7 +24,7 @@ class MLPDenoiser(nn.Module):
         condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
         time_dim: features of the timestep; even.
         dropout: of the hidden layers, in training.
-        initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'`` or ``'set'``,
+        initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'``, ``'set'`` or ``'points'``,
             see :mod:`ftl_lightning.diffusion.conditions`.
         initial_dim: features of what is observed.
     """
@@ -53,7 +53,7 @@ class MLPDenoiser(nn.Module):
         ):
             expect_range(f"denoiser_args.{name}", value, 1)
         expect_range("denoiser_args.dropout", dropout, 0, 1)
-        self.time_dim = time_dim
+        self.time_dim, self.plane = time_dim, sizes.plane
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, condition_dim), nn.SiLU())
         plan = sizes.horizon * sizes.state_dim
@@ -85,6 +85,9 @@ class MLPDenoiser(nn.Module):
         concepts = concepts.flatten(1)
         by_time = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(2 * len(self.layers), dim=-1)
         by_concept = self.concept_film(self.concept(concepts)).chunk(2 * len(self.layers), dim=-1)
+        direction = None if self.initial is None else self.initial.direction(context, concepts[index])
+        if direction is not None:
+            x = turned(x, direction, self.plane, back=False)
         hidden = x.flatten(1)
         if self.initial is not None:
             hidden = torch.cat((hidden, self.initial.attend(context, concepts[index])), dim=-1)
@@ -93,5 +96,5 @@ class MLPDenoiser(nn.Module):
             scale, shift = (by_time[i] + by_concept[i][index] for i in (2 * depth, 2 * depth + 1))
             update = self.dropout(functional.silu(layer(hidden) * (1 + scale) + shift))
             hidden = hidden + update if depth else update
-        out: Tensor = self.head(hidden)
-        return out.unflatten(-1, x.shape[1:])
+        out: Tensor = self.head(hidden).unflatten(-1, x.shape[1:])
+        return out if direction is None else turned(out, direction, self.plane, back=True)

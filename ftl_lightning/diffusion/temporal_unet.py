@@ -140,6 +140,8 @@ class TemporalUNet(nn.Module):
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        if initial_encoder == "points" and sizes.plane:
+            raise UserError("denoiser_args.initial_encoder: expected points without a plane for TemporalUNet, which turns no plans")
         self.initial = condition_encoder(initial_encoder, sizes, width)
         condition = width * (3 if sizes.vector_dim else 2)
         channels = [width * multiplier for multiplier in multipliers]

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from ftl_lightning.concepts.encoder import Encoder, load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.demonstrations.features import expect_features
-from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.errors import UserError, about, short
@@ -81,6 +81,8 @@ class PretrainingData(pl.LightningDataModule):
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
         samples_per_concept: demonstrations of each training concept.
         validation_per_concept: others of each, for the validation loss.
+        recoveries: demonstrations more of each training concept that has some, which begin where behaviour went wrong, see
+            :class:`~ftl_lightning.domains.domain.Recoveries`.
         seed: decides the demonstrations and the order they are seen in.
         batch_size: windows a step.
         steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
@@ -103,6 +105,7 @@ class PretrainingData(pl.LightningDataModule):
         root: str | None = None,
         samples_per_concept: int = 100,
         validation_per_concept: int = 10,
+        recoveries: int = 0,
         seed: int = 0,
         batch_size: int = 128,
         steps_per_epoch: int = 500,
@@ -113,8 +116,9 @@ class PretrainingData(pl.LightningDataModule):
         super().__init__()
         chosen = Windows(**windows)
         windows = asdict(chosen)  # hyper-parameters are the local variables: those that were not given count too
-        # Configurations from before there was a balance keep their hash.
-        self.save_hyperparameters(ignore=["balance"] if chosen.balance is None else None)
+        # Configurations from before there were these keep their hash.
+        unsaid = {"balance": chosen.balance is None, "recoveries": not recoveries}
+        self.save_hyperparameters(ignore=[name for name, absent in unsaid.items() if absent])
         if self.own_domain and domain not in ("", self.own_domain):
             raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
         self.domain_name, self.domain = self._domain(self.own_domain or domain)
@@ -136,6 +140,8 @@ class PretrainingData(pl.LightningDataModule):
         for name, (value, most) in counts.items():
             expect_count(f"data.{name}", value, 1, most)
         expect_range("data.seed", seed, 0)
+        expect_count("data.recoveries", recoveries, 0, LARGEST)
+        self.recoveries = recoveries
         self.balance = chosen.balance
         if self.balance is not None and not 0 <= self.balance <= 1:
             raise UserError(f"data.balance: expected a number from 0 to 1, found {self.balance}")
@@ -154,6 +160,11 @@ class PretrainingData(pl.LightningDataModule):
     def setup(self, stage: str) -> None:
         source = self.domain.source(self.root)
         self.training = source.split("train", self.samples_per_concept, self.seed).fitted(self.domain.observed)
+        if self.recoveries:
+            if not isinstance(source, Recoveries):
+                raise UserError(f"data.recoveries: expected 0, as domain {self.domain.name} has none, found {self.recoveries}")
+            more = source.recoveries("train", self.recoveries, self.seed).fitted(self.domain.observed)
+            self.training = concatenate([self.training, more])
         self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
         if self.balance is not None:
             self._shares = shares(self.training, self.balance)

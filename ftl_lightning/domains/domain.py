@@ -7,7 +7,7 @@ import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
@@ -134,6 +134,15 @@ class Source(Protocol):
         ...
 
 
+@runtime_checkable
+class Recoveries(Protocol):
+    """A source that also has demonstrations which begin where behaviour went wrong."""
+
+    def recoveries(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """``count`` of every training concept of which there are some; those of ``'validation'`` are in no training split."""
+        ...
+
+
 @dataclass(frozen=True)
 class Metric:
     """How generated plans are judged.
@@ -245,6 +254,8 @@ class View:
         act: a planner for plans in this view, as ``act`` of :class:`ClosedLoop`; ``None`` for the domain's planner.
         scales: groups of columns of a state; columns at the same position in each group share a scale.
         same_columns: whether encoded states have the same columns as the domain's states.
+        plane: columns of an encoded state that are x and y in the coordinates of what is seen as points: a denoiser may turn plans
+            together with these.
     """
 
     features: Mapping[str, Feature]
@@ -255,6 +266,20 @@ class View:
     act: Callable[[Tensor, int, Observed], Tensor] | None = None
     scales: tuple[tuple[int, ...], ...] = ()
     same_columns: bool = False
+    plane: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Privileged:
+    """Something that training demonstrations show and that is not observed later, such as where objects are.
+
+    Attributes:
+        feature: a vector.
+        error: ``(read (sample, n), feature (sample, *shape)) -> (sample,)``, how wrong what was read of an image is.
+    """
+
+    feature: Feature
+    error: Callable[[Tensor, Tensor], Tensor]
 
 
 def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:
@@ -274,6 +299,8 @@ class Domain(Shown):
         source: makes the source of demonstrations, given the folder of the user's data or ``None``.
         show: pictures of plans; by default lines over time, or paths where a state has two or three columns.
         observed: features that a plan is conditioned on, by name; empty where plans have no initial state.
+        privileged: what training demonstrations show beside these, by name: the encoder of images can be taught by it in
+            pretraining (``model.privileged``). No model observes it.
         metrics: how plans are judged in open loop, by name; the first is the one that ablations report. Empty where behaviour is
             judged in closed loop only.
         ours: our method in the form that others are compared with; the paper's by default.
@@ -297,6 +324,7 @@ class Domain(Shown):
     source: Callable[[Path | None], Source]
     show: Show = _UNSAID
     observed: Mapping[str, Feature] = field(default_factory=dict)
+    privileged: Mapping[str, Privileged] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
     ours: Compared = PAPERS_METHOD
     headline: str = ACCURACY

@@ -21,7 +21,7 @@ from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.checkpoint import Random
 from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.learning.model_config import ModelConfig, find_view
@@ -56,6 +56,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`; its defaults for ``None``.
         feature_dropout: of observed vectors by name, the probability with which each is hidden in training; none for ``None``.
             The published code hides the pose of a robot's hand with 0.4.
+        privileged: weights by name: what is read of images has to tell what training demonstrations show beside what is observed,
+            see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
 
     Raises:
         UserError: at construction, for a value out of its range.
@@ -89,9 +91,11 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         seed: int = 0,
         image_encoder: Mapping[str, Any] | None = None,
         feature_dropout: Mapping[str, float] | None = None,
+        privileged: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=groups_of(self.flat))
+        # Configurations from before there was anything privileged keep their hash.
+        self.save_hyperparameters(ignore=[*groups_of(self.flat), *([] if privileged else ["privileged"])])
         for name, value, most in (
             ("learning_rate", learning_rate, LARGEST_RATE),
             ("warmup_steps", warmup_steps, math.inf),
@@ -104,6 +108,9 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
         for name, share in self.feature_dropout.items():
             expect_range(f"model.feature_dropout.{name}", share, 0, 1)
+        self.privileged = dict(privileged or {})
+        for name, weight in self.privileged.items():
+            expect_factor(f"model.privileged.{name}", weight)
         self.seed = seed
         self.guidance = guidance
         self.register_parameter("unused", None)
@@ -122,7 +129,12 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     @abstractmethod
     def losses(self, model: M, batch: Batch, draw: torch.Generator) -> Tensor:
-        """What is minimised, on a batch ``(batch,)``; ``model`` is in training mode while fitting."""
+        """What is minimised, on a batch ``(batch,)`` that has been perturbed; ``model`` is in training mode while fitting."""
+
+    def _perturbed_losses(self, model: M, batch: Batch, draw: torch.Generator) -> tuple[Tensor, Batch]:
+        states, observed = model.perturbed(batch.states, batch.observed, draw)
+        seen = batch._replace(states=states, observed=dict(observed))
+        return self.losses(model, seen, draw), seen
 
     def configure_model(self) -> None:
         """Build the layers once the data are known. Does nothing the second time."""
@@ -161,6 +173,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             image_dim=image_dim,
             image_encoder=self.image_encoder,
             feature_dropout=expect_dropout(self.feature_dropout, features),
+            plane=view.plane if view else (),
             metrics=dict(data.metrics),
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
@@ -173,7 +186,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             resolution = data.domain.plans.resolution
-            normalization = Normalization.fit(states, view.scales if view else (), resolution)
+            normalization = Normalization.fit(states, view.scales if view else (), resolution, config.plane)
             beside = None
             if config.measured_dim:
                 beside = Normalization.fit(joined_vectors(seen, features), config.entities, resolution)
@@ -181,11 +194,30 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                     beside.share(config.state_columns, normalization)
             self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
             self.model.examples = data.examples
+            self._expect_privileged()
         self.raw = copy.deepcopy(self.model)
+        if self.privileged and self.raw.images is not None:
+            self.raw.images.register_forward_hook(self._keep)
         if not any(parameter.requires_grad for parameter in self.raw.parameters()):
             # Of a model that memorises: steps are still counted, so there has to be something that they are of.
             self.unused = torch.nn.Parameter(torch.zeros(()))
         self.model.requires_grad_(False).eval()
+
+    def _expect_privileged(self) -> None:
+        """Refuse to teach images what the domain does not show, or what no encoder of points reads."""
+        for name in self.privileged:
+            known, images = self.domain.privileged.get(name), self.model.images
+            if known is None or images is None:
+                told = ", ".join(self.domain.privileged) if images is not None else "none, as no image is observed"
+                raise UserError(f"model.privileged: expected {told or 'none'} (domain {self.domain.name}), found {short(name)!r}")
+            if images.size != known.feature.size:
+                raise UserError(
+                    f"model.privileged.{name}: expected image_encoder of {known.feature.shape[0]} points, "
+                    f"found one that reads {images.size} numbers"
+                )
+
+    def _keep(self, module: torch.nn.Module, inputs: Any, read: Tensor) -> None:
+        self._read = read
 
     def train(self, mode: bool = True) -> Self:
         """Switch modes; the average is always in evaluation mode."""
@@ -210,14 +242,26 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
-        loss = self.losses(self.raw, batch, draw).mean()
+        losses, seen = self._perturbed_losses(self.raw, batch, draw)
+        loss = losses.mean()
         if not loss.isfinite():
             raise UserError(
                 f"training: the loss became {loss.item()} at step {self.global_step}; the last checkpoint before it is kept; "
                 "lower model.learning_rate"
             )
         self.log("train/loss", loss, prog_bar=True)
+        if self.privileged:
+            loss = loss + self._privileged_loss(seen.observed)
         return loss if self.unused is None else loss + 0 * self.unused
+
+    def _privileged_loss(self, observed: Observed) -> Tensor:
+        """How badly what was read of the images in this step tells what they show, weighted."""
+        total = torch.zeros((), device=self.device)
+        for name, weight in self.privileged.items():
+            error = self.domain.privileged[name].error(self._read, observed[name]).mean()
+            self.log(f"train/{name}", error)
+            total = total + weight * error
+        return total
 
     def optimizer_step(self, *arguments: Any, **options: Any) -> None:
         """Step, then update the running average; here, so that no checkpoint falls between the two."""
@@ -230,7 +274,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     def _evaluation_step(self, batch: Batch, name: str) -> None:
         # The same noise every time, so that the curve shows the model and not the draw.
         draw = generator(self.device, self.seed)
-        self.log(name, self.losses(self.model, batch, draw).mean(), prog_bar=True, batch_size=len(batch.states))
+        self.log(name, self._perturbed_losses(self.model, batch, draw)[0].mean(), prog_bar=True, batch_size=len(batch.states))
 
     def validation_step(self, batch: Batch) -> None:
         self._evaluation_step(batch, "val/loss")

@@ -1,17 +1,22 @@
 """Condition encoders: what is observed is read once a plan, by whatever network, learning or sampling."""
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.conditions import ENCODERS, EntityEncoder, condition_encoder
+from ftl_lightning.diffusion.conditions import CHOSEN, ENCODERS, EntityEncoder, PointEncoder, condition_encoder
 from ftl_lightning.diffusion.denoiser import Sizes
+from ftl_lightning.diffusion.mlp import MLPDenoiser
 from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.diffusion.temporal_unet import TemporalUNet
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, scenes
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
@@ -21,6 +26,8 @@ from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
 
 STEPS = 6
+OF_VECTORS = [name for name in ENCODERS if name != "points"]
+"""Encoders that need no points of images."""
 
 
 def model(denoiser: str, options: dict[str, Any], prediction: str = "epsilon", **observed: Feature) -> GenerativeModel:
@@ -46,7 +53,7 @@ def model(denoiser: str, options: dict[str, Any], prediction: str = "epsilon", *
 def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[int]]:
     """Batch sizes with which each half of any encoder is called."""
     found: dict[str, list[int]] = {"observe": [], "attend": []}
-    for kind in (condition_encoder(name, Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8).__class__ for name in ENCODERS):
+    for kind in (condition_encoder(name, Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8).__class__ for name in OF_VECTORS):
         for half in ("observe", "attend"):
             monkeypatch.setattr(kind, half, counted(getattr(kind, half), found[half]))
     return found
@@ -70,7 +77,7 @@ NETWORKS = [
 
 
 @pytest.mark.parametrize(("denoiser", "options", "prediction"), NETWORKS, ids=str)
-@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize("encoder", OF_VECTORS)
 def test_what_is_observed_is_read_once_a_plan(
     denoiser: str, options: dict[str, Any], prediction: str, encoder: str, calls: dict[str, list[int]]
 ) -> None:
@@ -150,5 +157,65 @@ def test_features_may_come_in_any_order_and_others_do_not_matter() -> None:
 
 
 def test_a_name_that_is_no_encoder() -> None:
-    with pytest.raises(UserError, match="initial_encoder: expected one of flat, joint, entities, set, found 'deep'"):
+    with pytest.raises(UserError, match="initial_encoder: expected one of flat, joint, entities, set, points, found 'deep'"):
         condition_encoder("deep", Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8)
+
+
+def of_points(plane: tuple[int, ...] = (0, 1), count: int = 3) -> Sizes:
+    observed = {"photo": Feature((3, 8, 8), "image"), "pose": Feature((2,))}
+    return Sizes(horizon=5, state_dim=3, concept_dim=6, observed=observed, image_dim=4 * count, plane=plane)
+
+
+def scene(direction: float = 0.0) -> Tensor:
+    """A measured vector and three points ``(1, 14)``, all turned by an angle."""
+    xy = torch.tensor([[0.1, 0.2], [0.4, -0.1], [-0.3, 0.5]]) @ rotation(direction).T
+    heights, seen = torch.tensor([0.01, 0.02, 0.05]), torch.tensor([3.0, 3.0, -3.0])
+    return torch.cat((torch.tensor([0.3, 0.7]), xy.T.flatten(), heights, seen))[None]
+
+
+def rotation(angle: float) -> Tensor:
+    return torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+@pytest.mark.parametrize("angle", [0.4, 2.0, -3.0])
+def test_plans_turn_with_the_points_that_a_concept_chooses(angle: float) -> None:
+    torch.manual_seed(0)
+    net = MLPDenoiser(of_points(), hidden_dim=16, depth=2, condition_dim=8, initial_encoder="points", initial_dim=8).eval()
+    concept, x = torch.randn(1, 1, 6), torch.randn(1, 5, 3)
+    turned_x = torch.cat((x[..., :2] @ rotation(angle).T, x[..., 2:]), dim=-1)
+    here, there = (
+        net(noisy, torch.tensor([3]), concept, torch.tensor([0]), net.observe(seen))
+        for noisy, seen in ((x, scene()), (turned_x, scene(angle)))
+    )
+    expected = torch.cat((here[..., :2] @ rotation(angle).T, here[..., 2:]), dim=-1)
+    torch.testing.assert_close(there, expected, atol=2e-4, rtol=0)
+    # What a plan without a plane is, depends on the direction.
+    plain = MLPDenoiser(of_points(()), hidden_dim=16, depth=2, condition_dim=8, initial_encoder="points", initial_dim=8).eval()
+    before, after = (
+        plain(x, torch.tensor([3]), concept, torch.tensor([0]), plain.observe(seen)) for seen in (scene(), scene(angle))
+    )
+    assert not torch.allclose(before, after, atol=1e-3)
+
+
+def test_a_concept_decides_which_points_matter() -> None:
+    torch.manual_seed(0)
+    encoder = PointEncoder(of_points(), 8)
+    with torch.no_grad():
+        encoder.choice.bias.zero_()
+        encoder.choice.weight.zero_()
+        for choice in range(CHOSEN):  # the first number of a concept asks for point 0, the second for point 1
+            for point in range(2):
+                encoder.choice.weight[choice * 3 + point, point] = 100
+    first, second = 6**0.5 * torch.eye(6)[:2, None]
+    moved = scene()
+    moved[0, [3, 6]] += 1.0  # x and y of point 1
+    for concept, same in ((first, True), (second, False)):
+        plain, other = (encoder.attend(encoder.observe(seen), concept) for seen in (scene(), moved))
+        assert torch.allclose(plain, other, atol=1e-4) == same
+
+
+def test_points_have_to_be_read_of_images() -> None:
+    with pytest.raises(UserError, match=r"initial_encoder: expected flat, found points: no points are read of images"):
+        condition_encoder("points", Sizes(4, 1, 2, {OBSERVED: FEATURE}), 8)
+    with pytest.raises(UserError, match=r"denoiser_args.initial_encoder: expected points without a plane"):
+        TemporalUNet(replace(of_points(), horizon=8), initial_encoder="points")

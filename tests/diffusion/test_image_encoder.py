@@ -38,6 +38,8 @@ SIDE, TIME = 16, 6
         ({"widths": [8, 16], "head": "grid", "keypoints": 2}, 2 * 8 * 6),
         ({"network": "resnet18", "head": "grid", "keypoints": 4}, 4 * 1 * 1),
         ({"crop": 4, "head": "grid", "keypoints": 1}, 7 * 5),
+        ({"stride": 2, "head": "grid", "keypoints": 1}, 16 * 12),
+        ({"head": "points", "points": 5, "keypoints": 2}, 20),
     ],
 )
 def test_sizes(options: dict[str, Any], size: int) -> None:
@@ -57,7 +59,10 @@ def test_sizes(options: dict[str, Any], size: int) -> None:
     ("options", "message"),
     [
         ({"network": "vit"}, "model.image_encoder.network: expected one of small, resnet18, found 'vit'"),
-        ({"head": "mean"}, "model.image_encoder.head: expected one of keypoints, grid, found 'mean'"),
+        ({"head": "mean"}, "model.image_encoder.head: expected one of keypoints, points, grid, found 'mean'"),
+        ({"stride": 3}, "model.image_encoder.stride: expected one of 2, 4, found 3"),
+        ({"head": "points"}, "model.image_encoder.points: expected 1 or more for points, found 0"),
+        ({"points": 2}, "model.image_encoder.points: expected 0 for keypoints, found 2"),
         ({"widths": [12]}, r"model.image_encoder.widths: expected multiples of 8, found \[12\]"),
         ({"widths": []}, r"model.image_encoder.widths: expected multiples of 8, found \[\]"),
         ({"origin": "hand"}, "model.image_encoder.origin: expected an observed vector of 2 columns, found 'hand'"),
@@ -71,7 +76,7 @@ def test_sizes(options: dict[str, Any], size: int) -> None:
         ({"keypoints": 0}, "model.image_encoder.keypoints: expected 1 or more, found 0"),
         (
             {"depth": 3},
-            "key .model.image_encoder.depth.: expected one of network, widths, head, keypoints, crop, origin",
+            "key .model.image_encoder.depth.: expected one of network, widths, stride, head, keypoints, points, crop, origin",
         ),
     ],
 )
@@ -98,6 +103,10 @@ def test_keypoints_are_told_from_their_origin() -> None:
     assert encoders.size == 24
     for number, (column, row) in enumerate(hand.tolist()):
         assert moved[number].tolist() == 2 * [*[column] * 4, *[row] * 4, *[0.0] * 4]
+    points = ImageEncoders(features, {"head": "points", "points": 3, "origin": "hand"})
+    moved = read - points.from_origins(read, {"hand": hand})
+    for number, (x, y) in enumerate(hand.tolist()):
+        assert moved[number].tolist() == 2 * [*[x] * 3, *[y] * 3, *[0.0] * 6]
     plain = ImageEncoders(features, {"keypoints": 4})
     assert torch.equal(plain.from_origins(read, {}), read)
 

@@ -17,12 +17,14 @@ from ftl_lightning.domains.tabletop import DOMAIN, experts, source
 from ftl_lightning.domains.tabletop.domain import act
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.interface import ACTION, IMAGE, POSE
+from ftl_lightning.domains.tabletop.pushing import Manner, around, pushed
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     BOWL,
     CIRCLE,
     COLUMNS,
     HAND,
+    RING,
     SCENE,
     TRIANGLE,
     WHITE,
@@ -40,6 +42,7 @@ from ftl_lightning.domains.tabletop.tasks import (
     BESIDE_BOWL,
     PUSH,
     PUSH_ON_BOOK,
+    PUSHES,
     TASKS,
     TO_BOOK,
     TO_WHITE,
@@ -253,19 +256,55 @@ def test_pushing_at_the_height_of_the_table_moves_the_book(env: TableTopEnvironm
     assert env._told()["book"] > 0.02
 
 
-def test_an_expert_goes_around_a_circle_that_it_does_not_stand_behind(env: TableTopEnvironment) -> None:
-    env.reset(options={"scene": scene_of({CIRCLE: (0.48, 0.0, 0.0), TRIANGLE: (0.62, 0.0, 0.0)})})
-    for place in ((0.54, -0.06, 0.1), (0.54, -0.06, experts.PUSH_HEIGHT)):  # before the circle, beside its way
-        for _ in range(14):
-            env.step(np.array([*place, 0.0], dtype=np.float32))
-    pushing = experts._push(experts._Expert(env, PUSH, experts.style(np.random.default_rng(0))), experts.PUSH_HEIGHT)
-    pushing = (command for command in pushing if command[2] <= experts.PUSH_HEIGHT)  # it has come down already
-    told: dict[str, Any] = {}
-    for command, _ in zip(pushing, range(100), strict=False):
-        told = env.step(command.astype(np.float32))[-1]
-        if told["touched"]:
-            break
-    assert judged(PUSH, env.scene, told)
+@pytest.mark.parametrize("task", PUSHES)
+def test_pushes_begin_anew_wherever_hand_and_circle_are(task: str, env: TableTopEnvironment) -> None:
+    sides = []
+    for number, scene in enumerate(scenes(task, 5, 21).numpy()):
+        env.reset(options={"scene": scene})
+        before = env.places()[CIRCLE]
+        seen = experts.led_astray(env, task, np.random.default_rng([2, number]))
+        hand, circle = env.command[:2], env.places()[CIRCLE]
+        assert seen[POSE][:3] == pytest.approx(env.command[:3], abs=2e-3)
+        assert 0 <= np.linalg.norm(hand - circle[:2]) <= experts.AROUND[1] + 1e-6
+        assert circle[2] == pytest.approx(before[2], abs=1e-3)
+        sides.append(hand - circle[:2])
+        assert experts.perform(env, task, scene, np.random.default_rng([2, number]), begun_elsewhere=True).success
+    assert np.ptp(sides, axis=0).min() > 0.03
+
+
+HELD = Manner(height=0.014, speed=0.008)
+
+
+@pytest.mark.parametrize(
+    ("hand", "goes"),
+    [
+        ((0.40, 0.0, 0.014), (1, 0, 0)),  # behind: it pushes
+        ((0.41, 0.02, 0.014), (1, -1, 0)),  # a little to the left of the line: it steers back behind
+        ((0.41, -0.02, 0.014), (1, 1, 0)),
+        ((0.50, 0.0, 0.014), (0, 0, 1)),  # before the circle: up, and nowhere else
+        ((0.45, 0.05, 0.014), (0, 0, 1)),
+        ((0.50, 0.0, 0.079), (-1, 0, 0)),  # high enough: back over the circle
+        ((0.385, 0.0, 0.079), (0, 0, -1)),  # where a push begins: down
+        ((0.30, 0.0, 0.20), (1, 0, -1)),  # from afar
+    ],
+)
+def test_a_hand_pushes_behind_the_circle_and_goes_up_elsewhere(hand: tuple[float, ...], goes: tuple[int, ...]) -> None:
+    step = pushed(np.array(hand), np.array([0.45, 0.0]), np.array([0.6, 0.0]), HELD) - hand
+    assert np.where(np.abs(step) < 5e-4, 0, np.sign(step)).tolist() == list(goes)
+    assert np.linalg.norm(step) < 0.02
+
+
+def test_the_way_around_the_bowl_keeps_its_distance_and_ends_at_the_goal() -> None:
+    bowl, goal = np.array([0.5, 0.01]), np.array([0.65, 0.0])
+    circle, nearest = np.array([0.35, 0.0]), []
+    for _ in range(200):
+        step = around(circle, goal, bowl) - circle
+        circle = circle + 0.004 * step / max(np.linalg.norm(step), 1e-6)
+        nearest.append(np.linalg.norm(circle - bowl))
+    assert min(nearest) > RING - 0.012
+    assert np.linalg.norm(circle - goal) < 0.01
+    assert around(np.array([0.6, 0.0]), goal, bowl).tolist() == goal.tolist()  # the bowl is behind it
+    assert around(np.array([0.35, 0.2]), np.array([0.65, 0.2]), bowl).tolist() == [0.65, 0.2]  # beside it
 
 
 # Demonstrations
@@ -303,6 +342,36 @@ def test_training_sets_are_scattered_and_demonstrations_of_a_task_are_not(monkey
     expert.split("train", 2, 0)
     expert.draw(PUSH, 2, 0)
     assert [(one["count"], one["scatter"]) for one in drawn] == [(2, True), (2, True), (8, True), (2, True), (2, False)]
+    drawn.clear()
+    expert.recoveries("train", 3, 0)
+    expert.recoveries("validation", 3, 0)
+    assert [(one["task"], one["count"], one["scatter"], one["elsewhere"]) for one in drawn] == 2 * [
+        (PUSH, 3, True, True),
+        (AROUND_BOWL, 3, True, True),
+    ]
+    assert len({one["seed"] for one in drawn}) == 2
+
+
+def test_scattered_pictures_tell_what_is_where_and_the_triangle_lies_on_all_surfaces(env: TableTopEnvironment) -> None:
+    placed = {
+        CIRCLE: (0.4, -0.1, 0.0),
+        BOOK: (0.58, -0.15, 0.0),
+        WHITE: (0.6, 0.15, 0.0),
+        BOWL: (0.42, 0.2, 0.0),
+        TRIANGLE: (0.42, 0.08, 0),
+    }
+    made = experts.perform(env, TO_BOOK, scene_of(placed), np.random.default_rng(0), scatter=True)
+    assert made.places is not None
+    assert made.places.shape == (len(made.images), 5, 4)
+    seen, x, y, z = torch.from_numpy(made.places).unbind(dim=-1)
+    circle, triangle, book, white, bowl = range(5)
+    assert seen[:, [circle, book]].all()
+    for distractor in (triangle, white, bowl):
+        assert 0.3 < seen[:, distractor].mean() < 0.95
+    heights = z[:, triangle][seen[:, triangle] > 0.5]
+    assert set(heights.mul(1000).round().tolist()) == {15, 45, 75}
+    assert ((x - 0.5).abs() < 0.35)[seen > 0.5].all()
+    assert (y.abs() < 0.36)[seen > 0.5].all()
 
 
 def test_demonstrations_with_images_go_through_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

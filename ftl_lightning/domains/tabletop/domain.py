@@ -7,13 +7,15 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Show
+from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Privileged, Show
 from ftl_lightning.domains.paper import Paper, Published
 from ftl_lightning.domains.tabletop.interface import (
     FEATURES,
     MAX_STEPS,
     NAME,
+    PLACES,
     POSE,
+    SEEN,
     STATE_NAMES,
     STATE_UNITS,
     expect_simulator,
@@ -21,7 +23,7 @@ from ftl_lightning.domains.tabletop.interface import (
 from ftl_lightning.domains.tabletop.policies import POLICIES
 from ftl_lightning.domains.tabletop.success import judge
 from ftl_lightning.domains.tabletop.tasks import PUSH, SUITES, TRAINING_CONCEPTS
-from ftl_lightning.domains.tabletop.views import VIEWS
+from ftl_lightning.domains.tabletop.views import VIEWS, misplaced
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
@@ -81,6 +83,7 @@ DOMAIN = Domain(
     ),
     source=source,
     observed=FEATURES,
+    privileged={PLACES: Privileged(SEEN, misplaced)},
     views=VIEWS,
     headline=EXECUTED,
     show=Show(deferred(f"{RENDERING}:render")),

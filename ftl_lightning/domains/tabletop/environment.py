@@ -8,14 +8,12 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.physics import Simulator, pybullet
 from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
-from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, HAND, SCENE, TRIANGLE, check, draw_scene, gap, outline
+from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, HAND, OBJECTS, SCENE, TRIANGLE, check, draw_scene, gap, outline
 from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
-from ftl_lightning.domains.tabletop.world import ARM, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward
+from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.errors import UserError
 
 HERTZ = 10
-FASTEST = 0.02
-"""Metres that the hand is moved in a step at most; of an action farther away it goes the first part."""
 TARGETS, SUBSTEPS = 3, 8
 """In a step the arm is given so many targets in a row, for so many steps of the simulation each."""
 ITERATIONS = 20
@@ -105,20 +103,20 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._built += 1
         self.bodies = build(self.client, self.scene, self.arm_drawn)
         self._steps, self._lifted, self._touched = 0, False, False
-        self._start()
+        self._place(self.scene[HAND][:3].astype(np.float64), OPEN)
         self._first = self.places()
         self._before = self._first[CIRCLE]
         self._trace = [self._now()]
         return self._observation(), self._told()
 
-    def _start(self) -> None:
-        """Put the hand where the scene says, with an open gripper."""
+    def _place(self, hand: NDArray[np.float64], opening: float) -> None:
+        """Put the hand somewhere at once."""
         robot = self.bodies.robot
         for joint, angle in zip(ARM, REST, strict=True):
             self.client.resetJointState(robot, joint, angle)
         for finger in FINGERS:
-            self.client.resetJointState(robot, finger, OPEN / 2)
-        self.command = np.array([*map(float, self.scene[HAND][:3]), OPEN])
+            self.client.resetJointState(robot, finger, opening / 2)
+        self.command = np.array([*map(float, hand), opening])
         for _ in range(10):  # each search starts from where the last one ended
             for joint, angle in zip(ARM, self._angles(self.command[:3]), strict=True):
                 self.client.resetJointState(robot, joint, angle)
@@ -174,6 +172,25 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Centres ``(3,)`` of the objects, by name."""
         found = {name: self.client.getBasePositionAndOrientation(body)[0] for name, body in self.bodies.objects.items()}
         return {name: np.array(place) for name, place in found.items()}
+
+    def seen(self) -> NDArray[np.float32]:
+        """Of each of the five objects whether the camera sees it, and its centre: ``(5, 4)``."""
+        found = np.zeros((len(OBJECTS), 4), dtype=np.float32)
+        for name, place in self.places().items():
+            if all(low <= value <= high for value, (low, high) in zip(place, REACH, strict=False)):
+                found[OBJECTS.index(name)] = (1.0, *place)
+        return found
+
+    def put(self, hand: NDArray[np.float64], circle: NDArray[np.float64]) -> Seen:
+        """What is seen where an episode begins with the closed hand at ``(3,)``, and the circle's centre at ``(2,)``."""
+        self.client.resetBasePositionAndOrientation(
+            self.bodies.objects[CIRCLE], [*map(float, circle), self._first[CIRCLE][2]], turned(0.0)
+        )
+        self._place(hand, 0.0)
+        self._first = self.places()
+        self._before = self._first[CIRCLE]
+        self._trace = [self._now()]
+        return self._observation()
 
     def outline(self, name: str) -> NDArray[np.float64]:
         """An object from above, as it lies, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""

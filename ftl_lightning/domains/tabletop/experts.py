@@ -3,14 +3,28 @@
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.tabletop.distractors import scattered
 from ftl_lightning.domains.tabletop.interface import IMAGE, MAX_STEPS, OPEN, POSE
-from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, RING, TRIANGLE, WHITE, support
+from ftl_lightning.domains.tabletop.pushing import CLEAR, Manner, Place, around, pushed
+from ftl_lightning.domains.tabletop.scenes import (
+    APART,
+    BOOK,
+    BOWL,
+    CIRCLE,
+    COLUMNS,
+    HEIGHT,
+    TRIANGLE,
+    WHITE,
+    gap,
+    outline,
+    support,
+    within,
+)
 from ftl_lightning.domains.tabletop.success import judged
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, BESIDE_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
 
@@ -23,10 +37,8 @@ PUSH_HEIGHT = 0.014
 GRASP_HEIGHT = 0.016
 ASIDE = 0.02
 """Metres beside the line at which a push begins at most."""
-OUTWARDS = 4.0
-"""How much a hand that is not behind the circle keeps its distance, over how fast it goes around."""
-AHEAD = 0.02
-"""Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
+SPEED = 0.008
+"""Metres a step of a push."""
 SLOWER = 1.4
 """On the book pushes are slower by this factor, which gives more moments to learn from."""
 STRAIGHT_SPEED = 0.009
@@ -37,10 +49,18 @@ SLIPS, SLIP = 0.04, (0.006, 0.018)
 back to it (Laskey et al., 2017). A hand that always wanders shows it too, but hides the way under its noise."""
 RETURN = 0.8
 """Share of what the hand is off its way that is left a step later."""
+MISLAID = 0.6
+"""How often the circle lies elsewhere where a push begins anew."""
+LYING, RISING, OVER = 0.5, 0.4, 0.03
+"""How often the hand is low there, how often else it is beside the circle, and metres above the height of pushing from which on it
+may be over it."""
+ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
+"""x and y of circle and hand there."""
+AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
+"""Metres from circle to hand, from the circle to other things at least, and to the triangle at most, there."""
 BESIDE = 0.12
 """Metres between bowl and circle that is put down beside it, centre to centre: the fingers, which open to the sides, need room."""
 
-Place = NDArray[np.float64]
 Moves = Generator[Place, None, None]
 """Places ``(4,)`` to go to, one a step: x, y, z and opening."""
 
@@ -152,85 +172,34 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     return bowl + (BESIDE + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
 
 
-def _behind(expert: _Expert, goal: Place, aside: float) -> Place:
-    """Where a push of the circle towards a goal begins, metres to the left of the line between them."""
+def _behind(expert: _Expert, goal: Place) -> Place:
+    """Where a push of the circle towards a goal begins that is made without looking."""
     circle = expert.circle()[:2]
-    along = (goal - circle) / np.linalg.norm(goal - circle)
-    return circle - expert.how.behind * along + aside * np.array([-along[1], along[0]])
+    return circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
 
 
 def _triangle(expert: _Expert) -> Place:
     return expert.env.places()[TRIANGLE][:2]
 
 
-def _way_around(expert: _Expert) -> list[Place]:
-    """Places, some 5 mm apart, on the circle's way to the triangle: straight to the ring around the bowl, along it, straight on."""
-    start, end = expert.circle()[:2], _triangle(expert)
-    bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
-    along = (end - start) / np.linalg.norm(end - start)
-    beside = _cross(along, bowl - start)
-    if abs(beside) >= RING:
-        return _spread(start, end)
-    side = 1.0 if beside > 0 else -1.0  # counter-clockwise is 1: the bowl is passed where the way is shorter
-    first, last = (_tangent(bowl, place, turn) for place, turn in ((start, -side), (end, side)))
-    sweep = (side * (last - first)) % (2 * math.pi)
-    angles = first + side * np.linspace(0, sweep, max(2, int(RING * sweep / 0.005)))
-    arc = [bowl + RING * np.array([math.cos(angle), math.sin(angle)]) for angle in angles]
-    return [*_spread(start, arc[0]), *arc, *_spread(arc[-1], end)]
-
-
-def _cross(one: Place, other: Place) -> float:
-    return float(one[0] * other[1] - one[1] * other[0])
-
-
-def _tangent(centre: Place, place: Place, turn: float) -> float:
-    """Angle on the ring around a centre where the line from a place touches it."""
-    off = place - centre
-    distance = max(float(np.linalg.norm(off)), RING + 1e-6)
-    return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)
-
-
-def _spread(start: Place, end: Place) -> list[Place]:
-    count = max(2, int(np.linalg.norm(end - start) / 0.005))
-    return list(start + np.linspace(0, 1, count)[:, None] * (end - start))
-
-
 def _push(expert: _Expert, height: float) -> Moves:
-    """Bring the circle to the triangle, looking where it goes.
-
-    The hand follows a dipole field (Igarashi et al., 2010): where it sees the circle at an angle from the way, it goes at twice
-    that angle. Behind the circle that pushes it, steering; from beside it leads around. What to do follows from where things are
-    alone, without a jump, which is what a network can learn from few demonstrations.
-    """
+    """Bring the circle to the triangle, looking where it goes."""
     how = expert.how
-
-    def goal() -> Place:
-        if expert.task != AROUND_BOWL:
-            return _triangle(expert)
-        way, ahead = _way_around(expert), int(AHEAD / 0.005)
-        return way[ahead] if ahead < len(way) else way[-1]
-
-    speed = 0.008 * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
-    begin = _behind(expert, goal(), how.aside)
-    yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
-    yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
+    speed = SPEED * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
+    manner = Manner(height, speed, how.speed, how.behind, how.aside)
+    bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
     while True:
-        circle, hand, ahead = expert.circle()[:2], expert.env.command[:2], goal()
-        along, to = complex(*(ahead - circle)), complex(*(circle - hand))
-        distance = max(abs(to), 1e-6)
-        along, to = along / max(abs(along), 1e-6), to / distance
-        beside = 1 - (to / along).real  # 0 behind the circle, 1 beside it, 2 in front of it
-        near = max(0.0, 1 - distance / how.behind)
-        direction = to * to / along - OUTWARDS * min(1.0, 2 * beside) * near * to
-        direction /= max(abs(direction), 1e-6)
-        expert.at = np.array([*(hand + speed * np.array([direction.real, direction.imag])), height, CLOSED])
+        circle, goal = expert.circle()[:2], _triangle(expert)
+        if expert.task == AROUND_BOWL:
+            goal = around(circle, goal, bowl)
+        expert.at = np.array([*pushed(expert.env.command[:3], circle, goal, manner), CLOSED])
         yield expert.at
 
 
 def _straight(expert: _Expert, height: float) -> Moves:
     """Push on the line from circle to triangle as they lie in the beginning."""
     goal = _triangle(expert).copy()
-    begin = _behind(expert, goal, 0.0)
+    begin = _behind(expert, goal)
     yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
     yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
     along = (goal - begin) / np.linalg.norm(goal - begin)
@@ -249,6 +218,7 @@ class Episode:
         images: ``(time, 3, 64, 64)`` uint8.
         poses: ``(time, 8)``, as measured.
         success: whether it did the task.
+        places: ``(time, 5, 4)``, what is where in the pictures; known where distractors are scattered.
     """
 
     commands: NDArray[np.float32]
@@ -256,6 +226,7 @@ class Episode:
     images: NDArray[np.uint8]
     poses: NDArray[np.float32]
     success: bool
+    places: NDArray[np.float32] | None = None
 
 
 STAY = 4
@@ -270,6 +241,7 @@ def perform(
     height: float | None = None,
     feedback: bool = True,
     scatter: bool = False,
+    begun_elsewhere: bool = False,
 ) -> Episode:
     """One episode of the expert of a task.
 
@@ -280,11 +252,14 @@ def perform(
         rng: draws its style and its noise.
         height, feedback: see :func:`moves`.
         scatter: whether distractors lie elsewhere in each picture, see :mod:`ftl_lightning.domains.tabletop.distractors`.
+        begun_elsewhere: whether a push begins with the hand anywhere around the circle, see :func:`led_astray`.
 
     Raises:
         UserError: for a scene that cannot be built.
     """
     seen, told = env.reset(options={"scene": scene})
+    if begun_elsewhere:
+        seen = led_astray(env, task, rng)
     how = style(rng)
     commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
     actions: list[NDArray[np.float32]] = []
@@ -301,16 +276,50 @@ def perform(
         if terminated or truncated:
             break
     success = judged(task, env.scene, told)
+    places = None
     if scatter:
-        images = list(scattered(env, task, told["trace"], rng))
-    for _ in range(STAY):
-        commands.append(commands[-1])
-        images.append(images[-1])
-        poses.append(poses[-1])
+        pictures, places = scattered(env, task, told["trace"], rng)
+        images, places = list(pictures), _stayed(list(places))
     return Episode(
-        np.stack(commands).astype(np.float32),
+        _stayed(commands).astype(np.float32),
         np.stack(actions),
-        np.stack(images),
-        np.stack(poses).astype(np.float32),
+        _stayed(images),
+        _stayed(poses).astype(np.float32),
         success,
+        places,
     )
+
+
+def _stayed(values: list[Any]) -> NDArray[Any]:
+    return np.stack([*values, *[values[-1]] * STAY])
+
+
+def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
+    """What is seen where a push begins anew after it went wrong: the hand at any side of the circle, low or above it, and the
+    circle, in :data:`MISLAID` of the episodes, elsewhere on the table, also beyond where it begins else.
+
+    Args:
+        env: reset to a scene of the task, which is changed.
+        task: a push.
+        rng: draws both.
+    """
+    circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
+    below = support(env.scene, CIRCLE)
+    on_book = below > 0
+    surface = others.pop(BOOK) if on_book else None
+    while True:
+        place = circle[:2]
+        if rng.random() < MISLAID:
+            place = place + rng.uniform(-0.03, 0.03, 2) if on_book else np.array([rng.uniform(*limits) for limits in ASTRAY])
+        shape = outline(CIRCLE, float(place[0]), float(place[1]), 0.0)
+        if surface is not None and not within(shape, surface):
+            continue
+        low, rising = rng.random() < LYING, rng.random() < RISING
+        angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(AROUND[0] if low or rising else 0.0, AROUND[1])
+        hand = place + distance * np.array([math.cos(angle), math.sin(angle)])
+        height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, CLEAR))
+        finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
+        free = all(gap(shape, other) >= ROOM and gap(finger, other) >= APART for other in others.values())
+        far = np.linalg.norm(place - env.places()[TRIANGLE][:2]) > FARTHEST_PUSH
+        if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
+            return env.put(np.array([*hand, height]), place)

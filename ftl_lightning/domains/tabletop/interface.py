@@ -7,12 +7,14 @@ from ftl_lightning.extras import expect_extra
 NAME = "tabletop"
 STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
 STATE_UNITS = ("m",) * 4
-IMAGE, POSE = "image", "pose"
+IMAGE, POSE, PLACES = "image", "pose", "places"
 FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,), state=(0, 1, 2, 7))}
 """The overhead camera's picture, without the arm; measured place (m), quaternion (real part last) and opening (m) of the hand.
 
 Place and opening are what a plan starts from, but for the millimetres by which the arm lags behind what it is told.
 """
+SEEN = Feature((5, 4))
+"""Privileged: of each object whether the camera sees it, and its centre (m). Only the pictures of a training set come with it."""
 ACTION = 4
 """Place of the hand (m) and opening of the gripper (m): what plans consist of."""
 MAX_STEPS = 160

@@ -11,13 +11,13 @@ from ftl_lightning.demonstrations.cache import cached
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate, padded
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Split
-from ftl_lightning.domains.tabletop import environment, experts, success, world
+from ftl_lightning.domains.tabletop import distractors, environment, experts, pushing, success, world
 from ftl_lightning.domains.tabletop import scenes as scene_settings
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, perform
-from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, POSE, STATE_NAMES, STATE_UNITS
+from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
-from ftl_lightning.domains.tabletop.tasks import PUSH, TRAINING_CONCEPTS, expect_task
+from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, expect_task
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import VALIDATION_SEED, task_key
 
@@ -25,27 +25,29 @@ _LOG = logging.getLogger(__name__)
 
 MOST = 4
 """Episodes that are tried at most for each that is kept."""
-FORM = 4
+FORM = 5
 """Of the experts; what is cached of another one is not used."""
 TIMES = {PUSH: 4}
 """So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""
+RECOVERY_SEED = 2_000_000
+"""Added to the seed of demonstrations that begin elsewhere."""
 _NO_SETTINGS = ("FEATURES", "NEEDED", "TYPE_CHECKING")
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
-    for module in (environment, experts, scene_settings, success, world)
+    for module in (distractors, environment, experts, pushing, scene_settings, success, world)
     for name, value in sorted(vars(module).items())
     if name.isupper() and isinstance(value, int | float | str | tuple | dict | world.Camera) and name not in _NO_SETTINGS
 }
 """What decides a demonstration besides task, count and seed."""
 
-Job = tuple[str, int, int, bool]
-"""Task, seed and number of an episode, and whether distractors lie elsewhere in each of its pictures."""
+Job = tuple[str, int, int, bool, bool]
+"""Task, seed, number of an episode, whether distractors lie elsewhere in each picture, and whether it begins elsewhere."""
 _ENVIRONMENT: list[TableTopEnvironment] = []
 """The one of this process."""
 
 
 def _scene(job: Job) -> np.ndarray:
-    task, seed, number, _ = job
+    task, seed, number, *_ = job
     return draw_scene(task, np.random.default_rng([seed, task_key(task), number]))
 
 
@@ -56,12 +58,12 @@ def _episode(job: Job) -> Episode | None:
         MemoryError, OSError: for what the machine lacks, which would cost every other episode too.
         UserError: where the simulator does not start.
     """
-    task, seed, number, scatter = job
+    task, seed, number, scatter, elsewhere = job
     if not _ENVIRONMENT:
         _ENVIRONMENT.append(TableTopEnvironment())
     try:
         rng = np.random.default_rng([seed, task_key(task), number, 1])
-        return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter)
+        return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter, begun_elsewhere=elsewhere)
     except (MemoryError, OSError):
         raise
     except Exception as error:  # whatever the simulator raises: the other episodes go on
@@ -79,7 +81,13 @@ def _episodes(jobs: list[Job], workers: int) -> Iterator[Episode | None]:
 
 
 def demonstrations(
-    task: str, count: int, seed: int, workers: int, progress: Callable[[], None], scatter: bool = False
+    task: str,
+    count: int,
+    seed: int,
+    workers: int,
+    progress: Callable[[], None],
+    scatter: bool = False,
+    elsewhere: bool = False,
 ) -> Demonstrations:
     """The first ``count`` successful episodes of a task, in the order of their numbers, whatever the number of workers.
 
@@ -89,13 +97,14 @@ def demonstrations(
         seed: decides scenes, and styles and noise of the expert.
         workers: processes.
         progress: called after each successful episode.
-        scatter: whether distractors lie elsewhere in each picture.
+        scatter: whether distractors lie elsewhere in each picture; then it is told what is where.
+        elsewhere: whether a push begins with the hand anywhere around the circle.
 
     Raises:
         UserError: if too few episodes succeed.
     """
     kept: list[tuple[Job, Episode]] = []
-    jobs = [(task, seed, number, scatter) for number in range(MOST * count)]
+    jobs = [(task, seed, number, scatter, elsewhere) for number in range(MOST * count)]
     tried = 0
     for job, episode in zip(jobs, _episodes(jobs, workers), strict=False):
         tried += 1
@@ -106,6 +115,12 @@ def demonstrations(
             break
     else:
         raise UserError(f"table-top {task!r}: expected {count} successful episodes of {tried}, found {len(kept)}")
+    observed = {
+        IMAGE: padded([torch.from_numpy(episode.images) for _, episode in kept])[0],
+        POSE: padded([torch.from_numpy(episode.poses) for _, episode in kept])[0],
+    }
+    if scatter:
+        observed[PLACES] = padded([torch.from_numpy(episode.places) for _, episode in kept if episode.places is not None])[0]
     states, lengths = padded([torch.from_numpy(episode.commands) for _, episode in kept])
     return Demonstrations(
         states=states,
@@ -114,11 +129,8 @@ def demonstrations(
         state_names=STATE_NAMES,
         state_units=STATE_UNITS,
         concepts=(task,) * count,
-        observed={
-            IMAGE: padded([torch.from_numpy(episode.images) for _, episode in kept])[0],
-            POSE: padded([torch.from_numpy(episode.poses) for _, episode in kept])[0],
-        },
-        per_step=tuple(FEATURES),
+        observed=observed,
+        per_step=tuple(observed),
         scenes=torch.from_numpy(np.stack([_scene(job) for job, _ in kept])),
         provenance={"generator": NAME, "seed": seed, "count": count, "tried": tried, "rejected": tried - count},
     )
@@ -132,11 +144,19 @@ class Expert:
         own = seed if name == "train" else VALIDATION_SEED + seed
         return concatenate([self.draw(task, TIMES.get(task, 1) * count, own, scatter=True) for task in TRAINING_CONCEPTS])
 
-    def draw(self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False) -> Demonstrations:
-        """``count`` demonstrations of a task, if wanted with distractors that lie elsewhere in each picture."""
+    def recoveries(self, name: Split, count: int, seed: int) -> Demonstrations:
+        """``count`` more of every push, which begin where one went wrong, see :func:`.experts.led_astray`."""
+        own = RECOVERY_SEED + seed + (0 if name == "train" else VALIDATION_SEED)
+        pushes = [task for task in TRAINING_CONCEPTS if task in PUSHES]
+        return concatenate([self.draw(task, count, own, scatter=True, elsewhere=True) for task in pushes])
+
+    def draw(
+        self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
+    ) -> Demonstrations:
+        """``count`` demonstrations of a task, see :func:`demonstrations`."""
         settings = {"domain": NAME, "task": expect_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
-        settings["scatter"] = scatter
-        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter))
+        settings |= {"scatter": scatter, "elsewhere": elsewhere}
+        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """New scenes ``(count, 24)``, and what is seen there."""

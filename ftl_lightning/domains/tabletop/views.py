@@ -1,6 +1,7 @@
 """How a model sees the table-top: as it is, and in training also from other sides."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -8,12 +9,13 @@ from torch.nn import functional
 
 from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.domains.domain import View
-from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, POSE
+from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, PLACES, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
 
-HAND, MOVED = "hand", "moved"
+HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
-"""Observed with the view ``hand``: column and row of the hand in the picture (-1 to 1)."""
+"""Observed with the view ``hand``: column and row of the hand in the picture (-1 to 1); with ``points``: its x and y from the
+middle, where 1 is half of a picture."""
 SHIFT = 0.07
 """Metres by which a scene is shifted at most, in x and in y."""
 TURN = 0.5
@@ -32,7 +34,7 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
 
     Args:
         states: ``(sample, horizon, 4)``.
-        observed: ``image`` and ``pose``.
+        observed: ``image`` and ``pose``, and the privileged ``places`` if they are there.
         mirrored: ``(sample,)`` of bool, left and right exchanged.
         angles: ``(sample,)`` in radians.
         shifts: ``(sample, 2)`` in metres, x and y.
@@ -55,7 +57,30 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
     images = observed[IMAGE]
     grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
     drawn = functional.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
-    return places(states), {**observed, IMAGE: drawn.round().to(torch.uint8), POSE: places(observed[POSE])}
+    found = {**observed, IMAGE: drawn.round().to(torch.uint8), POSE: places(observed[POSE])}
+    if PLACES in observed:
+        seen, centres = observed[PLACES].split((1, 3), dim=-1)
+        centres = places(centres)
+        shown = ((centres[..., :2] - middle).abs() < HALF).all(dim=-1, keepdim=True)
+        found[PLACES] = torch.cat((seen * shown, centres), dim=-1)
+    return places(states), found
+
+
+def misplaced(read: Tensor, places: Tensor) -> Tensor:
+    """How wrong points that were read of pictures are ``(sample,)``.
+
+    The absolute errors of the centres of what is seen, where 1 is half of a picture, and a hundredth of the cross-entropy of
+    whether it is seen.
+
+    Args:
+        read: x, y, height and logit of being seen of each object, all x first ``(sample, 20)``; see
+            :class:`ftl_lightning.diffusion.image_encoder.Points`.
+        places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
+    """
+    read, seen = read.unflatten(1, (4, -1)).transpose(1, 2), places[..., 0]
+    off = read[..., :3] - (places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))) / HALF
+    unseen = functional.binary_cross_entropy_with_logits(read[..., 3], seen, reduction="none")
+    return (off.abs().sum(dim=-1) * seen + 0.01 * unseen).sum(dim=-1)
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
@@ -81,14 +106,20 @@ def _with_origin(observed: Observed) -> dict[str, Tensor]:
     return {**observed, ORIGIN: away.flip(1)}
 
 
+def _with_place(observed: Observed) -> dict[str, Tensor]:
+    return {**observed, ORIGIN: (observed[POSE][:, :2] - observed[POSE].new_tensor(MIDDLE)) / HALF}
+
+
+_FROM_HAND = View(
+    features={**FEATURES, ORIGIN: Feature((2,))},
+    observe=_with_origin,
+    encode=lambda states, observed: states - _place(observed),
+    decode=lambda states, observed: states + _place(observed),
+    perturb=_perturb,
+)
 VIEWS = {
-    HAND: View(
-        features={**FEATURES, ORIGIN: Feature((2,))},
-        observe=_with_origin,
-        encode=lambda states, observed: states - _place(observed),
-        decode=lambda states, observed: states + _place(observed),
-        perturb=_perturb,
-    ),
+    HAND: _FROM_HAND,
+    POINTS: replace(_FROM_HAND, observe=_with_place, plane=(0, 1)),
     MOVED: View(
         features=FEATURES,
         observe=lambda observed: observed,
@@ -100,6 +131,6 @@ VIEWS = {
 }
 """With ``model.perturb``, scenes are mirrored, turned and shifted at random together with what is done in them.
 
-``hand`` shows places from where the hand is; keypoints of pictures can be told likewise, see :data:`ORIGIN`. ``moved`` shows states
-as they are.
+``hand`` shows places from where the hand is; keypoints of pictures can be told likewise, see :data:`ORIGIN`. So does ``points``,
+for encoders that tell x and y of things. ``moved`` shows states as they are.
 """

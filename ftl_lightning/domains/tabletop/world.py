@@ -25,6 +25,8 @@ from ftl_lightning.domains.tabletop.scenes import (
 
 STEP = 1 / 240
 """Seconds of a step of the simulation."""
+FASTEST = 0.02
+"""Metres that the hand is moved in a step of an episode at most; of an action farther away it goes the first part."""
 MASS = {CIRCLE: 0.06, TRIANGLE: 0.15, BOOK: 0.35, WHITE: 0.0, BOWL: 0.0}
 """kg; what has none stays where it is."""
 FRICTION = {CIRCLE: 0.5, TRIANGLE: 0.6, BOOK: 0.5, WHITE: 0.6, BOWL: 0.6}

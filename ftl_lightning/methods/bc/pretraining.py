@@ -43,5 +43,5 @@ class CloningPretraining(Pretraining[CloningModel]):
 
     def losses(self, model: CloningModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Squared error of what follows."""
-        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        states, seen = batch.states, batch.observed
         return model.errors(states, seen, model.training_embeddings[batch.concepts])

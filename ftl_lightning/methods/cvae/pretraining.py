@@ -40,7 +40,7 @@ class VAEPretraining(Pretraining[VAEModel]):
 
     def losses(self, model: VAEModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """The negative evidence lower bound, per number of the behaviour (Kingma & Welling, 2014)."""
-        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        states, seen = batch.states, batch.observed
         mean, log_variance = model.posterior(states, seen)
         noise = torch.randn(mean.shape, generator=draw, device=mean.device)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)

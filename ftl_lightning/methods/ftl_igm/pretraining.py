@@ -18,7 +18,7 @@ from ftl_lightning.learning.pretraining import Pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.option_groups import flat, groups_of
-from ftl_lightning.ranges import expect_count, expect_factor, expect_range
+from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.regrouped import PRETRAINING
 
 WINDOWS = 4096
@@ -62,6 +62,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         denoiser_args: its arguments other than the sizes.
         paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
         diffusion_steps: T.
+        draws: timesteps and noises that are drawn for each window of a step; what it observes is read once for all of them.
         prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'``, ``'displacement'`` or
             ``'cosines'``, from which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
         loss: what is minimised.
@@ -81,6 +82,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         denoiser_args: Mapping[str, Any] | None = None,
         paper_size: bool = False,
         diffusion_steps: int = 100,
+        draws: int = 1,
         prediction: str = "epsilon",
         loss: LossOptions = _LOSS,
         codes: Codes = _CODES,
@@ -90,11 +92,13 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         **options: Any,
     ) -> None:
         super().__init__(learning_rate=learning_rate, guidance=guidance, **options)
-        self.save_hyperparameters(ignore=groups_of(PRETRAINING))
+        # Configurations from before there were draws keep their hash.
+        self.save_hyperparameters(ignore=[*groups_of(PRETRAINING), *(["draws"] if draws == 1 else [])])
         self.save_hyperparameters(flat({"loss": loss, "codes": codes}, PRETRAINING))
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
         expect_count("model.diffusion_steps", diffusion_steps, 1, MOST_STEPS)
-        self.loss, self.codes = loss, codes
+        expect_count("model.draws", draws, 1, MOST_TOGETHER)
+        self.loss, self.codes, self.draws = loss, codes, draws
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> GenerativeModel:
         network = {name: self.hparams[name] for name in ("denoiser", "diffusion_steps", "prediction")}
@@ -114,14 +118,17 @@ class PretrainingModule(Pretraining[GenerativeModel]):
 
     def losses(self, model: GenerativeModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Eq. 1; while fitting, concepts are dropped."""
-        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        states, seen = batch.states, batch.observed
         clean = model.encode(states, seen)
-        context = model.observe(seen)
+        context, concept = model.observe(seen), batch.concepts
+        if (draws := self.draws) > 1:
+            clean, concept = clean.repeat(draws, 1, 1), concept.repeat(draws)
+            context = tuple(part.repeat(draws, *(1,) * (part.dim() - 1)) for part in context)
         count = len(clean)
         dropout = self.loss.condition_dropout if model.training else 0.0
         removed = torch.rand(count, generator=draw, device=self.device) < dropout
         concepts = torch.cat((model.empty[None], model.training_embeddings))
-        index = torch.where(removed, 0, batch.concepts + 1)
+        index = torch.where(removed, 0, concept + 1)
         if self.codes.share and model.training:
             concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
         else:

@@ -81,7 +81,7 @@ class InContextPretraining(Pretraining[InContextModel]):
 
     def losses(self, model: InContextModel, batch: Batch, draw: torch.Generator) -> Tensor:
         """Negative log-likelihood of the bins of what follows."""
-        states, seen = model.perturbed(batch.states, batch.observed, draw)
+        states, seen = batch.states, batch.observed
         observed = model.present_vector(seen)
         target = model.bins(model.encode(states[:, :: self.stride], seen)[:, -1])
         most, groups = self.hparams["prompts"], len(self._own)
