@@ -3,8 +3,9 @@
     python benchmarks/tabletop_localisation.py --pretrained pretrained/tabletop --out results/tabletop_localisation.json
 
 From the features of an image, linear regression (ridge) and a small network each estimate where every object is. They learn from
-new scenes of all tasks, and are tested on others; the encoder stays as it was trained. Errors are distances in centimetres;
-`middle` is the error of always saying the mean place.
+new scenes of all tasks, and are tested on others; the encoder stays as it was trained. Errors are distances in centimetres, of
+circle and triangle apart for each surface that they lie on; `middle` is the error of always saying the mean place. An encoder that
+reads points also tells places itself (`read`).
 """
 
 import argparse
@@ -14,9 +15,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.domains.tabletop.scenes import COLUMNS, scenes
+from ftl_lightning.diffusion.image_encoder import POINT
+from ftl_lightning.domains.tabletop.scenes import COLUMNS, scenes, support
 from ftl_lightning.domains.tabletop.source import initial_states
 from ftl_lightning.domains.tabletop.tasks import TASKS
+from ftl_lightning.domains.tabletop.views import HALF, MIDDLE
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -57,6 +60,15 @@ def network(features: Tensor, places: Tensor) -> nn.Module:
     return net
 
 
+def told(features: Tensor, name: str) -> Tensor | None:
+    """Where an encoder says that an object is ``(scene, 2)`` in centimetres, if it reads points."""
+    count = len(COLUMNS)
+    if features.shape[1] != POINT * count:
+        return None
+    number = list(COLUMNS).index(name)
+    return 100 * (features[:, [number, count + number]] * HALF + torch.tensor(MIDDLE))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pretrained", default="pretrained/tabletop", help="folder of the model")
@@ -85,13 +97,24 @@ def main() -> None:
         def error(estimate: Tensor, places: Tensor = places, tested: Tensor = tested) -> Tensor:
             return (estimate - places[tested]).norm(dim=1)
 
-        found[name] = {"scenes": float(len(known)), "middle": error(places[known].mean(dim=0)).mean().item()}
+        off = {}
         for kind, fit in (("linear", ridge), ("network", network)):
             with torch.no_grad():
                 probe = torch.enable_grad()(fit)(features[known], places[known])
-                off = error(probe(features[tested]))
-            found[name] |= {f"{kind} median": off.median().item(), f"{kind} rms": off.square().mean().sqrt().item()}
-        print(name, {key: round(value, 2) for key, value in found[name].items()}, flush=True)
+                off[kind] = error(probe(features[tested]))
+        if (itself := told(features[tested], name)) is not None:
+            off["read"] = error(itself)
+        middle = error(places[known].mean(dim=0))
+        raised = torch.tensor([support(scene, name) > 0 for scene in drawn[tested].numpy()])
+        for where, rows in (("", ~raised), (" on the book", raised)):
+            if not rows.any():
+                continue
+            numbers = {"scenes": float(rows.sum()), "middle": middle[rows].mean().item()}
+            for kind, distances in off.items():
+                one = distances[rows]
+                numbers |= {f"{kind} median": one.median().item(), f"{kind} rms": one.square().mean().sqrt().item()}
+            found[name + where] = numbers
+            print(name + where, {key: round(value, 2) for key, value in numbers.items()}, flush=True)
     if options.out:
         content = {"model": model.hash, "pretrained": Path(options.pretrained).name, "cm": found}
         write_text(options.out, json.dumps(content, indent=2) + "\n")
