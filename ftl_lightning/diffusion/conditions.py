@@ -204,20 +204,21 @@ class PointEncoder(ConditionEncoder):
         measured, points = vector.split((vector.shape[1] - POINT * self.count, POINT * self.count), dim=1)
         return measured, points.unflatten(1, (POINT, self.count)).transpose(1, 2)
 
-    def _chosen(self, context: Context, concept: Tensor) -> Tensor:
+    def _chosen(self, points: Tensor, concept: Tensor) -> Tensor:
         """``(batch, choice, 4)``."""
         weights = self.choice(concept / concept.shape[-1] ** 0.5).unflatten(1, (CHOSEN, self.count)).softmax(dim=-1)
-        chosen: Tensor = weights @ context[1]
+        chosen: Tensor = weights @ points
         return chosen
 
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
         if not self.turns:
             return None
-        first, second = self._chosen(context, concept)[:, :2, :2].unbind(dim=1)
+        # The direction between points that are close to each other is steep in where they are: no gradient goes there.
+        first, second = self._chosen(context[1].detach(), concept)[:, :2, :2].unbind(dim=1)
         return functional.normalize(second - first + 1e-6, dim=-1)
 
     def attend(self, context: Context, concept: Tensor) -> Tensor:
-        chosen = self._chosen(context, concept)
+        chosen = self._chosen(context[1], concept)
         places = chosen[..., :2]
         first, second = torch.triu_indices(CHOSEN, CHOSEN, 1, device=places.device)
         vectors = torch.cat((places, places[:, second] - places[:, first]), dim=1)

@@ -52,21 +52,33 @@ def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, pau
     return content.getvalue()
 
 
-def captioned(pictures: Sequence[NDArray[np.uint8]], text: str) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` with a caption below each; long lines are broken where the picture ends."""
-    if not pictures or not text:
+def captioned(pictures: Sequence[NDArray[np.uint8]], text: str, ending: str = "") -> list[NDArray[np.uint8]]:
+    """Pictures ``(height, width, 3)`` with a caption below each; long lines are broken where the picture ends.
+
+    Args:
+        pictures: of one size.
+        text: below each.
+        ending: below that of the last, such as an outcome, which nobody knows before; empty for nothing.
+    """
+    if not pictures or not (text or ending):
         return list(pictures)
     font = ImageFont.load_default(FONT_SIZE)
     width = pictures[0].shape[1]
     letters = max(1, int((width - 2 * MARGIN) / font.getlength("n")))
-    lines = [part for one in text.splitlines() for part in textwrap.wrap(line(one), letters) or [""]]
+    told, ends = (
+        [part for one in words.splitlines() for part in textwrap.wrap(line(one), letters) or [""]] for words in (text, ending)
+    )
     spacing = round(1.35 * FONT_SIZE)
-    strip = Image.new("RGB", (width, spacing * len(lines) + 2 * MARGIN), PAPER)
-    draw = ImageDraw.Draw(strip)
-    for number, part in enumerate(lines):
-        draw.text((MARGIN, MARGIN + number * spacing), part, fill=INK, font=font)
-    below = np.asarray(strip, dtype=np.uint8)
-    return [np.concatenate((picture, below)) for picture in pictures]
+
+    def strip(lines: Sequence[str]) -> NDArray[np.uint8]:
+        drawn = Image.new("RGB", (width, spacing * (len(told) + len(ends)) + 2 * MARGIN), PAPER)
+        draw = ImageDraw.Draw(drawn)
+        for number, part in enumerate(lines):
+            draw.text((MARGIN, MARGIN + number * spacing), part, fill=INK, font=font)
+        return np.asarray(drawn, dtype=np.uint8)
+
+    below, last = strip(told), strip([*told, *ends])
+    return [*(np.concatenate((picture, below)) for picture in pictures[:-1]), np.concatenate((pictures[-1], last))]
 
 
 def side_by_side(films: Mapping[str, Sequence[NDArray[np.uint8]]]) -> list[NDArray[np.uint8]]:
@@ -93,16 +105,14 @@ def side_by_side(films: Mapping[str, Sequence[NDArray[np.uint8]]]) -> list[NDArr
     return pictures
 
 
-def outcome_text(goal: str, outcomes: Mapping[str, Tensor], episode: int = 0) -> str:
-    """A caption: what was asked and how an episode ended.
+def outcome_text(outcomes: Mapping[str, Tensor], episode: int = 0) -> str:
+    """How an episode ended, in words.
 
     Args:
-        goal: in words.
         outcomes: a domain's judgement of episodes, by name ``(episode,)``; of bool, or numbers.
         episode: which one.
     """
-    ends = [f"{name}: {_end(values[episode])}" for name, values in outcomes.items()]
-    return "\n".join(part for part in (goal, ", ".join(ends)) if part)
+    return ", ".join(f"{name}: {_end(values[episode])}" for name, values in outcomes.items())
 
 
 def _end(value: Tensor) -> str:

@@ -32,4 +32,4 @@ def draw(logger: TensorBoardLogger, judged: Sequence[Judged], domain: Domain, fi
         film = domain.closed_loop.film if domain.closed_loop else None
         if film and behaviour.rollout is not None and behaviour.followed is not None:
             pictures = film(behaviour.rollout.take(0, 1), behaviour.followed)
-            log_animation(logger, f"{CLOSED}/{name}", pictures, step, outcome_text(behaviour.task.goal, behaviour.outcomes))
+            log_animation(logger, f"{CLOSED}/{name}", pictures, step, behaviour.task.goal, outcome_text(behaviour.outcomes))

@@ -98,6 +98,6 @@ class Execution(Shown):
         if Path(path).suffix != ".gif":
             raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
         outcomes = self.domain.judge(self.goal, self.rollout) if self.goal else {}
-        pictures = captioned(self.frames(episode), outcome_text(self.goal, outcomes, episode))
+        pictures = captioned(self.frames(episode), self.goal, outcome_text(outcomes, episode))
         with atomic(path) as temporary:
             temporary.write_bytes(gif(pictures))

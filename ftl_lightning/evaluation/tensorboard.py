@@ -102,7 +102,9 @@ def log_projector(logger: TensorBoardLogger, embeddings: Mapping[str, torch.Tens
         logger.experiment.add_embedding(stacked, metadata=list(embeddings), global_step=step, tag="concepts")
 
 
-def log_animation(logger: TensorBoardLogger, tag: str, pictures: Sequence[NDArray[np.uint8]], step: int, caption: str = "") -> None:
+def log_animation(
+    logger: TensorBoardLogger, tag: str, pictures: Sequence[NDArray[np.uint8]], step: int, caption: str = "", ending: str = ""
+) -> None:
     """Put an animated GIF among the images.
 
     Args:
@@ -110,9 +112,9 @@ def log_animation(logger: TensorBoardLogger, tag: str, pictures: Sequence[NDArra
         tag: its name.
         pictures: ``(height, width, 3)`` each.
         step: the trainer's.
-        caption: drawn below every picture, see :func:`~ftl_lightning.evaluation.animation.captioned`.
+        caption, ending: drawn below every picture and below the last, see :func:`~ftl_lightning.evaluation.animation.captioned`.
     """
-    shown = captioned(pictures, caption) if caption else list(pictures)
+    shown = captioned(pictures, caption, ending)
     height, width, _ = shown[0].shape
     image = Summary.Image(encoded_image_string=gif(shown), height=height, width=width, colorspace=3)
     logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)

@@ -46,8 +46,19 @@ def test_a_caption_stands_below_every_picture_and_breaks_its_lines() -> None:
     assert captioned(plain, "")[0].shape == plain[0].shape
 
 
+def test_how_it_ended_stands_below_the_last_picture_alone() -> None:
+    plain = pictures(3)
+    first, second, last = captioned(plain, "goal", "success: yes")
+    assert first.shape == second.shape == last.shape
+    alone = captioned(plain, "goal")[0]
+    assert np.array_equal(first[: len(alone) - 6], alone[:-6])
+    assert (first[len(alone) - 6 :] == 255).all()
+    assert np.array_equal(first[30:], second[30:])
+    assert (last[len(alone) - 6 :] < 128).any()
+
+
 def test_an_outcome_is_told_in_words() -> None:
     outcomes = {"success": torch.tensor([True, False]), "return": torch.tensor([1.0, 2.345])}
-    assert outcome_text("roundabout", outcomes) == "roundabout\nsuccess: yes, return: 1.00"
-    assert outcome_text("roundabout", outcomes, 1) == "roundabout\nsuccess: no, return: 2.35"
-    assert outcome_text("roundabout", {}) == "roundabout"
+    assert outcome_text(outcomes) == "success: yes, return: 1.00"
+    assert outcome_text(outcomes, 1) == "success: no, return: 2.35"
+    assert outcome_text({}) == ""

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,7 @@ def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bod
         client.changeVisualShape(robot, link, rgbaColor=[1, 1, 1, 0])
     for finger in FINGERS:
         client.changeDynamics(robot, finger, lateralFriction=FINGER_FRICTION)
-    objects = {name: _object(client, scene, name) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
+    objects = {name: _object(client, scene, name, arm_drawn) for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5}
     return Bodies(robot, objects)
 
 
@@ -129,7 +130,8 @@ def _box(
     return body
 
 
-def _object(client: Simulator, scene: NDArray[np.float32], name: str) -> int:
+def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: bool) -> int:
+    """An object; ``edged`` draws circle and triangle with edges, for people: smooth shading makes a ball and a cone of them."""
     x, y, yaw = map(float, scene[COLUMNS[name]][1:])
     height, colour = HEIGHT[name], [*COLOUR[name], 1]
     place = (x, y, support(scene, name) + height / 2)
@@ -138,12 +140,15 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str) -> int:
     if name == CIRCLE:
         shape = client.createCollisionShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], height=height)
         seen = client.createVisualShape(pybullet().GEOM_CYLINDER, radius=RADIUS[name], length=height, rgbaColor=colour)
+        if edged:
+            drawn = _edged(_corners(RADIUS[name], height / 2, ROUND))
+            seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     elif name == TRIANGLE:
         vertices = _prism(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN)  # corners move by 2 when sides move by 1
         shape = client.createCollisionShape(pybullet().GEOM_MESH, vertices=vertices)
-        seen = client.createVisualShape(
-            pybullet().GEOM_MESH, vertices=_prism(RADIUS[name], height / 2), indices=_PRISM_SIDES, rgbaColor=colour
-        )
+        smooth: dict[str, list[Any]] = {"vertices": _prism(RADIUS[name], height / 2), "indices": _PRISM_SIDES}
+        drawn = _edged(_corners(RADIUS[name], height / 2, 3)) if edged else smooth
+        seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     else:
         shape = _bowl_shape(client)
         vertices, triangles = bowl(RADIUS[name], height / 2, 0.006)
@@ -159,6 +164,39 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str) -> int:
 def _prism(radius: float, half: float) -> list[list[float]]:
     corners = [(radius * math.cos(angle), radius * math.sin(angle)) for angle in (0, 2 * math.pi / 3, 4 * math.pi / 3)]
     return [[x, y, z] for z in (-half, half) for x, y in corners]
+
+
+ROUND = 48
+"""Corners of a circle that is drawn with edges."""
+
+
+def _corners(radius: float, half: float, count: int) -> NDArray[np.float64]:
+    """Of an upright prism ``(2 * count, 3)``, those below first."""
+    angles = 2 * np.pi * np.arange(count) / count
+    flat = radius * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    return np.concatenate([np.pad(flat, ((0, 0), (0, 1)), constant_values=z) for z in (-half, half)])
+
+
+def _edged(corners: NDArray[np.float64]) -> dict[str, list[Any]]:
+    """Arguments of a visual shape of an upright prism whose faces share no corner, so that no shading runs across an edge.
+
+    Args:
+        corners: ``(2 * count, 3)``, those below first.
+    """
+    count = len(corners) // 2
+    below, above = corners[:count], corners[count:]
+    faces = [(above[0], above[i], above[i + 1]) for i in range(1, count - 1)]
+    faces += [(below[0], below[i + 1], below[i]) for i in range(1, count - 1)]
+    for i in range(count):
+        j = (i + 1) % count
+        faces += [(below[i], below[j], above[j]), (below[i], above[j], above[i])]
+    normals = np.array([np.cross(b - a, c - a) for a, b, c in faces])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return {
+        "vertices": np.array(faces).reshape(-1, 3).tolist(),
+        "indices": list(range(3 * len(faces))),
+        "normals": normals.repeat(3, axis=0).tolist(),
+    }
 
 
 _PRISM_SIDES = [0, 2, 1, 3, 4, 5, 0, 1, 4, 0, 4, 3, 1, 2, 5, 1, 5, 4, 2, 0, 3, 2, 3, 5]
