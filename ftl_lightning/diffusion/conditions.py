@@ -173,11 +173,11 @@ class SetEncoder(ConditionEncoder):
 class PointEncoder(ConditionEncoder):
     """Points that were read of images: the concept chooses some, of which is read how they lie to each other and to the origin.
 
-    Each of :data:`CHOSEN` choices is a mean of all points, weighed by the concept alone (attention whose keys are the points'
-    names), so that another concept may mean another thing by the same plan. Of every chosen point, and of every difference between
-    two, the network is given the vector, its direction and the logarithm of its length: what is near and what is far differ in
-    scale. Where plans have a plane, all vectors are told from the direction from the first chosen point to the second, and so is
-    the plan: whatever is learned holds in every direction.
+    Each of :data:`CHOSEN` choices is a mean of the points that are seen, weighed by the concept alone (attention whose keys are the
+    points' names), so that another concept may mean another thing by the same plan. Of every chosen point, and of every difference
+    between two, the network is given the vector, its direction and the logarithm of its length: what is near and what is far
+    differ in scale. All points stand beside them as they are. Where plans have a plane, all vectors are told from the direction
+    from the first chosen point to the second, and so is the plan: whatever is learned holds in every direction.
 
     Args:
         sizes: with the numbers that are read of images, which have to be points.
@@ -194,21 +194,23 @@ class PointEncoder(ConditionEncoder):
         self.count, self.turns = sizes.image_dim // POINT, bool(sizes.plane)
         self.choice = nn.Linear(sizes.concept_dim, CHOSEN * self.count)
         with torch.no_grad():  # every choice starts with a favourite of its own
-            self.choice.bias.copy_(2.0 * torch.eye(self.count)[torch.arange(CHOSEN) % self.count].flatten())
+            self.choice.bias.copy_(torch.eye(self.count)[torch.arange(CHOSEN) % self.count].flatten())
         vectors = CHOSEN * (CHOSEN + 1) // 2
-        inputs = sizes.measured_dim + 5 * vectors + 2 * CHOSEN
+        inputs = sizes.measured_dim + 5 * vectors + 2 * CHOSEN + POINT * self.count
         self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
 
     def observe(self, vector: Tensor) -> Context:
-        """What was measured, and the points ``(batch, point, 4)``."""
+        """What was measured, and x, y, height and probability of being seen of each point ``(batch, point, 4)``."""
         measured, points = vector.split((vector.shape[1] - POINT * self.count, POINT * self.count), dim=1)
-        return measured, points.unflatten(1, (POINT, self.count)).transpose(1, 2)
+        points = points.unflatten(1, (POINT, self.count)).transpose(1, 2)
+        return measured, torch.cat((points[..., :3], points[..., 3:].sigmoid()), dim=-1)
 
     def _chosen(self, points: Tensor, concept: Tensor) -> Tensor:
-        """``(batch, choice, 4)``."""
-        weights = self.choice(concept / concept.shape[-1] ** 0.5).unflatten(1, (CHOSEN, self.count)).softmax(dim=-1)
-        chosen: Tensor = weights @ points
-        return chosen
+        """x, y, height, and how much of what is asked for is seen ``(batch, choice, 4)``."""
+        logits = SHARPNESS * self.choice(concept / concept.shape[-1] ** 0.5)
+        weights = logits.unflatten(1, (CHOSEN, self.count)).softmax(dim=-1) * points[:, None, :, 3]
+        seen = weights.sum(dim=-1, keepdim=True)
+        return torch.cat((weights @ points[..., :3] / (seen + 1e-3), seen), dim=-1)
 
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
         if not self.turns:
@@ -218,21 +220,25 @@ class PointEncoder(ConditionEncoder):
         return functional.normalize(second - first + 1e-6, dim=-1)
 
     def attend(self, context: Context, concept: Tensor) -> Tensor:
-        chosen = self._chosen(context[1], concept)
-        places = chosen[..., :2]
+        measured, points = context
+        chosen = self._chosen(points, concept)
+        places, seen = chosen[..., :2], points[..., 3:]
         first, second = torch.triu_indices(CHOSEN, CHOSEN, 1, device=places.device)
-        vectors = torch.cat((places, places[:, second] - places[:, first]), dim=1)
+        vectors = torch.cat((places, places[:, second] - places[:, first], seen * points[..., :2]), dim=1)
         if (direction := self.direction(context, concept)) is not None:
             vectors = turned(vectors, direction, (0, 1), back=False)
-        length = (vectors.square().sum(dim=-1, keepdim=True) + SMALLEST**2).sqrt()
-        rest = torch.cat((10 * chosen[..., 2], chosen[..., 3].sigmoid()), dim=1)
-        parts = (context[0], vectors.flatten(1), (vectors / length).flatten(1), (length / SMALLEST).log()[..., 0] / 3, rest)
+        near, plain = vectors[:, : -self.count], vectors[:, -self.count :]
+        length = (near.square().sum(dim=-1, keepdim=True) + SMALLEST**2).sqrt()
+        rest = (10 * chosen[..., 2], chosen[..., 3], 10 * (seen * points[..., 2:3])[..., 0], seen[..., 0], plain.flatten(1))
+        parts = (measured, near.flatten(1), (near / length).flatten(1), (length / SMALLEST).log()[..., 0] / 3, *rest)
         features: Tensor = self.net(torch.cat(parts, dim=1))
         return features
 
 
 CHOSEN = 4
 """Points that a concept chooses."""
+SHARPNESS = 4.0
+"""Factor of the numbers that decide a choice: a mean of several points is where none of them is."""
 SMALLEST = 0.02
 """Length of a vector below which its direction counts less and less."""
 

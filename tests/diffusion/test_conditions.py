@@ -207,11 +207,24 @@ def test_a_concept_decides_which_points_matter() -> None:
             for point in range(2):
                 encoder.choice.weight[choice * 3 + point, point] = 100
     first, second = 6**0.5 * torch.eye(6)[:2, None]
-    moved = scene()
-    moved[0, [3, 6]] += 1.0  # x and y of point 1
-    for concept, same in ((first, True), (second, False)):
-        plain, other = (encoder.attend(encoder.observe(seen), concept) for seen in (scene(), moved))
-        assert torch.allclose(plain, other, atol=1e-4) == same
+    _, points = encoder.observe(scene())
+    for concept, point in ((first, 0), (second, 1)):
+        chosen = encoder._chosen(points, concept)
+        assert chosen.shape == (1, CHOSEN, 4)
+        torch.testing.assert_close(chosen[0, :, :3], points[0, [point] * CHOSEN, :3], atol=2e-3, rtol=0)
+        assert torch.allclose(chosen[..., 3], points[0, point, 3], atol=1e-3)
+    # What is not seen is no part of a mean: the third point hardly is, wherever it is said to be.
+    asked = 6**0.5 * torch.eye(6)[2:3]
+    means = [encoder._chosen(encoder.observe(seen)[1], asked)[..., :2] for seen in (scene(), elsewhere(scene()))]
+    torch.testing.assert_close(*means, atol=0.2, rtol=0)
+    assert not torch.allclose(*means, atol=1e-4)
+
+
+def elsewhere(seen: Tensor) -> Tensor:
+    """The third point, which is hardly seen, far away."""
+    seen = seen.clone()
+    seen[0, [4, 7]] += 5.0
+    return seen
 
 
 def test_points_have_to_be_read_of_images() -> None:

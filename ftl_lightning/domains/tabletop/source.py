@@ -31,7 +31,7 @@ TIMES = {PUSH: 4}
 """So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""
 RECOVERY_SEED = 2_000_000
 """Added to the seed of demonstrations that begin elsewhere."""
-_NO_SETTINGS = ("FEATURES", "NEEDED", "TYPE_CHECKING")
+_NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
     for module in (distractors, environment, experts, pushing, scene_settings, success, world)
