@@ -83,6 +83,7 @@ class PretrainingData(pl.LightningDataModule):
         validation_per_concept: others of each, for the validation loss.
         recoveries: demonstrations more of each training concept that has some, which begin where behaviour went wrong, see
             :class:`~ftl_lightning.domains.domain.Recoveries`.
+        more: file of further demonstrations of training concepts, such as corrections of a model; ``None`` for none.
         seed: decides the demonstrations and the order they are seen in.
         batch_size: windows a step.
         steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
@@ -106,6 +107,7 @@ class PretrainingData(pl.LightningDataModule):
         samples_per_concept: int = 100,
         validation_per_concept: int = 10,
         recoveries: int = 0,
+        more: str | None = None,
         seed: int = 0,
         batch_size: int = 128,
         steps_per_epoch: int = 500,
@@ -117,7 +119,7 @@ class PretrainingData(pl.LightningDataModule):
         chosen = Windows(**windows)
         windows = asdict(chosen)  # hyper-parameters are the local variables: those that were not given count too
         # Configurations from before there were these keep their hash.
-        unsaid = {"balance": chosen.balance is None, "recoveries": not recoveries}
+        unsaid = {"balance": chosen.balance is None, "recoveries": not recoveries, "more": more is None}
         self.save_hyperparameters(ignore=[name for name, absent in unsaid.items() if absent])
         if self.own_domain and domain not in ("", self.own_domain):
             raise UserError(f"data.domain: expected {self.own_domain!r} or none for {type(self).__name__}, found {domain!r}")
@@ -141,7 +143,7 @@ class PretrainingData(pl.LightningDataModule):
             expect_count(f"data.{name}", value, 1, most)
         expect_range("data.seed", seed, 0)
         expect_count("data.recoveries", recoveries, 0, LARGEST)
-        self.recoveries = recoveries
+        self.recoveries, self.more = recoveries, more
         self.balance = chosen.balance
         if self.balance is not None and not 0 <= self.balance <= 1:
             raise UserError(f"data.balance: expected a number from 0 to 1, found {self.balance}")
@@ -165,6 +167,8 @@ class PretrainingData(pl.LightningDataModule):
                 raise UserError(f"data.recoveries: expected 0, as domain {self.domain.name} has none, found {self.recoveries}")
             more = source.recoveries("train", self.recoveries, self.seed).fitted(self.domain.observed)
             self.training = concatenate([self.training, more])
+        if self.more is not None:
+            self.training = concatenate([self.training, self._read_more(self.more)])
         self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
         if self.balance is not None:
             self._shares = shares(self.training, self.balance)
@@ -172,6 +176,13 @@ class PretrainingData(pl.LightningDataModule):
         starts = source.starts(self.domain.concepts.training[0], 1, self.seed) if self.domain.observed else None
         if starts is not None:
             expect_features(starts.observed, self.domain.observed)
+
+    def _read_more(self, path: str) -> Demonstrations:
+        found = read_demonstrations(path, self.domain)
+        for text in found.concepts:
+            if text not in self._number:
+                raise UserError(f"{path}: expected demonstrations of training concepts, found {short(text)!r}")
+        return found
 
     @property
     def examples(self) -> Demonstrations | None:

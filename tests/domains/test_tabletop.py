@@ -268,7 +268,7 @@ def test_pushes_begin_anew_wherever_hand_and_circle_are(task: str, env: TableTop
         assert 0 <= np.linalg.norm(hand - circle[:2]) <= experts.AROUND[1] + 1e-6
         assert circle[2] == pytest.approx(before[2], abs=1e-3)
         sides.append(hand - circle[:2])
-        assert experts.perform(env, task, scene, np.random.default_rng([2, number]), begun_elsewhere=True).success
+        assert experts.perform(env, task, scene, np.random.default_rng([2, number]), begin=experts.led_astray).success
     assert np.ptp(sides, axis=0).min() > 0.03
 
 

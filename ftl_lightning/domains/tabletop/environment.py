@@ -74,6 +74,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self.bodies = Bodies(-1, {})
         self.command = np.zeros(ACTION)
         self._built = 0
+        self._trace: list[NDArray[np.float64]] = []
 
     @staticmethod
     def _connected() -> Simulator:
@@ -102,12 +103,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self.client, self._built = self._connected(), 0
         self._built += 1
         self.bodies = build(self.client, self.scene, self.arm_drawn)
-        self._steps, self._lifted, self._touched = 0, False, False
         self._place(self.scene[HAND][:3].astype(np.float64), OPEN)
-        self._first = self.places()
-        self._before = self._first[CIRCLE]
-        self._trace = [self._now()]
-        return self._observation(), self._told()
+        return self.begun(), self._told()
 
     def _place(self, hand: NDArray[np.float64], opening: float) -> None:
         """Put the hand somewhere at once."""
@@ -187,6 +184,11 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self.bodies.objects[CIRCLE], [*map(float, circle), self._first[CIRCLE][2]], turned(0.0)
         )
         self._place(hand, 0.0)
+        return self.begun()
+
+    def begun(self) -> Seen:
+        """What is seen if an episode begins as things are now."""
+        self._steps, self._lifted, self._touched = 0, False, False
         self._first = self.places()
         self._before = self._first[CIRCLE]
         self._trace = [self._now()]

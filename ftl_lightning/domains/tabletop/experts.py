@@ -1,7 +1,7 @@
 """Scripted experts: each says where the hand should go next, from where the objects are."""
 
 import math
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -229,6 +229,8 @@ class Episode:
     places: NDArray[np.float32] | None = None
 
 
+Begin = Callable[["TableTopEnvironment", str, np.random.Generator], dict[str, NDArray[Any]]]
+"""``(environment, task, what is random) -> what is seen where a demonstration begins``."""
 STAY = 4
 """Steps that the hand stays after a task is done, so that plans end at rest."""
 
@@ -241,7 +243,7 @@ def perform(
     height: float | None = None,
     feedback: bool = True,
     scatter: bool = False,
-    begun_elsewhere: bool = False,
+    begin: Begin | None = None,
 ) -> Episode:
     """One episode of the expert of a task.
 
@@ -252,14 +254,14 @@ def perform(
         rng: draws its style and its noise.
         height, feedback: see :func:`moves`.
         scatter: whether distractors lie elsewhere in each picture, see :mod:`ftl_lightning.domains.tabletop.distractors`.
-        begun_elsewhere: whether a push begins with the hand anywhere around the circle, see :func:`led_astray`.
+        begin: what happens in the scene before the demonstration begins, such as :func:`led_astray`; nothing for ``None``.
 
     Raises:
         UserError: for a scene that cannot be built.
     """
     seen, told = env.reset(options={"scene": scene})
-    if begun_elsewhere:
-        seen = led_astray(env, task, rng)
+    if begin is not None:
+        seen = begin(env, task, rng)
     how = style(rng)
     commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
     actions: list[NDArray[np.float32]] = []

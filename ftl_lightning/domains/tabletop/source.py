@@ -14,7 +14,7 @@ from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.tabletop import distractors, environment, experts, pushing, success, world
 from ftl_lightning.domains.tabletop import scenes as scene_settings
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
-from ftl_lightning.domains.tabletop.experts import Episode, perform
+from ftl_lightning.domains.tabletop.experts import Episode, led_astray, perform
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, expect_task
@@ -63,7 +63,7 @@ def _episode(job: Job) -> Episode | None:
         _ENVIRONMENT.append(TableTopEnvironment())
     try:
         rng = np.random.default_rng([seed, task_key(task), number, 1])
-        return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter, begun_elsewhere=elsewhere)
+        return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter, begin=led_astray if elsewhere else None)
     except (MemoryError, OSError):
         raise
     except Exception as error:  # whatever the simulator raises: the other episodes go on

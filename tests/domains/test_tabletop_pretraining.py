@@ -1,0 +1,143 @@
+"""Pretraining on the table-top: demonstrations that begin elsewhere, corrections from a file, and eyes that are taught places."""
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.data import PretrainingData
+from ftl_lightning.domains.tabletop import DOMAIN
+from ftl_lightning.domains.tabletop.interface import IMAGE, PLACES, POSE
+from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
+from ftl_lightning.domains.tabletop.views import HALF, MIDDLE, VIEWS, misplaced
+from ftl_lightning.errors import UserError
+from ftl_lightning.learning import PretrainingModule
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.seeding import generator
+from ftl_lightning.trainer import Trainer
+
+ROOT = Path(__file__).parents[2]
+SIZES: dict[str, Any] = {"samples_per_concept": 1, "validation_per_concept": 1, "batch_size": 8, "steps_per_epoch": 4}
+POINTS = {"widths": [8], "head": "points", "keypoints": 4, "points": 5, "origin": "origin"}
+SMALL: dict[str, Any] = {
+    "denoiser_args": {"hidden_dim": 16, "depth": 1, "condition_dim": 8, "initial_dim": 8, "initial_encoder": "points"},
+    "image_encoder": POINTS,
+    "view": "points",
+    "perturb": True,
+    "prediction": "clean",
+}
+
+
+def trainer(**options: Any) -> Trainer:
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
+    return Trainer(accelerator="cpu", default_root_dir="logs", **(quiet | options))
+
+
+def test_what_begins_elsewhere_and_corrections_join_the_training_set(tmp_path: Path) -> None:
+    data = PretrainingData(domain="tabletop", recoveries=1, **SIZES)
+    data.setup("fit")
+    assert [data.training.concepts.count(task) for task in (PUSH, AROUND_BOWL)] == [5, 2]
+    assert len(data.training) == 9
+    batch = data.batch(0)
+    assert batch.observed[PLACES].shape == (8, 5, 4)
+    assert "recoveries" in data.hparams
+    assert not {"recoveries", "more"} & set(PretrainingData(domain="tabletop", **SIZES).hparams)
+    data.training.rows([0, 1]).save(tmp_path / "more.safetensors")
+    longer = PretrainingData(domain="tabletop", more=str(tmp_path / "more.safetensors"), **SIZES)
+    longer.setup("fit")
+    assert len(longer.training) == 9
+    strange = DOMAIN.source(None).draw(PUSH_ON_BOOK, 1, 0)
+    strange.save(tmp_path / "strange.safetensors")
+    with pytest.raises(UserError, match=r"strange.safetensors: expected demonstrations of training concepts, found 'push"):
+        PretrainingData(domain="tabletop", more=str(tmp_path / "strange.safetensors"), **SIZES).setup("fit")
+    with pytest.raises(UserError, match="recoveries: expected 0, as domain object_rearrangement has none, found 1"):
+        PretrainingData(domain="object_rearrangement", recoveries=1).setup("fit")
+
+
+def test_eyes_are_taught_places(tmp_path: Path) -> None:
+    data = PretrainingData(domain="tabletop", **SIZES)
+    losses: list[float] = []
+    module = PretrainingModule(privileged={PLACES: 1.0}, draws=2, output=str(tmp_path / "model"), learning_rate=3e-3, **SMALL)
+    module.log = lambda name, value, **_: losses.append(float(value)) if name == "train/places" else None  # type: ignore[method-assign]
+    trainer(max_steps=40).fit(module, datamodule=data)
+    assert len(losses) == 40
+    assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+    model = load_model(tmp_path / "model")
+    assert model.config.plane == (0, 1)
+    start = data.training.initial_states
+    read = model.of_images(start.observed)
+    assert read is not None
+    assert read.shape == (len(data.training), 20)
+    assert float(misplaced(read, start.observed[PLACES]).mean()) < losses[0]
+
+
+def test_an_error_is_that_of_what_is_seen() -> None:
+    places = torch.zeros(2, 5, 4)
+    places[:, 0] = torch.tensor([1.0, MIDDLE[0] + 0.1, MIDDLE[1], 0.015])
+    right = torch.zeros(2, 4, 5)
+    right[:, 0, 0], right[:, 2, 0] = 0.1 / HALF, 0.015 / HALF
+    right[:, 3] = torch.tensor([20.0, *[-20.0] * 4])
+    right[:, :3, 1:] = 7.0  # nobody knows where what is not seen is
+    assert misplaced(right.flatten(1), places).tolist() == pytest.approx([0, 0], abs=1e-6)
+    right[1, 1, 0] += 0.5
+    assert misplaced(right.flatten(1), places).tolist() == pytest.approx([0, 0.5], abs=1e-6)
+
+
+def test_places_move_with_the_picture() -> None:
+    data = PretrainingData(domain="tabletop", **SIZES)
+    data.setup("fit")
+    batch = data.batch(1)
+    perturb = VIEWS["points"].perturb
+    assert perturb is not None
+    states, seen = perturb(batch.states, batch.observed, generator("cpu", 0))
+    hand, before = seen[POSE][:, :2], batch.observed[POSE][:, :2]
+    for number in range(5):
+        there = (seen[PLACES][:, number, 0] > 0.5) & (batch.observed[PLACES][:, number, 0] > 0.5)
+        away = (seen[PLACES][there, number, 1:3] - hand[there]).norm(dim=1)
+        torch.testing.assert_close(
+            away, (batch.observed[PLACES][there, number, 1:3] - before[there]).norm(dim=1), atol=1e-5, rtol=0
+        )
+    assert seen[IMAGE].dtype == torch.uint8
+    assert states.shape == batch.states.shape
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"privileged": {"depth": 1.0}}, r"model.privileged: expected places \(domain tabletop\), found 'depth'"),
+        (
+            {"privileged": {PLACES: 1.0}, "image_encoder": {"origin": "origin"}, "denoiser_args": {}},
+            "model.privileged.places: expected image_encoder of 5 points, found one that reads 96 numbers",
+        ),
+        ({"image_encoder": {"origin": "origin"}}, "initial_encoder: expected flat, found points"),
+        ({"privileged": {PLACES: -1.0}}, r"model.privileged.places: expected a number from 0"),
+        ({"draws": 0}, "model.draws: expected a number from 1|model.draws: expected 1"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        trainer(max_steps=1).fit(PretrainingModule(**(SMALL | options)), datamodule=PretrainingData(domain="tabletop", **SIZES))
+
+
+def test_a_model_is_corrected_by_the_expert(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["fit", "--config", "conf/tabletop.yaml", "--trainer.max_steps", "1", "--model.output", str(tmp_path / "model")]
+    sizes = ["--data.samples_per_concept", "1", "--data.validation_per_concept", "1", "--data.recoveries", "0"]
+    monkeypatch.chdir(ROOT)
+    assert main([*arguments, *sizes, "--trainer.default_root_dir", str(tmp_path), "--trainer.logger", "false"]) == 0
+    out = tmp_path / "corrections.safetensors"
+    script = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_dagger.py"))
+    monkeypatch.setattr(
+        "sys.argv",
+        ["x", f"--pretrained={tmp_path / 'model'}", f"--task={PUSH}", "--count=2", f"--out={out}"],
+    )
+    script["main"]()
+    made = Demonstrations.load(out)
+    assert made.concepts == (PUSH, PUSH)
+    assert set(made.observed) == {IMAGE, POSE, PLACES}
+    longer = PretrainingData(domain="tabletop", more=str(out), **SIZES)
+    longer.setup("fit")
+    assert len(longer.training) == 9
