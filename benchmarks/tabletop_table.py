@@ -31,7 +31,7 @@ METHODS = (
     ("BC", "BC", "", 1, 10),
     ("CVAE", "CVAE", "", 1, 10),
     ("in-context", "in-context", "", 0, 10),
-    ("language", "language", "", 0, 0),
+    ("language", "language", "", 1, 0),
 )
 """What a row is called; method, form, K and demonstrations of its results."""
 REFERENCES = ("expert (oracle)", "straight push", "table-height push")
@@ -114,7 +114,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows[column] = rows[column].replace("", 0).astype(int)
     parts = [new_task(rows), training_tasks(rows)]
     for name, text in (("tabletop_failures.json", failures), ("tabletop_localisation.json", eyes)):
-        parts.append(text(json.loads((chosen.results / name).read_text(encoding="utf-8"))))
+        if (path := chosen.results / name).exists():
+            parts.append(text(json.loads(path.read_text(encoding="utf-8"))))
     write_text(chosen.out, "\n\n".join(parts) + "\n")
 
 

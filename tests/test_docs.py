@@ -138,6 +138,13 @@ def test_the_page_of_own_data_tells_what_check_finds() -> None:
     assert f"in {paths:.2f} of the sets of paths and in {relations:.2f} of those of relations" in page
 
 
+def test_the_tables_of_the_table_top_are_what_the_results_say(tmp_path: Path) -> None:
+    tables = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_table.py"))
+    tables["main"]([f"--results={ROOT / 'results'}", f"--out={tmp_path / 'found.md'}"])
+    kept = (ROOT / "results" / "tabletop.md").read_text(encoding="utf-8")
+    assert (tmp_path / "found.md").read_text(encoding="utf-8") == kept, "run benchmarks/tabletop_table.py"
+
+
 def test_the_tables_of_human_motion_are_what_the_results_say(tmp_path: Path) -> None:
     tables = runpy.run_path(str(ROOT / "benchmarks" / "mocap_table.py"))
     tables["main"]([f"--results={ROOT / 'results' / 'mocap.csv'}", f"--out={tmp_path / 'found.md'}"])

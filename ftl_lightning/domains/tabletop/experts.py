@@ -35,7 +35,7 @@ CLOSED = 0.0
 PUSH_HEIGHT = 0.014
 """Metres of the hand above what the circle stands on while it pushes."""
 GRASP_HEIGHT = 0.016
-ASIDE = 0.02
+ASIDE = 0.006
 """Metres beside the line at which a push begins at most."""
 SPEED = 0.008
 """Metres a step of a push."""
@@ -88,7 +88,7 @@ def style(rng: np.random.Generator) -> Style:
     """At random."""
     return Style(
         speed=float(rng.uniform(0.8, 1.2)),
-        behind=float(rng.uniform(0.055, 0.08)),
+        behind=float(rng.uniform(0.06, 0.07)),
         aside=float(rng.uniform(-ASIDE, ASIDE)),
         hover=float(rng.uniform(0.11, 0.16)),
         grasp=rng.uniform(-0.004, 0.004, 2),
@@ -231,6 +231,8 @@ class Episode:
 
 Begin = Callable[["TableTopEnvironment", str, np.random.Generator], dict[str, NDArray[Any]]]
 """``(environment, task, what is random) -> what is seen where a demonstration begins``."""
+PAST = 8
+"""Steps that a push goes on after it has succeeded: who sees distances a little wrong would stop before the triangle."""
 STAY = 4
 """Steps that the hand stays after a task is done, so that plans end at rest."""
 
@@ -265,6 +267,7 @@ def perform(
     how = style(rng)
     commands, images, poses = [env.command.copy()], [seen[IMAGE]], [seen[POSE]]
     actions: list[NDArray[np.float32]] = []
+    ended, success = None, False
     for command in moves(env, task, how, height, feedback):
         off = TREMBLE * rng.standard_normal(3)
         angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
@@ -275,9 +278,10 @@ def perform(
         commands.append(env.command.copy())
         images.append(seen[IMAGE])
         poses.append(seen[POSE])
-        if terminated or truncated:
+        if ended is None and (terminated or truncated):
+            ended, success = len(actions), judged(task, env.scene, told)
+        if ended is not None and len(actions) >= ended + (PAST if success and task in PUSHES else 0):
             break
-    success = judged(task, env.scene, told)
     places = None
     if scatter:
         pictures, places = scattered(env, task, told["trace"], rng)

@@ -26,8 +26,9 @@ LOW = 0.006
 """Metres above the height of pushing below which a hand counts as low."""
 CLEAR = 0.065
 """Metres above the height of pushing at which the hand travels: above everything on the table."""
-NEAR, FUNNEL = 0.006, 0.03
-"""Metres from where it comes down: nearer than the first the hand may be low, and so much farther it has to be clear."""
+NEAR, FUNNEL = 0.015, 0.03
+"""Metres from where it comes down: nearer than the first the hand may be low, and so much farther it has to be clear. The first is
+more than demonstrations differ in where they come down, or their mean is to stay in the air."""
 ACROSS, DOWN, UP = 0.016, 0.011, 0.014
 """Metres a step at most, off the line, down and up."""
 AHEAD = 0.05
