@@ -31,7 +31,7 @@ METHODS = (
     ("BC", "BC", "", 1, 10),
     ("CVAE", "CVAE", "", 1, 10),
     ("in-context", "in-context", "", 0, 10),
-    ("language", "language", "", 1, 0),
+    ("language", "language", "", 0, 10),
 )
 """What a row is called; method, form, K and demonstrations of its results."""
 REFERENCES = ("expert (oracle)", "straight push", "table-height push")
