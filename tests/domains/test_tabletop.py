@@ -13,7 +13,7 @@ from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop import DOMAIN, experts, source
+from ftl_lightning.domains.tabletop import DOMAIN, WIDE, experts, source
 from ftl_lightning.domains.tabletop.domain import act
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.interface import ACTION, IMAGE, POSE
@@ -42,6 +42,7 @@ from ftl_lightning.domains.tabletop.tasks import (
     BESIDE_BOWL,
     PUSH,
     PUSH_ON_BOOK,
+    PUSH_TO_BOWL,
     PUSHES,
     TASKS,
     TO_BOOK,
@@ -117,7 +118,7 @@ def test_bad_scenes_are_told_in_one_line(scene: np.ndarray, expected: str, env: 
 
 
 def test_unknown_tasks_are_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["generate", "tabletop", "--task", "push green circle to book"]) == 2
+    assert main(["generate", "tabletop", "--task", "push green circle to sky"]) == 2
     assert "table-top task: expected one of 'pick green circle to book'" in capsys.readouterr().err
 
 
@@ -456,5 +457,26 @@ def test_an_experts_actions_come_to_the_same_in_another_simulation(env: TableTop
 def test_every_description_has_an_embedding() -> None:
     from ftl_lightning.concepts.encoder import load_encoder
 
-    assert len(load_encoder("table", DOMAIN.concepts.table)(DOMAIN.concepts.descriptions)) == len(TASKS)
+    for domain in (DOMAIN, WIDE):
+        texts = domain.concepts.descriptions
+        assert len(load_encoder("table", domain.concepts.table)(texts)) == len(texts)
+    assert set(DOMAIN.concepts.descriptions) | set(WIDE.concepts.descriptions) == set(TASKS)
+
+
+def test_the_wide_domain_draws_its_own_and_ends_at_any_touch() -> None:
+    assert WIDE.closed_loop is not None
+    source_ = WIDE.source(None)
+    made = source_.draw(PUSH_TO_BOWL, 1, 0)
+    assert made.domain == WIDE.name
+    assert made.scenes is not None
+    env = WIDE.closed_loop.environment()
+    try:
+        env.reset(options={"scene": made.scenes[0].numpy()})
+        ended = [env.step(action.numpy())[2:] for action in made.states[0, 1:]]
+    finally:
+        env.close()
+    assert any(terminated for terminated, *_ in ended)
+    assert ended[-1][-1]["touches"] == {BOWL}
+    assert judged(PUSH_TO_BOWL, made.scenes[0].numpy(), ended[-1][-1])
+    assert not judged(PUSH, made.scenes[0].numpy(), ended[-1][-1])
     assert [int(columns.start) for columns in COLUMNS.values()] == [0, 4, 8, 12, 16]

@@ -145,7 +145,7 @@ def test_demonstrations_of_states_alone_on_the_command_line(shipped: Path, capsy
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--task", "push green circle to book"], f"table-top task: expected one of {', '.join(map(repr, TASKS))}, found 'push"),
+        (["--task", "push green circle to sky"], f"table-top task: expected one of {', '.join(map(repr, TASKS))}, found 'push"),
         (["--task", PUSH, "--count=0"], "count: expected 1 or more, found 0"),
         (["--task", PUSH, "--seed=-1"], "seed: expected 0 or more, found -1"),
         (["--task", PUSH, "--workers=0"], "workers: expected 1 or more, found 0"),

@@ -1,5 +1,5 @@
 """Table-top manipulation: a Panda picks, places and pushes a green circle, seen by a camera (paper, section 'Table-Top')."""
 
-from ftl_lightning.domains.tabletop.domain import DOMAIN
+from ftl_lightning.domains.tabletop.domain import DOMAIN, WIDE
 
-__all__ = ["DOMAIN"]
+__all__ = ["DOMAIN", "WIDE"]

@@ -1,5 +1,6 @@
 """The domain object: what the rest of the package knows of the table-top."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,11 +19,13 @@ from ftl_lightning.domains.tabletop.interface import (
     SEEN,
     STATE_NAMES,
     STATE_UNITS,
+    WIDE_NAME,
     expect_simulator,
 )
 from ftl_lightning.domains.tabletop.policies import POLICIES
+from ftl_lightning.domains.tabletop.scenes import OBJECTS
 from ftl_lightning.domains.tabletop.success import judge
-from ftl_lightning.domains.tabletop.tasks import PUSH, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.tabletop.tasks import PUSH, SUITES, TRAINING_CONCEPTS, WIDE_CONCEPTS, WIDE_SUITES
 from ftl_lightning.domains.tabletop.views import VIEWS, misplaced
 
 if TYPE_CHECKING:
@@ -46,6 +49,18 @@ def source(root: Path | None) -> "Expert":
     return Expert()
 
 
+def wide_source(root: Path | None) -> "Expert":
+    """The scripted experts of the wide domain's concepts.
+
+    Raises:
+        UserError: without the simulator.
+    """
+    expect_simulator()
+    from ftl_lightning.domains.tabletop.source import Expert
+
+    return Expert(WIDE_CONCEPTS, WIDE_NAME)
+
+
 def environment() -> "TableTopEnvironment":
     """The domain's environment.
 
@@ -56,6 +71,18 @@ def environment() -> "TableTopEnvironment":
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
     return TableTopEnvironment()
+
+
+def wide_environment() -> "TableTopEnvironment":
+    """The same, in which an episode ends where the circle touches anything.
+
+    Raises:
+        UserError: as :func:`environment`.
+    """
+    expect_simulator()
+    from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
+
+    return TableTopEnvironment(ends_at=OBJECTS)
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
@@ -73,6 +100,17 @@ _ON_ROBOT = ("new concept", 0.55, ""), ("training representation", 0.15, ""), ("
 PUBLISHED = tuple(Published(setting, value, task=task, metric=EXECUTED) for setting, value, task in _ON_ROBOT)
 """The paper's numbers, on a real robot, 20 episodes each (section 4.5)."""
 
+_LOOP = ClosedLoop(
+    environment=environment,
+    act=act,
+    steps=MAX_STEPS,
+    judge=judge,
+    film=deferred(f"{RENDERING}:film"),
+    keeps=(POSE,),
+    less_is_better=("book moved",),
+    policies=POLICIES,
+    expect=expect_simulator,
+)
 DOMAIN = Domain(
     name=NAME,
     plans=Plans(HORIZON, STATE_NAMES, STATE_UNITS, resolution=1e-4),
@@ -87,17 +125,16 @@ DOMAIN = Domain(
     views=VIEWS,
     headline=EXECUTED,
     show=Show(deferred(f"{RENDERING}:render")),
-    closed_loop=ClosedLoop(
-        environment=environment,
-        act=act,
-        steps=MAX_STEPS,
-        judge=judge,
-        film=deferred(f"{RENDERING}:film"),
-        keeps=(POSE,),
-        less_is_better=("book moved",),
-        policies=POLICIES,
-        expect=expect_simulator,
-    ),
+    closed_loop=_LOOP,
     paper=Paper(PUBLISHED, omega="learned", ours="1.2"),
     fresh=False,  # an expert takes about half a second for an episode
 )
+WIDE = replace(
+    DOMAIN,
+    name=WIDE_NAME,
+    concepts=Concepts(training=WIDE_CONCEPTS, suites=WIDE_SUITES, table=Path(__file__).parent / "wide_embeddings.safetensors"),
+    source=wide_source,
+    closed_loop=replace(_LOOP, environment=wide_environment),
+    paper=None,
+)
+"""The same table with more things to push and pick to, which the paper does not have."""

@@ -1,5 +1,6 @@
 """A Panda at a table, in pybullet, as a gymnasium environment."""
 
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium
@@ -8,7 +9,19 @@ from numpy.typing import NDArray
 
 from ftl_lightning.domains.physics import Simulator, pybullet
 from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
-from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, HAND, OBJECTS, SCENE, TRIANGLE, check, draw_scene, gap, outline
+from ftl_lightning.domains.tabletop.scenes import (
+    BOOK,
+    CIRCLE,
+    HAND,
+    HEIGHT,
+    OBJECTS,
+    SCENE,
+    TRIANGLE,
+    check,
+    draw_scene,
+    gap,
+    outline,
+)
 from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
 from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.errors import UserError
@@ -44,11 +57,13 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
     simulator of its own, without a display.
 
     What ``step`` tells: places of ``circle``, ``triangle`` and book (``book place``), or ``None`` of what is not there; metres by
-    which the ``book`` has moved; whether the circle ``touched`` the triangle, was ``lifted`` and is ``released``; the ``trace``,
-    joint angles and poses of all objects at each step, for films.
+    which the ``book`` has moved; whether the circle ``touched`` the triangle, and the names of all that it has touched
+    (``touches``); whether it was ``lifted`` and is ``released``; the ``trace``, joint angles and poses of all objects at each step,
+    for films.
 
     Args:
         arm_drawn: whether pictures show the arm, which hides much of the table from above.
+        ends_at: what ends an episode when the circle touches it.
 
     Raises:
         UserError: if the simulator does not start.
@@ -67,8 +82,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         np.array([*(high for _, high in REACH), OPEN], dtype=np.float32),
     )
 
-    def __init__(self, arm_drawn: bool = False) -> None:
-        self.arm_drawn = arm_drawn
+    def __init__(self, arm_drawn: bool = False, ends_at: Collection[str] = (TRIANGLE,)) -> None:
+        self.arm_drawn, self.ends_at = arm_drawn, frozenset(ends_at)
         self.client = self._connected()
         self.scene = np.zeros(SCENE, dtype=np.float32)
         self.bodies = Bodies(-1, {})
@@ -157,13 +172,18 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
                 self.client.stepSimulation()
         self._steps += 1
         places = self.places()
-        if TRIANGLE in places and abs(places[CIRCLE][2] - places[TRIANGLE][2]) < LIFTED:
-            self._touched |= touching(self.outline(TRIANGLE), places[CIRCLE])
+        self._touched |= {name for name in places if name != CIRCLE and self._touches(name, places)}
         self._lifted |= bool(places[CIRCLE][2] > self._first[CIRCLE][2] + LIFTED)
         self._trace.append(self._now())
         seen, found = self._observation(), self._told()
         self._before = places[CIRCLE]
-        return seen, 0.0, self._touched or (self._lifted and found["released"]), self._steps >= MAX_STEPS, found
+        return (
+            seen,
+            0.0,
+            bool(self.ends_at & self._touched) or (self._lifted and found["released"]),
+            self._steps >= MAX_STEPS,
+            found,
+        )
 
     def places(self) -> dict[str, NDArray[np.float64]]:
         """Centres ``(3,)`` of the objects, by name."""
@@ -188,11 +208,18 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     def begun(self) -> Seen:
         """What is seen if an episode begins as things are now."""
-        self._steps, self._lifted, self._touched = 0, False, False
+        self._steps, self._lifted = 0, False
+        self._touched: set[str] = set()
         self._first = self.places()
         self._before = self._first[CIRCLE]
         self._trace = [self._now()]
         return self._observation()
+
+    def _touches(self, name: str, places: dict[str, NDArray[np.float64]]) -> bool:
+        """Whether the circle is beside an object, at its height, and touches it as seen from above."""
+        circle, place = places[CIRCLE], places[name]
+        level = abs(circle[2] - place[2]) < LIFTED if name == TRIANGLE else circle[2] < place[2] + HEIGHT[name] / 2
+        return level and touching(self.outline(name), circle)
 
     def outline(self, name: str) -> NDArray[np.float64]:
         """An object from above, as it lies, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""
@@ -222,7 +249,8 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             "triangle": triangle,
             "book": moved,
             "book place": places.get(BOOK),
-            "touched": self._touched,
+            "touched": TRIANGLE in self._touched,
+            "touches": frozenset(self._touched),
             "lifted": self._lifted,
             "released": released,
             "trace": self._trace,
@@ -251,6 +279,6 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self.client.disconnect()
 
 
-def touching(triangle: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
-    """Whether a circle with this centre touches the outline of a triangle, seen from above."""
-    return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), triangle) <= TOUCH
+def touching(shape: NDArray[np.float64], circle: NDArray[np.float64]) -> bool:
+    """Whether a circle with this centre touches an outline, seen from above."""
+    return gap(outline(CIRCLE, float(circle[0]), float(circle[1]), 0.0), shape) <= TOUCH

@@ -18,7 +18,7 @@ from ftl_lightning.domains.tabletop.scenes import (
     CIRCLE,
     COLUMNS,
     HEIGHT,
-    TRIANGLE,
+    TARGET,
     WHITE,
     gap,
     outline,
@@ -26,7 +26,7 @@ from ftl_lightning.domains.tabletop.scenes import (
     within,
 )
 from ftl_lightning.domains.tabletop.success import judged
-from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, BESIDE_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
+from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, TO_WHITE
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
@@ -58,8 +58,8 @@ ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
 """x and y of circle and hand there."""
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
 """Metres from circle to hand, from the circle to other things at least, and to the triangle at most, there."""
-BESIDE = 0.12
-"""Metres between bowl and circle that is put down beside it, centre to centre: the fingers, which open to the sides, need room."""
+APART_FROM = 0.12
+"""Metres between a thing and the circle that is put down beside it, centre to centre: the fingers, which open, need room."""
 
 Moves = Generator[Place, None, None]
 """Places ``(4,)`` to go to, one a step: x, y, z and opening."""
@@ -164,12 +164,11 @@ def _target(expert: _Expert) -> tuple[Place, float]:
     if expert.task in (TO_BOOK, TO_WHITE):
         name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
         return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.place, HEIGHT[name]
-    assert expert.task == BESIDE_BOWL
-    # On the side of the bowl where it lay: which one that is does not change when the scene is turned.
-    bowl = scene[COLUMNS[BOWL]][1:3].astype(np.float64)
-    along = expert.circle()[:2] - bowl
+    # On the side of the thing where it lay: which one that is does not change when the scene is turned.
+    thing = scene[COLUMNS[TARGET[expert.task]]][1:3].astype(np.float64)
+    along = expert.circle()[:2] - thing
     along /= np.linalg.norm(along)
-    return bowl + (BESIDE + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
+    return thing + (APART_FROM + 0.005 * how.place[0]) * along + 0.01 * how.place[1] * np.array([-along[1], along[0]]), 0.0
 
 
 def _behind(expert: _Expert, goal: Place) -> Place:
@@ -178,18 +177,18 @@ def _behind(expert: _Expert, goal: Place) -> Place:
     return circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
 
 
-def _triangle(expert: _Expert) -> Place:
-    return expert.env.places()[TRIANGLE][:2]
+def _goal(expert: _Expert) -> Place:
+    return expert.env.places()[TARGET[expert.task]][:2]
 
 
 def _push(expert: _Expert, height: float) -> Moves:
-    """Bring the circle to the triangle, looking where it goes."""
+    """Bring the circle to what the task names, looking where it goes."""
     how = expert.how
     speed = SPEED * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
     manner = Manner(height, speed, how.speed, how.behind, how.aside)
     bowl = expert.env.scene[COLUMNS[BOWL]][1:3].astype(np.float64)
     while True:
-        circle, goal = expert.circle()[:2], _triangle(expert)
+        circle, goal = expert.circle()[:2], _goal(expert)
         if expert.task == AROUND_BOWL:
             goal = around(circle, goal, bowl)
         expert.at = np.array([*pushed(expert.env.command[:3], circle, goal, manner), CLOSED])
@@ -197,8 +196,8 @@ def _push(expert: _Expert, height: float) -> Moves:
 
 
 def _straight(expert: _Expert, height: float) -> Moves:
-    """Push on the line from circle to triangle as they lie in the beginning."""
-    goal = _triangle(expert).copy()
+    """Push on the line from the circle to what the task names as they lie in the beginning."""
+    goal = _goal(expert).copy()
     begin = _behind(expert, goal)
     yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
     yield from expert.go(np.array([*begin, height]), 0.011, CLOSED)
@@ -278,8 +277,9 @@ def perform(
         commands.append(env.command.copy())
         images.append(seen[IMAGE])
         poses.append(seen[POSE])
-        if ended is None and (terminated or truncated):
-            ended, success = len(actions), judged(task, env.scene, told)
+        done = judged(task, env.scene, told)
+        if ended is None and (terminated or truncated or (done and task in PUSHES)):
+            ended, success = len(actions), done
         if ended is not None and len(actions) >= ended + (PAST if success and task in PUSHES else 0):
             break
     places = None
@@ -326,6 +326,6 @@ def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) 
         height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, CLEAR))
         finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
         free = all(gap(shape, other) >= ROOM and gap(finger, other) >= APART for other in others.values())
-        far = np.linalg.norm(place - env.places()[TRIANGLE][:2]) > FARTHEST_PUSH
+        far = np.linalg.norm(place - env.places()[TARGET[task]][:2]) > FARTHEST_PUSH
         if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
             return env.put(np.array([*hand, height]), place)

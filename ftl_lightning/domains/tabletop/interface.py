@@ -4,7 +4,7 @@ from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.domains.tabletop.world import OVERHEAD
 from ftl_lightning.extras import expect_extra
 
-NAME = "tabletop"
+NAME, WIDE_NAME = "tabletop", "tabletop_wide"
 STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
 STATE_UNITS = ("m",) * 4
 IMAGE, POSE, PLACES = "image", "pose", "places"

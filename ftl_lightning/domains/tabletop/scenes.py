@@ -14,9 +14,15 @@ from torch import Tensor
 
 from ftl_lightning.domains.tabletop.tasks import (
     AROUND_BOWL,
+    BESIDE,
     BESIDE_BOWL,
+    BESIDE_TRIANGLE,
     PUSH,
     PUSH_ON_BOOK,
+    PUSH_TO_BOOK,
+    PUSH_TO_BOWL,
+    PUSH_TO_WHITE,
+    PUSHES,
     TO_BOOK,
     TO_WHITE,
     expect_task,
@@ -30,6 +36,20 @@ COLUMNS = {name: slice(4 * number, 4 * number + 4) for number, name in enumerate
 HAND = slice(4 * len(OBJECTS), 4 * len(OBJECTS) + 4)
 """Columns (x, y, z, yaw) of the hand."""
 SCENE = HAND.stop
+
+TARGET = {
+    TO_BOOK: BOOK,
+    TO_WHITE: WHITE,
+    BESIDE_BOWL: BOWL,
+    BESIDE_TRIANGLE: TRIANGLE,
+    PUSH: TRIANGLE,
+    AROUND_BOWL: TRIANGLE,
+    PUSH_ON_BOOK: TRIANGLE,
+    PUSH_TO_BOWL: BOWL,
+    PUSH_TO_WHITE: WHITE,
+    PUSH_TO_BOOK: BOOK,
+}
+"""What the circle is brought to."""
 
 RADIUS = {CIRCLE: 0.025, BOWL: 0.05, TRIANGLE: 0.07 / math.sqrt(3)}
 """Of the circle and the bowl, and of the corners of the triangle, whose side is 7 cm."""
@@ -175,6 +195,17 @@ def _push(rng: Rng) -> _Placed:
     return _pair(rng, 0.12, 0.24)
 
 
+def _push_to(target: str, near: float, far: float) -> Callable[[Rng], _Placed]:
+    """Circle and another thing so far apart, centre to centre."""
+
+    def draw(rng: Rng) -> _Placed:
+        placed = _pair(rng, near, far)
+        x, y, _ = placed.pop(TRIANGLE)
+        return {**placed, target: (x, y, random_yaw(rng, target))}
+
+    return draw
+
+
 def _around(rng: Rng) -> _Placed:
     """The bowl between circle and triangle, with room for the circle's way on the side where it is shorter."""
     while True:
@@ -199,16 +230,20 @@ NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
     TO_BOOK: _pick(BOOK),
     TO_WHITE: _pick(WHITE),
     BESIDE_BOWL: _pick(BOWL),
+    BESIDE_TRIANGLE: _pick(TRIANGLE),
     PUSH: _push,
+    PUSH_TO_BOWL: _push_to(BOWL, 0.14, 0.26),
+    PUSH_TO_WHITE: _push_to(WHITE, 0.17, 0.28),
+    PUSH_TO_BOOK: _push_to(BOOK, 0.19, 0.30),
     AROUND_BOWL: _around,
     PUSH_ON_BOOK: _on_book,
 }
 """What a task needs, at random, whether it fits or not."""
 
 
-def _way(placed: _Placed, half_width: float) -> Points:
-    """The stretch that the hand sweeps when it pushes the circle straight to the triangle."""
-    start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
+def _way(placed: _Placed, target: str, half_width: float) -> Points:
+    """The stretch that the hand sweeps when it pushes the circle straight to a thing."""
+    start, end = (np.array(placed[name][:2]) for name in (CIRCLE, target))
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
     across = np.array([-along[1], along[0]]) * half_width
     behind = start - 0.09 * along
@@ -228,17 +263,17 @@ def _clear(task: str, placed: _Placed) -> bool:
             if name == other or (on_book and BOOK in (name, other) and {name, other} & {CIRCLE, TRIANGLE}):
                 continue
             near = room if CIRCLE in (name, other) or {BOOK, WHITE, BOWL} >= {name, other} else 0.03
-            if {CIRCLE, TRIANGLE} == {name, other} and TRIANGLE in needed:
-                near = 0.02  # as the task says
+            if task in PUSHES and {CIRCLE, TARGET[task]} == {name, other}:
+                near = 0.02 if TARGET[task] == TRIANGLE else 0.04  # as the task says
             if {CIRCLE, BOWL} == {name, other} and task == AROUND_BOWL:
                 near = 0.03
-            if other == BOWL and task == BESIDE_BOWL:
+            if task in BESIDE and other == TARGET[task]:
                 near = 0.10  # the circle is put down there
             if gap(shape, points) < near:
                 return False
-        if task in (PUSH, PUSH_ON_BOOK, AROUND_BOWL) and name not in needed:
+        if task in PUSHES and name not in needed:
             half = 0.17 if task == AROUND_BOWL else 0.10 if name == WHITE else 0.06
-            if gap(shape, _way(placed, half)) < 0:
+            if gap(shape, _way(placed, TARGET[task], half)) < 0:
                 return False
     return True
 

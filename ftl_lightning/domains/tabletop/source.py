@@ -2,7 +2,8 @@
 
 import logging
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -137,17 +138,25 @@ def demonstrations(
 
 
 class Expert:
-    """Episodes of the scripted experts that succeeded, from the cache if they are there."""
+    """Episodes of the scripted experts that succeeded, from the cache if they are there.
+
+    Args:
+        concepts: the training concepts.
+        domain: whose demonstrations they are.
+    """
+
+    def __init__(self, concepts: Sequence[str] = TRAINING_CONCEPTS, domain: str = NAME) -> None:
+        self.concepts, self.domain = tuple(concepts), domain
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """``count`` demonstrations of every training concept, and more of those in :data:`TIMES`; distractors are scattered."""
         own = seed if name == "train" else VALIDATION_SEED + seed
-        return concatenate([self.draw(task, TIMES.get(task, 1) * count, own, scatter=True) for task in TRAINING_CONCEPTS])
+        return concatenate([self.draw(task, TIMES.get(task, 1) * count, own, scatter=True) for task in self.concepts])
 
     def recoveries(self, name: Split, count: int, seed: int) -> Demonstrations:
         """``count`` more of every push, which begin where one went wrong, see :func:`.experts.led_astray`."""
         own = RECOVERY_SEED + seed + (0 if name == "train" else VALIDATION_SEED)
-        pushes = [task for task in TRAINING_CONCEPTS if task in PUSHES]
+        pushes = [task for task in self.concepts if task in PUSHES]
         return concatenate([self.draw(task, count, own, scatter=True, elsewhere=True) for task in pushes])
 
     def draw(
@@ -156,7 +165,8 @@ class Expert:
         """``count`` demonstrations of a task, see :func:`demonstrations`."""
         settings = {"domain": NAME, "task": expect_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
         settings |= {"scatter": scatter, "elsewhere": elsewhere}
-        return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
+        made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
+        return made if made.domain == self.domain else replace(made, domain=self.domain)
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """New scenes ``(count, 24)``, and what is seen there."""

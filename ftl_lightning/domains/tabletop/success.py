@@ -9,23 +9,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, HEIGHT, WHITE, outline, support, within
-from ftl_lightning.domains.tabletop.tasks import BESIDE_BOWL, PUSH_ON_BOOK, PUSHES, TO_BOOK, expect_task
+from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, TARGET, TRIANGLE, WHITE, outline, support, within
+from ftl_lightning.domains.tabletop.tasks import BESIDE, PUSH_ON_BOOK, PUSHES, TO_BOOK, expect_task
 
 BOOK_MOVED = 0.02
 """Metres beyond which the book counts as moved."""
 LEVEL = 0.008
 """Metres by which the height of the circle's centre may be off, where it has to lie on something."""
-NEAR_BOWL = 0.15
-"""Metres between the centres of the circle and the bowl that it was put beside."""
+NEAR = 0.15
+"""Metres between the centres of the circle and of what it was put beside."""
 
 
 def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bool:
     """Whether a task is done.
 
-    - Pushes: circle and triangle touch (see the environment's ``TOUCH``); neither has left the surface on which it stood.
+    - Pushes to the triangle: circle and triangle touch (see the environment's ``TOUCH``); neither has left the surface on which it
+      stood.
+    - Pushes to something else: the circle has touched that and nothing else, and lies on the table.
     - To the book and to the white surface: the circle was lifted and let go; it lies on the surface, its centre over it.
-    - Beside the bowl: the circle was lifted and let go; it lies on the table, its centre within :data:`NEAR_BOWL` of the bowl's.
+    - Beside something: the circle was lifted and let go; it lies on the table, its centre within :data:`NEAR` of that.
 
     Args:
         task: known.
@@ -36,15 +38,17 @@ def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bo
     if not told:
         return False
     circle = told["circle"]
+    if task in PUSHES and TARGET[task] != TRIANGLE:
+        return set(told["touches"]) == {TARGET[task]} and _lies(circle, 0.0)
     if task in PUSHES:
         surface = HEIGHT[BOOK] if task == PUSH_ON_BOOK else support(scene, CIRCLE)
         both = (circle, told["triangle"])
         return bool(told["touched"]) and all(one is not None and _lies(one, surface) for one in both)
     if not (told["lifted"] and told["released"]):
         return False
-    if task == BESIDE_BOWL:
-        away = float(np.linalg.norm(circle[:2] - scene[COLUMNS[BOWL]][1:3]))
-        return _lies(circle, 0.0) and away <= NEAR_BOWL
+    if task in BESIDE:
+        thing = told["triangle"] if TARGET[task] == TRIANGLE else scene[COLUMNS[TARGET[task]]][1:4]
+        return _lies(circle, 0.0) and float(np.linalg.norm(circle[:2] - thing[:2])) <= NEAR
     name = BOOK if task == TO_BOOK else WHITE
     x, y, yaw = map(float, scene[COLUMNS[name]][1:])
     moved = told["book place"] if task == TO_BOOK else None

@@ -9,11 +9,19 @@ PUSH = "push green circle to orange triangle"
 AROUND_BOWL = "push green circle to orange triangle around purple bowl"
 PUSH_ON_BOOK = "push green circle to orange triangle on book"
 BESIDE_BOWL = "pick green circle to beside purple bowl"
+PUSH_TO_BOWL = "push green circle to purple bowl"
+PUSH_TO_WHITE = "push green circle to elevated white surface"
+PUSH_TO_BOOK = "push green circle to book"
+BESIDE_TRIANGLE = "pick green circle to beside orange triangle"
 
 TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)
 """Of the paper."""
-TASKS = (*TRAINING_CONCEPTS, PUSH_ON_BOOK, BESIDE_BOWL)
-PUSHES = (PUSH, AROUND_BOWL, PUSH_ON_BOOK)
+WIDE_CONCEPTS = (*TRAINING_CONCEPTS, PUSH_TO_BOWL, PUSH_TO_WHITE, BESIDE_TRIANGLE)
+"""Of the wide model: pushes and picks to several things, of which no pair of verb and thing is asked for in the end."""
+TASKS = (*TRAINING_CONCEPTS, PUSH_ON_BOOK, BESIDE_BOWL, PUSH_TO_BOWL, PUSH_TO_WHITE, PUSH_TO_BOOK, BESIDE_TRIANGLE)
+PUSHES = tuple(task for task in TASKS if task.startswith("push"))
+BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)
+"""Picks that end on the table."""
 
 SUITES = {
     "training": training_suite(TRAINING_CONCEPTS),
@@ -25,6 +33,13 @@ SUITES = {
 
 ``representation`` is the paper's baseline: the scenes of the new task, told to push as on the table.
 """
+WIDE_SUITES = {
+    "training": training_suite(WIDE_CONCEPTS),
+    "paper": SUITES["paper"],
+    "pairs": Suite((EvaluationTask("new concept", PUSH_TO_BOOK, (PUSH_TO_BOOK,)),)),
+    "validation": SUITES["validation"],
+}
+"""``pairs``: a verb and a thing that pretraining shows apart from each other."""
 
 
 def expect_task(task: str) -> str:
