@@ -110,7 +110,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             expect_range(f"model.feature_dropout.{name}", share, 0, 1)
         self.privileged = dict(privileged or {})
         for name, weight in self.privileged.items():
-            expect_factor(f"model.privileged.{name}", weight)
+            expect_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
         self.seed = seed
         self.guidance = guidance
         self.register_parameter("unused", None)

@@ -59,6 +59,9 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     kind: type[nn.Module] = getattr(diffusion, config.denoiser)
     if config.prediction == "cosines" and getattr(kind, "over_time", False):
         raise UserError(f"prediction: expected clean for {config.denoiser}, whose output is smooth by itself, found cosines")
+    points = config.denoiser_args.get("initial_encoder") == "points"
+    if points and config.image_dim and config.image_encoder.get("head") != "points":
+        raise UserError("denoiser_args.initial_encoder: expected flat, found points: image_encoder.head reads no points")
     denoiser = built(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
         return denoiser
