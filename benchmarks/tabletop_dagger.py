@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate, padded
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, perform
-from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import draw_scene
+from ftl_lightning.domains.tabletop.source import joined_episodes
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSHES
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.pretrained import load_model
@@ -67,24 +67,7 @@ def corrected(model: ConceptModel, task: str, count: int, seed: int, omega: floa
                 kept.append(episode)
                 advance()
     env.close()
-    states, lengths = padded([torch.from_numpy(episode.commands) for episode in kept])
-    places = [torch.from_numpy(episode.places) for episode in kept if episode.places is not None]
-    observed = {
-        IMAGE: padded([torch.from_numpy(episode.images) for episode in kept])[0],
-        POSE: padded([torch.from_numpy(episode.poses) for episode in kept])[0],
-        PLACES: padded(places)[0],
-    }
-    return Demonstrations(
-        states=states,
-        lengths=lengths,
-        domain=NAME,
-        state_names=STATE_NAMES,
-        state_units=STATE_UNITS,
-        concepts=(task,) * count,
-        observed=observed,
-        per_step=tuple(observed),
-        provenance={"corrections of": model.hash, "seed": seed, "tried": number},
-    )
+    return joined_episodes(task, kept, None, {"corrections of": model.hash, "seed": seed, "tried": number})
 
 
 def main() -> None:

@@ -2,8 +2,9 @@
 
 import logging
 import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -116,24 +117,40 @@ def demonstrations(
             break
     else:
         raise UserError(f"table-top {task!r}: expected {count} successful episodes of {tried}, found {len(kept)}")
+    drawn = torch.from_numpy(np.stack([_scene(job) for job, _ in kept]))
+    provenance = {"generator": NAME, "seed": seed, "count": count, "tried": tried, "rejected": tried - count}
+    return joined_episodes(task, [episode for _, episode in kept], drawn, provenance)
+
+
+def joined_episodes(
+    task: str, episodes: Sequence[Episode], drawn: torch.Tensor | None, provenance: Mapping[str, Any]
+) -> Demonstrations:
+    """Episodes of a task as demonstrations.
+
+    Args:
+        task: known.
+        episodes: all with places, or none.
+        drawn: their scenes ``(episode, 24)``; ``None`` where they did not begin as one.
+        provenance: for the record.
+    """
     observed = {
-        IMAGE: padded([torch.from_numpy(episode.images) for _, episode in kept])[0],
-        POSE: padded([torch.from_numpy(episode.poses) for _, episode in kept])[0],
+        IMAGE: padded([torch.from_numpy(episode.images) for episode in episodes])[0],
+        POSE: padded([torch.from_numpy(episode.poses) for episode in episodes])[0],
     }
-    if scatter:
-        observed[PLACES] = padded([torch.from_numpy(episode.places) for _, episode in kept if episode.places is not None])[0]
-    states, lengths = padded([torch.from_numpy(episode.commands) for _, episode in kept])
+    if places := [torch.from_numpy(episode.places) for episode in episodes if episode.places is not None]:
+        observed[PLACES] = padded(places)[0]
+    states, lengths = padded([torch.from_numpy(episode.commands) for episode in episodes])
     return Demonstrations(
         states=states,
         lengths=lengths,
         domain=NAME,
         state_names=STATE_NAMES,
         state_units=STATE_UNITS,
-        concepts=(task,) * count,
+        concepts=(task,) * len(episodes),
         observed=observed,
         per_step=tuple(observed),
-        scenes=torch.from_numpy(np.stack([_scene(job) for job, _ in kept])),
-        provenance={"generator": NAME, "seed": seed, "count": count, "tried": tried, "rejected": tried - count},
+        scenes=drawn,
+        provenance=dict(provenance),
     )
 
 
