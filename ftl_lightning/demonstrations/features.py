@@ -14,6 +14,9 @@ from ftl_lightning.representation import Shown
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
 
+READ = "read"
+"""Observed in place of images where they have been read already: what an encoder read of them ``(sample, n)``."""
+
 
 @dataclass(frozen=True)
 class Feature:

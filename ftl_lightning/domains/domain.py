@@ -276,10 +276,13 @@ class Privileged:
     Attributes:
         feature: a vector.
         error: ``(read (sample, n), feature (sample, *shape)) -> (sample,)``, how wrong what was read of an image is.
+        told: ``(feature (sample, *shape), draw) -> (sample, n)``, what an encoder of images might read of one that shows this,
+            with errors as it makes them; ``None`` where nobody can say.
     """
 
     feature: Feature
     error: Callable[[Tensor, Tensor], Tensor]
+    told: Callable[[Tensor, torch.Generator], Tensor] | None = None
 
 
 def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:

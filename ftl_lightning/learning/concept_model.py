@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Feature, Observed, expect_features
+from ftl_lightning.demonstrations.features import READ, Feature, Observed, expect_features
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError, short, shown
@@ -198,12 +198,12 @@ class ConceptModel(Shown, nn.Module, ABC):
         states = self.normalization.decode(normalised)
         return states if self.view is None else self.view.decode(states, observed)
 
-    def vector(self, observed: Observed, of_images: Tensor | None = None) -> Tensor | None:
+    def vector(self, observed: Observed) -> Tensor | None:
         """What is observed as the network sees it: vectors one after another, then what is read of images ``(batch, m)``.
 
         Args:
-            observed: features by name, in the domain's units.
-            of_images: what :meth:`of_images` read, where it has been read before.
+            observed: features by name, in the domain's units; :data:`~ftl_lightning.demonstrations.features.READ`, what
+                :meth:`of_images` read, may stand for the images.
 
         Returns:
             ``None`` where nothing is observed.
@@ -219,7 +219,7 @@ class ConceptModel(Shown, nn.Module, ABC):
             vectors = self.initial_normalization.encode(joined_vectors(seen, self.config.observed))
             parts.append(self._dropped(vectors) if self.training else vectors)
         if self.images is not None:
-            parts.append(self.images.from_origins(self.images(seen) if of_images is None else of_images, seen))
+            parts.append(self.images.from_origins(observed[READ] if READ in observed else self.images(seen), seen))
         return torch.cat(parts, dim=-1)
 
     def of_images(self, observed: Observed) -> Tensor | None:
@@ -230,10 +230,11 @@ class ConceptModel(Shown, nn.Module, ABC):
         return found
 
     def _seen(self, observed: Observed) -> Observed:
+        read = READ in observed
         if self.view is not None:
-            expect_features(observed, self.domain.observed)
+            expect_features(observed, _unread(self.domain.observed, read))
             observed = self.view.observe(observed)
-        expect_features(observed, self.config.observed)
+        expect_features(observed, _unread(self.config.observed, read))
         return observed
 
     def _dropped(self, vectors: Tensor) -> Tensor:
@@ -253,6 +254,11 @@ class ConceptModel(Shown, nn.Module, ABC):
         """What a file of it holds: weights in half precision, everything else as it is."""
         weights = dict(self.named_parameters())
         return {name: value.half() if name in weights else value for name, value in self.state_dict().items()}
+
+
+def _unread(features: Mapping[str, Feature], read: bool) -> Mapping[str, Feature]:
+    """The features that have to be observed, where images may have been read before."""
+    return {name: feature for name, feature in features.items() if not (read and feature.kind == "image")}
 
 
 def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:

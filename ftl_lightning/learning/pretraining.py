@@ -15,7 +15,7 @@ from torch import Tensor
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Feature, Observed
+from ftl_lightning.demonstrations.features import READ, Feature, Observed, take
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import Batch, PretrainingData
@@ -58,6 +58,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             The published code hides the pose of a robot's hand with 0.4.
         privileged: weights by name: what is read of images has to tell what training demonstrations show beside what is observed,
             see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
+        told: share of each step's windows whose images are not looked at: what an encoder might read of them is told by what is
+            privileged. Such a window costs a fraction of one with an image.
 
     Raises:
         UserError: at construction, for a value out of its range.
@@ -92,10 +94,13 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         image_encoder: Mapping[str, Any] | None = None,
         feature_dropout: Mapping[str, float] | None = None,
         privileged: Mapping[str, float] | None = None,
+        told: float = 0.0,
     ) -> None:
         super().__init__()
         # Configurations from before there was anything privileged keep their hash.
-        self.save_hyperparameters(ignore=[*groups_of(self.flat), *([] if privileged else ["privileged"])])
+        self.save_hyperparameters(
+            ignore=[*groups_of(self.flat), *([] if privileged else ["privileged"]), *([] if told else ["told"])]
+        )
         for name, value, most in (
             ("learning_rate", learning_rate, LARGEST_RATE),
             ("warmup_steps", warmup_steps, math.inf),
@@ -111,6 +116,10 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         self.privileged = dict(privileged or {})
         for name, weight in self.privileged.items():
             expect_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
+        expect_range("model.told", told, 0, 1)
+        if told == 1 or (told and len(self.privileged) != 1):
+            raise UserError(f"model.told: expected less than 1, and one name in model.privileged, found {told}")
+        self.told = told
         self.seed = seed
         self.guidance = guidance
         self.register_parameter("unused", None)
@@ -215,6 +224,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                     f"model.privileged.{name}: expected image_encoder of {known.feature.shape[0]} points, "
                     f"found one that reads {images.size} numbers"
                 )
+            if self.told and known.told is None:
+                raise UserError(f"model.told: expected 0, as nothing tells what is read of {name!r}, found {self.told}")
 
     def _keep(self, module: torch.nn.Module, inputs: Any, read: Tensor) -> None:
         self._read = read
@@ -242,7 +253,10 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
-        losses, seen = self._perturbed_losses(self.raw, batch, draw)
+        looked_at, told = self._apart(batch)
+        losses, seen = self._perturbed_losses(self.raw, looked_at, draw)
+        if told is not None:
+            losses = torch.cat((losses, self._told_losses(told, draw)))
         loss = losses.mean()
         if not loss.isfinite():
             raise UserError(
@@ -253,6 +267,25 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         if self.privileged:
             loss = loss + self._privileged_loss(seen.observed)
         return loss if self.unused is None else loss + 0 * self.unused
+
+    def _apart(self, batch: Batch) -> tuple[Batch, Batch | None]:
+        """The windows of a step whose images are looked at, and those whose images are not."""
+        if not self.told:
+            return batch, None
+        count = max(1, round((1 - self.told) * len(batch.states)))
+        images = [name for name, feature in self.domain.observed.items() if feature.kind == "image"]
+        unseen = {name: values[count:] for name, values in batch.observed.items() if name not in images}
+        first = Batch(batch.states[:count], batch.concepts[:count], take(batch.observed, slice(count)))
+        return first, Batch(batch.states[count:], batch.concepts[count:], unseen)
+
+    def _told_losses(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """The losses of windows whose images are not looked at."""
+        ((name, _),) = self.privileged.items()
+        told = self.domain.privileged[name].told
+        assert told is not None
+        states, observed = self.raw.perturbed(batch.states, batch.observed, draw)
+        observed = {**observed, READ: told(observed[name], draw)}
+        return self.losses(self.raw, batch._replace(states=states, observed=observed), draw)
 
     def _privileged_loss(self, observed: Observed) -> Tensor:
         """How badly what was read of the images in this step tells what they show, weighted."""

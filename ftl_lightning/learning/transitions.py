@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.demonstrations.features import READ, Observed
 from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -63,8 +63,9 @@ def unroll(model: ConceptModel, config: StepConfig, predict: Callable[[Tensor | 
         predict: ``observed vectors as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
         observed: features ``(batch, *shape)`` by name, in the domain's units.
     """
-    images = model.of_images(observed)  # those of the start: what follows is imagined, and no picture shows it
-    first = model.decode(predict(model.vector(observed, images)), observed)
+    if (read := model.of_images(observed)) is not None:
+        observed = {**observed, READ: read}  # of the start: what follows is imagined, and no picture shows it
+    first = model.decode(predict(model.vector(observed)), observed)
     if config.horizon == 1 or (config.horizon, config.stride) == (2, 1):
         return first
     ((name, columns),) = [(name, feature.state) for name, feature in model.domain.observed.items() if feature.state]
@@ -72,7 +73,7 @@ def unroll(model: ConceptModel, config: StepConfig, predict: Callable[[Tensor | 
     states = [observed[name][:, columns], first[:, -1]]
     while len(states) < 1 + -(-(config.horizon - 1) // config.stride):
         present[name][:, columns] = states[-1]
-        states.append(model.decode(predict(model.vector(present, images)), present)[:, -1])
+        states.append(model.decode(predict(model.vector(present)), present)[:, -1])
     coarse = torch.stack(states, dim=1)
     at = torch.arange(config.horizon, device=coarse.device) / config.stride
     before = at.long().clamp(max=len(states) - 2)

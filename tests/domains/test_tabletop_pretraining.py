@@ -9,11 +9,13 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.interface import IMAGE, PLACES, POSE
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
-from ftl_lightning.domains.tabletop.views import HALF, MIDDLE, VIEWS, misplaced
+from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, VIEWS, misplaced, told
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.pretrained import load_model
@@ -87,6 +89,37 @@ def test_an_error_is_that_of_what_is_seen() -> None:
     assert misplaced(right.flatten(1), places).tolist() == pytest.approx([0, 0.5], abs=1e-6)
 
 
+def test_what_is_told_is_right_but_for_errors_of_eyes() -> None:
+    data = PretrainingData(domain="tabletop", **SIZES)
+    data.setup("fit")
+    places = data.batch(0).observed[PLACES].repeat(200, 1, 1)
+    read = told(places, generator("cpu", 0))
+    there = places[..., 0] > 0.5
+    wrong = read.unflatten(1, (4, 5)).transpose(1, 2)[..., :3] * HALF - (places[..., 1:] - torch.tensor([*MIDDLE, 0.0]))
+    assert wrong[there].std(dim=0).tolist() == pytest.approx(list(BLUR), rel=0.1)
+    assert wrong[there].mean(dim=0).abs().max() < 1e-3
+    assert torch.equal(read[:, 15:] > 0, there)
+
+
+def test_pictures_are_looked_at_in_part_of_the_windows_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[int] = []
+    plain = ImageEncoders.forward
+
+    def counted(self: ImageEncoders, observed: Observed) -> torch.Tensor:
+        looked.append(len(observed[IMAGE]))
+        return plain(self, observed)
+
+    monkeypatch.setattr(ImageEncoders, "forward", counted)
+    data = PretrainingData(domain="tabletop", **SIZES)
+    module = PretrainingModule(privileged={PLACES: 1.0}, told=0.75, output=str(tmp_path / "model"), **SMALL)
+    trainer(max_steps=3, limit_val_batches=0).fit(module, datamodule=data)
+    assert looked == [2, 2, 2]
+    plan = {name: value.grad for name, value in module.raw.named_parameters() if value.grad is not None}
+    assert any(name.startswith("denoiser") for name in plan)
+    assert load_model(tmp_path / "model").config.training["model"]["told"] == 0.75
+    assert "told" not in PretrainingModule(privileged={PLACES: 1.0}, **SMALL).hparams
+
+
 def test_places_move_with_the_picture() -> None:
     data = PretrainingData(domain="tabletop", **SIZES)
     data.setup("fit")
@@ -115,6 +148,9 @@ def test_places_move_with_the_picture() -> None:
         ),
         ({"image_encoder": {"origin": "origin"}}, "initial_encoder: expected flat, found points"),
         ({"privileged": {PLACES: -1.0}}, r"model.privileged.places: expected a number from 0"),
+        ({"told": 0.5}, "model.told: expected less than 1, and one name in model.privileged, found 0.5"),
+        ({"told": 1.0, "privileged": {PLACES: 1.0}}, "model.told: expected less than 1"),
+        ({"told": 1.5, "privileged": {PLACES: 1.0}}, "model.told: expected a number from 0 to 1"),
         ({"draws": 0}, "model.draws: expected a number from 1|model.draws: expected 1"),
     ],
 )

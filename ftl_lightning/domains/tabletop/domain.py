@@ -26,7 +26,7 @@ from ftl_lightning.domains.tabletop.policies import POLICIES
 from ftl_lightning.domains.tabletop.scenes import OBJECTS
 from ftl_lightning.domains.tabletop.success import judge
 from ftl_lightning.domains.tabletop.tasks import PUSH, SUITES, TRAINING_CONCEPTS, WIDE_CONCEPTS, WIDE_SUITES
-from ftl_lightning.domains.tabletop.views import VIEWS, misplaced
+from ftl_lightning.domains.tabletop.views import VIEWS, misplaced, told
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
@@ -121,7 +121,7 @@ DOMAIN = Domain(
     ),
     source=source,
     observed=FEATURES,
-    privileged={PLACES: Privileged(SEEN, misplaced)},
+    privileged={PLACES: Privileged(SEEN, misplaced, told)},
     views=VIEWS,
     headline=EXECUTED,
     show=Show(deferred(f"{RENDERING}:render")),

@@ -20,6 +20,10 @@ SHIFT = 0.07
 """Metres by which a scene is shifted at most, in x and in y."""
 TURN = 0.5
 """Radians by which half of the scenes are turned at most; the others are turned by any angle."""
+BLUR = (0.004, 0.004, 0.002)
+"""Metres by which an encoder of images is wrong, in x, y and height: the standard deviation on new scenes."""
+SURE = 6.0
+"""Logit of being seen of an encoder that is sure."""
 HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)
 """Metres of the table from the middle of a picture to its edge."""
 MIDDLE = OVERHEAD.target[:2]
@@ -34,7 +38,7 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
 
     Args:
         states: ``(sample, horizon, 4)``.
-        observed: ``image`` and ``pose``, and the privileged ``places`` if they are there.
+        observed: ``pose``, and ``image`` and the privileged ``places`` if they are there.
         mirrored: ``(sample,)`` of bool, left and right exchanged.
         angles: ``(sample,)`` in radians.
         shifts: ``(sample, 2)`` in metres, x and y.
@@ -54,10 +58,12 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
     back = turned.transpose(1, 2)
     offset = (back @ shifts[..., None])[..., 0] / HALF
     theta = torch.cat((back.flip(1, 2), offset.flip(1)[..., None]), dim=-1)
-    images = observed[IMAGE]
-    grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
-    drawn = functional.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
-    found = {**observed, IMAGE: drawn.round().to(torch.uint8), POSE: places(observed[POSE])}
+    found = {**observed, POSE: places(observed[POSE])}
+    if IMAGE in observed:
+        images = observed[IMAGE]
+        grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
+        drawn = functional.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
+        found[IMAGE] = drawn.round().to(torch.uint8)
     if PLACES in observed:
         seen, centres = observed[PLACES].split((1, 3), dim=-1)
         centres = places(centres)
@@ -81,6 +87,21 @@ def misplaced(read: Tensor, places: Tensor) -> Tensor:
     off = read[..., :3] - (places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))) / HALF
     unseen = functional.binary_cross_entropy_with_logits(read[..., 3], seen, reduction="none")
     return (off.abs().sum(dim=-1) * seen + 0.01 * unseen).sum(dim=-1)
+
+
+def told(places: Tensor, draw: torch.Generator) -> Tensor:
+    """What an encoder might read of a picture: the places of what is seen, wrong by :data:`BLUR`.
+
+    Args:
+        places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
+        draw: of the errors.
+
+    Returns:
+        as :func:`misplaced` takes it.
+    """
+    seen, centres = places[..., :1], places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))
+    wrong = torch.randn(centres.shape, generator=draw, device=centres.device) * centres.new_tensor(BLUR)
+    return torch.cat((seen * (centres + wrong) / HALF, SURE * (2 * seen - 1)), dim=-1).transpose(1, 2).flatten(1)
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
