@@ -15,7 +15,7 @@ from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.interface import IMAGE, PLACES, POSE
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
-from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, VIEWS, misplaced, told
+from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.pretrained import load_model
@@ -136,6 +136,28 @@ def test_places_move_with_the_picture() -> None:
         )
     assert seen[IMAGE].dtype == torch.uint8
     assert states.shape == batch.states.shape
+
+
+def test_what_has_no_picture_is_also_seen_higher() -> None:
+    data = PretrainingData(domain="tabletop", **SIZES)
+    data.setup("fit")
+    batch = data.batch(1)
+    perturb = VIEWS["points"].perturb
+    assert perturb is not None
+    unseen = {name: values for name, values in batch.observed.items() if name != IMAGE}
+    states, seen = perturb(batch.states, unseen, generator("cpu", 0))
+    heights = (states[..., 2] - batch.states[..., 2])[:, 0]
+    assert (heights == 0).any()
+    assert (heights > 0.005).any()
+    assert heights.max() <= RAISED + 1e-6
+    for moved, before in (
+        (states[..., 2], batch.states[..., 2]),
+        (seen[POSE][:, 2:3], batch.observed[POSE][:, 2:3]),
+        (seen[PLACES][..., 3], batch.observed[PLACES][..., 3]),
+    ):
+        torch.testing.assert_close(moved - before, heights[:, None].expand_as(moved), atol=1e-6, rtol=0)
+    _, shown = perturb(batch.states, batch.observed, generator("cpu", 0))
+    assert torch.equal(shown[POSE][:, 2], batch.observed[POSE][:, 2])
 
 
 @pytest.mark.parametrize(

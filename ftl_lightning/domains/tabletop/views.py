@@ -18,6 +18,8 @@ ORIGIN = "origin"
 middle, where 1 is half of a picture."""
 SHIFT = 0.07
 """Metres by which a scene is shifted at most, in x and in y."""
+RAISED = 0.05
+"""Metres by which half of the scenes without a picture are raised at most, so that pushes and picks are known on any surface."""
 TURN = 0.5
 """Radians by which half of the scenes are turned at most; the others are turned by any angle."""
 BLUR = (0.004, 0.004, 0.002)
@@ -72,6 +74,23 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
     return places(states), found
 
 
+def raised(states: Tensor, observed: Observed, heights: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """Behaviour and places as if the whole table were higher. No picture from above would tell.
+
+    Args:
+        states: ``(sample, horizon, 4)``.
+        observed: ``pose`` and the privileged ``places``.
+        heights: ``(sample,)`` in metres.
+    """
+    found = dict(observed)
+    found[POSE], found[PLACES] = observed[POSE].clone(), observed[PLACES].clone()
+    found[POSE][:, 2] += heights
+    found[PLACES][..., 3] += heights[:, None]
+    states = states.clone()
+    states[..., 2] += heights[:, None]
+    return states, found
+
+
 def misplaced(read: Tensor, places: Tensor) -> Tensor:
     """How wrong points that were read of pictures are ``(sample,)``.
 
@@ -109,7 +128,10 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
         return states, observed
     drawn = torch.rand((len(states), 5), generator=draw, device=states.device)
     most = torch.where(drawn[:, 1] < 0.5, TURN, math.pi)
-    return moved(states, observed, drawn[:, 0] < 0.5, most * (2 * drawn[:, 2] - 1), SHIFT * (2 * drawn[:, 3:] - 1))
+    states, observed = moved(states, observed, drawn[:, 0] < 0.5, most * (2 * drawn[:, 2] - 1), SHIFT * (2 * drawn[:, 3:] - 1))
+    if IMAGE in observed:
+        return states, observed
+    return raised(states, observed, RAISED * (2 * torch.rand(len(states), generator=draw, device=states.device) - 1).clamp(min=0))
 
 
 def _start(observed: Observed) -> Tensor:
