@@ -10,9 +10,11 @@ from statistics import mean, pstdev
 import pytest
 
 from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
+from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, TO_BOOK, TO_WHITE
 from ftl_lightning.evaluation.results import read_rows
 
 ROOT = Path(__file__).parent.parent
+PAPERS_FORM = "the paper's form of the concept: two components, learned weights"
 README = ROOT / "README.md"
 CARDS = (
     *ROOT.glob("pretrained/*/README.md"),
@@ -143,6 +145,22 @@ def test_the_tables_of_the_table_top_are_what_the_results_say(tmp_path: Path) ->
     tables["main"]([f"--results={ROOT / 'results'}", f"--out={tmp_path / 'found.md'}"])
     kept = (ROOT / "results" / "tabletop.md").read_text(encoding="utf-8")
     assert (tmp_path / "found.md").read_text(encoding="utf-8") == kept, "run benchmarks/tabletop_table.py"
+
+
+def test_numbers_of_the_table_top_in_texts_are_those_of_its_tables() -> None:
+    rows = [line.strip("| ").split(" | ") for line in (ROOT / "results" / "tabletop.md").read_text(encoding="utf-8").splitlines()]
+    told = {row[0]: [cell.split(" ")[0] for cell in row[1:]] for row in rows if len(row) == 4 or len(row) == 5}
+    (adapter, moved, *_), (paper, dragged, *_) = told["**FTL-IGM with an adapter**"], told[PAPERS_FORM]
+    readme, limits, page = (
+        (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/limits.md", "docs/domains/table-top.md")
+    )
+    succeeds = f"succeeds in {adapter} of new scenes with an adapter and in {paper} in the paper's form; BC in {told['BC'][0]}"
+    assert succeeds in readme
+    assert f"embeddings alone move the book in {dragged} of the scenes; an adapter in {moved}" in limits
+    known = [told[task][0] for task in (TO_BOOK, TO_WHITE, PUSH)]
+    assert f"succeed in {min(known)} to {max(known)} of new scenes, pushing around the bowl in {told[AROUND_BOWL][0]};" in limits
+    from_push = told["the training concept of pushing on the table (the paper's baseline)"]
+    assert f"succeeds in {from_push[0]} of the scenes, in the paper in {from_push[2]}." in page
 
 
 def test_the_tables_of_human_motion_are_what_the_results_say(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ FRAME_SECONDS = (0.05, 0.8)
 """The shortest and the longest that a frame is shown; browsers slow down what is shorter than 0.02 s."""
 END_SECONDS = 1.5
 """The last frame stays, before the animation starts again."""
+COLOURS = 64
+"""Of a picture: more make files larger, but small things keep theirs in large pictures."""
 FONT_SIZE = 14
 MARGIN = 6
 INK, PAPER = (32, 32, 32), (255, 255, 255)
@@ -35,15 +37,18 @@ def frame_milliseconds(count: int, seconds: float | None = None) -> int:
     return max(10 * round(100 * each), 20)
 
 
-def gif(pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, pause: float = END_SECONDS) -> bytes:
+def gif(
+    pictures: Sequence[NDArray[np.uint8]], seconds: float | None = None, pause: float = END_SECONDS, colours: int = COLOURS
+) -> bytes:
     """An endless animation.
 
     Args:
         pictures: ``(height, width, 3)`` each, of one size.
         seconds: that all pictures take together; ``None`` for a speed at which their number can be followed.
         pause: seconds that the last picture stays longer.
+        colours: of each picture, up to 256.
     """
-    first, *rest = (Image.fromarray(picture).quantize(64) for picture in pictures)
+    first, *rest = (Image.fromarray(picture).quantize(colours) for picture in pictures)
     each = frame_milliseconds(len(pictures), seconds)
     last = each + 10 * round(100 * pause)
     content = io.BytesIO()

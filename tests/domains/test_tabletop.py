@@ -43,7 +43,6 @@ from ftl_lightning.domains.tabletop.tasks import (
     PUSH,
     PUSH_ON_BOOK,
     PUSH_TO_BOWL,
-    PUSHES,
     TASKS,
     TO_BOOK,
     TO_WHITE,
@@ -257,8 +256,8 @@ def test_pushing_at_the_height_of_the_table_moves_the_book(env: TableTopEnvironm
     assert env._told()["book"] > 0.02
 
 
-@pytest.mark.parametrize("task", PUSHES)
-def test_pushes_begin_anew_wherever_hand_and_circle_are(task: str, env: TableTopEnvironment) -> None:
+@pytest.mark.parametrize("task", TASKS)
+def test_tasks_begin_anew_wherever_hand_and_circle_are(task: str, env: TableTopEnvironment) -> None:
     sides = []
     for number, scene in enumerate(scenes(task, 5, 21).numpy()):
         env.reset(options={"scene": scene})

@@ -198,12 +198,12 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
                 found[OBJECTS.index(name)] = (1.0, *place)
         return found
 
-    def put(self, hand: NDArray[np.float64], circle: NDArray[np.float64]) -> Seen:
-        """What is seen where an episode begins with the closed hand at ``(3,)``, and the circle's centre at ``(2,)``."""
+    def put(self, hand: NDArray[np.float64], circle: NDArray[np.float64], opening: float = 0.0) -> Seen:
+        """What is seen where an episode begins with the hand at ``(3,)`` and so far open, and the circle's centre at ``(2,)``."""
         self.client.resetBasePositionAndOrientation(
             self.bodies.objects[CIRCLE], [*map(float, circle), self._first[CIRCLE][2]], turned(0.0)
         )
-        self._place(hand, 0.0)
+        self._place(hand, opening)
         return self.begun()
 
     def begun(self) -> Seen:

@@ -56,6 +56,10 @@ LYING, RISING, OVER = 0.5, 0.4, 0.03
 may be over it."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
 """x and y of circle and hand there."""
+OPENED = 0.5
+"""How often a hand that picks is open there."""
+HIGHEST = 0.16
+"""Metres above the height of pushing at which a hand that picks is at most there."""
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
 """Metres from circle to hand, from the circle to other things at least, and to the triangle at most, there."""
 APART_FROM = 0.12
@@ -143,6 +147,8 @@ def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | Non
 
 def _pick(expert: _Expert) -> Moves:
     scene, how = expert.env.scene, expert.how
+    if expert.at[2] < expert.circle()[2] + CLEAR:  # a grasp has missed; fingers that open here might move the circle
+        yield from expert.go(np.array([*expert.at[:2], expert.circle()[2] + CLEAR]), 0.014, float(expert.at[3]))
     circle = expert.circle()
     target, surface = _target(expert)
     over = circle[:2] + how.grasp
@@ -301,16 +307,18 @@ def _stayed(values: list[Any]) -> NDArray[Any]:
 
 
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
-    """What is seen where a push begins anew after it went wrong: the hand at any side of the circle, low or above it, and the
-    circle, in :data:`MISLAID` of the episodes, elsewhere on the table, also beyond where it begins else.
+    """What is seen where a task begins anew after it went wrong: the hand at any side of the circle, low or above it, and the
+    circle, in :data:`MISLAID` of the episodes, elsewhere on the table, also beyond where it begins else. A hand that picks may
+    be open above the circle, or closed and empty anywhere.
 
     Args:
         env: reset to a scene of the task, which is changed.
-        task: a push.
+        task: known.
         rng: draws both.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
-    below = support(env.scene, CIRCLE)
+    below, picks = support(env.scene, CIRCLE), task not in PUSHES
+    highest = HIGHEST if picks else CLEAR
     on_book = below > 0
     surface = others.pop(BOOK) if on_book else None
     while True:
@@ -320,12 +328,13 @@ def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) 
         shape = outline(CIRCLE, float(place[0]), float(place[1]), 0.0)
         if surface is not None and not within(shape, surface):
             continue
-        low, rising = rng.random() < LYING, rng.random() < RISING
+        opened = picks and rng.random() < OPENED
+        low, rising = not opened and rng.random() < LYING, not opened and rng.random() < RISING
         angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(AROUND[0] if low or rising else 0.0, AROUND[1])
         hand = place + distance * np.array([math.cos(angle), math.sin(angle)])
-        height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, CLEAR))
+        height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, highest))
         finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
         free = all(gap(shape, other) >= ROOM and gap(finger, other) >= APART for other in others.values())
-        far = np.linalg.norm(place - env.places()[TARGET[task]][:2]) > FARTHEST_PUSH
+        far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > FARTHEST_PUSH
         if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
-            return env.put(np.array([*hand, height]), place)
+            return env.put(np.array([*hand, height]), place, OPEN if opened else CLOSED)
