@@ -162,7 +162,7 @@ TINY = {
     "agent": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
     "driving": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
     "mocap": ["--data.batch_size=8"],
-    "tabletop": ["--data.samples_per_concept=1", "--data.validation_per_concept=1", "--data.batch_size=8"],
+    "tabletop": ["--data.samples_per_concept=1", "--data.validation_per_concept=1", "--data.recoveries=1", "--data.batch_size=8"],
 }
 SMALL = {
     "bc": ["--model.hidden_dim=16"],
