@@ -26,7 +26,7 @@ DATA = {
     "driving": FEW,
     "mocap": [],
     "own": [],
-    "tabletop": ["--data.samples_per_concept=1", "--data.validation_per_concept=1"],
+    "tabletop": ["--data.samples_per_concept=1", "--data.validation_per_concept=1", "--data.recoveries=1"],
 }
 NETWORK = {
     "agent": [
