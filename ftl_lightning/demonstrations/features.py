@@ -14,7 +14,7 @@ from ftl_lightning.representation import Shown
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
 
-READ = "read"
+READ = "(read)"  # not as a feature of anybody's own is named
 """Observed in place of images where they have been read already: what an encoder read of them ``(sample, n)``."""
 
 

@@ -270,9 +270,9 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     def _apart(self, batch: Batch) -> tuple[Batch, Batch | None]:
         """The windows of a step whose images are looked at, and those whose images are not."""
-        if not self.told:
-            return batch, None
         count = max(1, round((1 - self.told) * len(batch.states)))
+        if count >= len(batch.states):
+            return batch, None
         images = [name for name, feature in self.domain.observed.items() if feature.kind == "image"]
         unseen = {name: values[count:] for name, values in batch.observed.items() if name not in images}
         first = Batch(batch.states[:count], batch.concepts[:count], take(batch.observed, slice(count)))
