@@ -20,7 +20,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.trainer import Trainer
 from tests.conftest import CONF, ROOT, TINY
 
-OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop")
+OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop", "tabletop_wide")
 BASELINES = ("bc", "cvae", "in_context")
 FITS = [*OURS, *sorted(f"{method}/{path.stem}" for method in BASELINES for path in (CONF / method).glob("*.yaml"))]
 INVERSIONS = [[name] for name in (*FITS, "mocap_adapter", "tabletop_adapter")] + [[name, "method/language"] for name in OURS]

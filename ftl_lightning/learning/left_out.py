@@ -10,7 +10,7 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.demonstrations.finding import numbered
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.explained_by import relative_losses
+from ftl_lightning.learning.explained_by import generated_loss, relative_losses
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import PAPER, InversionSettings
 
@@ -22,6 +22,8 @@ ODD, HARMED = 1.7, 1.2
 """An odd demonstration's left-out loss is so many times the largest of the others, and of the empty concept's."""
 COVERED = 0.95
 """Of the empty concept's loss: a demonstration is explained by a concept whose loss is less."""
+FAR = 10.0
+"""A task is far from anything pretrained where the loss of those left out is so many times that of what the model generates."""
 FALLING = 0.05
 """Share that the loss of those left out falls by for one more demonstration, from which on more are likely to help."""
 
@@ -35,12 +37,25 @@ class LeftOut:
         learned_from: of each, the mean under the concepts that were learned from it and all others but one ``(demo,)``.
         curve: the mean of those left out by the number of demonstrations that were learned from, without the odd one.
         odd: the demonstration that differs from the others, from 0; ``None`` where none does.
+        generated: of what the model generates itself, see :func:`~ftl_lightning.learning.explained_by.generated_loss`.
     """
 
     left_out: tuple[float, ...]
     learned_from: tuple[float, ...]
     curve: dict[int, float]
     odd: int | None
+    generated: float
+
+    @property
+    def distance(self) -> float:
+        """How many times the loss of what the model generates the loss of those left out is, without the odd one."""
+        kept = [loss for row, loss in enumerate(self.left_out) if row != self.odd]
+        return sum(kept) / len(kept) / max(self.generated, 1e-12)
+
+    @property
+    def far(self) -> bool:
+        """Whether the model has seen nothing like them, so that no concept explains them as those that were pretrained."""
+        return self.distance >= FAR
 
     @property
     def covered(self) -> int:
@@ -71,7 +86,11 @@ class LeftOut:
         verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
         if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:
             verdict = "hardly falls, and those left out are not explained: look at samples"
-        return [told, *([odd] if count > 2 else []), f"more: loss of those left out {curve}; it {verdict}" if curve else ""]
+        more = f"more: loss of those left out {curve}; it {verdict}" if curve else ""
+        times = f"those left out have {self.distance:.1f} times the loss of what the model generates itself"
+        near = f"near: {times} (far from anything pretrained: {FAR:.0f} and more)"
+        far = f"far: {times}: nothing pretrained is like this; samples are likely to do something else"
+        return [told, *([odd] if count > 2 else []), more, far if self.far else near]
 
 
 def subsets(count: int) -> list[tuple[int, ...]]:
@@ -151,7 +170,7 @@ def left_out(
         for size in sorted(set(sizes.tolist()))
         if kept[sizes == size].any()
     }
-    return LeftOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd)
+    return LeftOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, own, settings))
 
 
 def odd_one(losses: Tensor) -> int | None:

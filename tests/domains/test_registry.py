@@ -9,7 +9,7 @@ from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.errors import UserError
 
-BUILT_IN = ("agent", "driving", "mocap", "object_rearrangement", "tabletop")
+BUILT_IN = ("agent", "driving", "mocap", "object_rearrangement", "tabletop", "tabletop_wide")
 MODULE = """
 from dataclasses import replace
 from ftl_lightning.domains.object_rearrangement import DOMAIN as OTHER

@@ -118,16 +118,19 @@ def test_the_odd_one_is_far_above_all_others() -> None:
 
 
 def test_words_follow_the_numbers() -> None:
-    suffice = LeftOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None)
+    suffice = LeftOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None, 0.2)
     assert (suffice.covered, suffice.falling) == (2, False)
     told = " ".join(suffice.lines())
     assert "explains 2 of 3, not demonstration 3" in told
     assert "these suffice" in told
-    more = LeftOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2)
+    more = LeftOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2, 0.04)
     assert more.falling
+    assert suffice.lines()[-1].startswith("near: those left out have 3.1 times the loss")
+    assert more.far  # without the odd one
+    assert more.lines()[-1].startswith("far: those left out have 11.2 times the loss")
     assert "odd: demonstration 3, loss 1.90" in " ".join(more.lines())
     assert "more are likely to help" in " ".join(more.lines())
-    assert "look at samples" in LeftOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None).lines()[-1]
+    assert "look at samples" in LeftOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None, 0.2).lines()[-2]
     assert not Known("a", (0.9, 0.9, 1.2, 0.9)).clear
 
 

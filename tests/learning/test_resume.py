@@ -15,7 +15,7 @@ from ftl_lightning.testing.strokes import TRAINING, strokes
 from tests.conftest import CONF
 from tests.domains.mocap_samples import folder
 
-OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop")
+OURS = ("agent", "driving", "mocap", "object_rearrangement", "own", "tabletop", "tabletop_wide")
 FITS = [Path(f"{domain}.yaml") for domain in OURS] + sorted(
     path.relative_to(CONF) for method in ("bc", "cvae", "in_context") for path in (CONF / method).glob("*.yaml")
 )
@@ -27,6 +27,7 @@ DATA = {
     "mocap": [],
     "own": [],
     "tabletop": ["--data.samples_per_concept=1", "--data.validation_per_concept=1", "--data.recoveries=1"],
+    "tabletop_wide": ["--data.samples_per_concept=1", "--data.validation_per_concept=1", "--data.recoveries=1"],
 }
 NETWORK = {
     "agent": [
@@ -41,6 +42,7 @@ NETWORK = {
     "object_rearrangement": ["--model.denoiser_args={hidden_dim: 16, depth: 2, condition_dim: 16, dropout: 0.1}"],
     "own": ["--model.denoiser_args={hidden_dim: 16, depth: 2, condition_dim: 16, dropout: 0.1}"],
     "tabletop": ["--model.denoiser_args={hidden_dim: 16, depth: 2, condition_dim: 16, initial_dim: 16}"],
+    "tabletop_wide": ["--model.denoiser_args={hidden_dim: 16, depth: 2, condition_dim: 16, initial_dim: 16}"],
     "bc": ["--model.hidden_dim=16"],
     "cvae": ["--model.hidden_dim=16", "--model.latent_dim=4"],
     "in_context": ["--model.width=16", "--model.layers=1", "--model.heads=2"],

@@ -50,7 +50,7 @@ def source(root: Path | None) -> "Expert":
 
 
 def wide_source(root: Path | None) -> "Expert":
-    """The scripted experts of the wide domain's concepts.
+    """The scripted experts of the wide domain's concepts, of which all are also shown from where one went wrong.
 
     Raises:
         UserError: without the simulator.
@@ -58,7 +58,7 @@ def wide_source(root: Path | None) -> "Expert":
     expect_simulator()
     from ftl_lightning.domains.tabletop.source import Expert
 
-    return Expert(WIDE_CONCEPTS, WIDE_NAME)
+    return Expert(WIDE_CONCEPTS, WIDE_NAME, begun_anew=WIDE_CONCEPTS)
 
 
 def environment() -> "TableTopEnvironment":

@@ -100,7 +100,7 @@ def demonstrations(
         workers: processes.
         progress: called after each successful episode.
         scatter: whether distractors lie elsewhere in each picture; then it is told what is where.
-        elsewhere: whether a push begins with the hand anywhere around the circle.
+        elsewhere: whether it begins with the hand anywhere around the circle.
 
     Raises:
         UserError: if too few episodes succeed.
@@ -160,10 +160,14 @@ class Expert:
     Args:
         concepts: the training concepts.
         domain: whose demonstrations they are.
+        begun_anew: those that are also shown from where one went wrong; pushes alone for ``None``.
     """
 
-    def __init__(self, concepts: Sequence[str] = TRAINING_CONCEPTS, domain: str = NAME) -> None:
+    def __init__(
+        self, concepts: Sequence[str] = TRAINING_CONCEPTS, domain: str = NAME, begun_anew: Sequence[str] | None = None
+    ) -> None:
         self.concepts, self.domain = tuple(concepts), domain
+        self.begun_anew = tuple(task for task in self.concepts if task in (PUSHES if begun_anew is None else begun_anew))
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """``count`` demonstrations of every training concept, and more of those in :data:`TIMES`; distractors are scattered."""
@@ -171,10 +175,9 @@ class Expert:
         return concatenate([self.draw(task, TIMES.get(task, 1) * count, own, scatter=True) for task in self.concepts])
 
     def recoveries(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` more of every push, which begin where one went wrong, see :func:`.experts.led_astray`."""
+        """``count`` more of every task that is begun anew, from where one went wrong, see :func:`.experts.led_astray`."""
         own = RECOVERY_SEED + seed + (0 if name == "train" else VALIDATION_SEED)
-        pushes = [task for task in self.concepts if task in PUSHES]
-        return concatenate([self.draw(task, count, own, scatter=True, elsewhere=True) for task in pushes])
+        return concatenate([self.draw(task, count, own, scatter=True, elsewhere=True) for task in self.begun_anew])
 
     def draw(
         self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
