@@ -1,9 +1,9 @@
-"""The tables of the table-top's page, from the rows of its ablation and its benchmarks: results/tabletop.md.
+"""The tables of the table-top's page, from the rows of its ablations and its benchmarks: results/tabletop.md, tabletop_wide.md.
 
     python benchmarks/tabletop_table.py
 
 The new task and the training tasks, how episodes of pushing end and with which half done by the expert, and where the model's eyes
-see things.
+see things; of the wide model, what it learns, what its pushes aim at, and the training tasks.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TRAINING_CONCEPTS
+from ftl_lightning.domains.tabletop.tasks import BESIDE_BOWL, PUSH, PUSH_ON_BOOK, PUSH_TO_BOOK, TRAINING_CONCEPTS, WIDE_CONCEPTS
 from ftl_lightning.tensor_file import write_text
 
 NEW, OLD, FROM_PUSH = "new concept", "training concept", "training representation"
@@ -103,20 +103,66 @@ def eyes(found: dict[str, Any]) -> str:
     return table(["where it is seen, error in cm (root mean square)", *kinds], lines)
 
 
+def wide_tasks(rows: pd.DataFrame) -> str:
+    """Tasks that the wide model learns, a line for each."""
+    lines = []
+    for task in (PUSH_TO_BOOK, PUSH_ON_BOOK, BESIDE_BOWL):
+        new = rows[(rows["setting"] == NEW) & (rows["task"] == task)]
+        forms = (("FTL-IGM", "with adapter"), ("LoRA fine-tuning", ""), ("FTL-IGM", ""), (REFERENCES[0], ""))
+        lines.append([task, *(cells(new[(new["method"] == method) & (new["form"] == form)])[0] for method, form in forms)])
+    head = [
+        "wide model, from ten demonstrations",
+        "with an adapter",
+        "LoRA fine-tuning",
+        "the paper's form of the concept",
+        "*expert*",
+    ]
+    return table(head, lines)
+
+
+def wide_training(rows: pd.DataFrame) -> str:
+    """What the wide model was pretrained on, a line for each task."""
+    lines = []
+    for task in WIDE_CONCEPTS:
+        own = rows[(rows["setting"] == OLD) & (rows["task"] == task)]
+        lines.append([task, cells(own[own["method"] == "FTL-IGM"])[0], cells(own[own["method"] == REFERENCES[0]])[0]])
+    return table(["wide model, training task", "success", "*expert*"], lines)
+
+
+def targets(found: dict[str, Any]) -> str:
+    """Where pushes go when two things exchange their places, a line for what is pushed to."""
+    pairs = found["pushed to, beside"]
+    lines = []
+    for target, others in pairs.items():
+        shown = [others.get(other) for other in pairs]
+        lines.append([target, *("-" if one is None else f"{number(one['right'])} / {number(one['followed'])}" for one in shown)])
+    return table(["pushed to, beside another thing: right / followed", *pairs], lines)
+
+
+def rows_of(path: Path) -> pd.DataFrame:
+    """Rows of a results file; K and demonstrations are 0 where there are none."""
+    rows = pd.read_csv(path, keep_default_na=False, na_values={"value": [""]})
+    for column in ("K", "demonstrations"):
+        rows[column] = rows[column].replace("", 0).astype(int)
+    return rows
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=Path("results"), help="folder")
-    parser.add_argument("--out", type=Path, default=Path("results/tabletop.md"))
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder")
     chosen = parser.parse_args(arguments)
-    rows = pd.read_csv(chosen.results / "tabletop.csv", keep_default_na=False, na_values={"value": [""]})
-    for column in ("K", "demonstrations"):
-        rows[column] = rows[column].replace("", 0).astype(int)
-    parts = [new_task(rows), training_tasks(rows)]
-    for name, text in (("tabletop_failures.json", failures), ("tabletop_localisation.json", eyes)):
-        if (path := chosen.results / name).exists():
-            parts.append(text(json.loads(path.read_text(encoding="utf-8"))))
-    write_text(chosen.out, "\n\n".join(parts) + "\n")
+    rows = rows_of(chosen.results / "tabletop.csv")
+    found = {
+        name: json.loads((chosen.results / f"tabletop_{name}.json").read_text(encoding="utf-8"))
+        for name in ("failures", "localisation", "targets")
+    }
+    parts = [new_task(rows), training_tasks(rows), failures(found["failures"]), eyes(found["localisation"])]
+    write_text(chosen.out / "tabletop.md", "\n\n".join(parts) + "\n")
+    rows = rows_of(chosen.results / "tabletop_wide.csv")
+    parts = [wide_tasks(rows), targets(found["targets"]), wide_training(rows)]
+    write_text(chosen.out / "tabletop_wide.md", "\n\n".join(parts) + "\n")
 
 
 if __name__ == "__main__":

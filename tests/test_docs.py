@@ -142,9 +142,10 @@ def test_the_page_of_own_data_tells_what_check_finds() -> None:
 
 def test_the_tables_of_the_table_top_are_what_the_results_say(tmp_path: Path) -> None:
     tables = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_table.py"))
-    tables["main"]([f"--results={ROOT / 'results'}", f"--out={tmp_path / 'found.md'}"])
-    kept = (ROOT / "results" / "tabletop.md").read_text(encoding="utf-8")
-    assert (tmp_path / "found.md").read_text(encoding="utf-8") == kept, "run benchmarks/tabletop_table.py"
+    tables["main"]([f"--results={ROOT / 'results'}", f"--out={tmp_path}"])
+    for name in ("tabletop.md", "tabletop_wide.md"):
+        kept = (ROOT / "results" / name).read_text(encoding="utf-8")
+        assert (tmp_path / name).read_text(encoding="utf-8") == kept, "run benchmarks/tabletop_table.py"
 
 
 def test_numbers_of_the_table_top_in_texts_are_those_of_its_tables() -> None:
@@ -161,6 +162,27 @@ def test_numbers_of_the_table_top_in_texts_are_those_of_its_tables() -> None:
     assert f"succeed in {min(known)} to {max(known)} of new scenes, pushing around the bowl in {told[AROUND_BOWL][0]};" in limits
     from_push = told["the training concept of pushing on the table (the paper's baseline)"]
     assert f"succeeds in {from_push[0]} of the scenes, in the paper in {from_push[2]}." in page
+
+
+def test_the_table_of_settings_is_what_the_configurations_say() -> None:
+    settings = runpy.run_path(str(ROOT / "docs" / "settings.py"))
+    page = settings["PAGE"].read_text(encoding="utf-8")
+    assert settings["written"](page) == page, "run docs/settings.py"
+
+
+def test_the_page_of_the_paper_is_what_the_results_say() -> None:
+    page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    assert runpy.run_path(str(ROOT / "docs" / "paper.py"))["page"]() == page, "run docs/paper.py"
+
+
+def test_the_page_of_the_paper_says_what_has_no_rows() -> None:
+    paper = runpy.run_path(str(ROOT / "docs" / "paper.py"))
+    rows = paper["read_rows"](ROOT / "results" / "tabletop.csv")
+    assert re.fullmatch(r"0\.\d\d.*", paper["measured"](rows, {"method": "BC", "metric": "closed loop success"}, "BC"))
+    with pytest.raises(SystemExit, match=r"BC: expected rows with .*, found none"):
+        paper["measured"](rows, {"method": "BC", "metric": "accuracy"}, "BC")
+    with pytest.raises(SystemExit, match="all: expected rows of one setting, found"):
+        paper["measured"](rows, {"method": "FTL-IGM", "metric": "closed loop success"}, "all")
 
 
 def test_the_tables_of_human_motion_are_what_the_results_say(tmp_path: Path) -> None:

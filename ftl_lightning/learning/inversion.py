@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
@@ -16,7 +17,17 @@ from ftl_lightning.demonstrations.features import moved
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.adam import Group
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, EXPLAINED, MIXED, MODES, ONE, PAPER, InversionSettings
+from ftl_lightning.learning.inversion_settings import (
+    ADAPTED,
+    AUTO,
+    CONCEPTS,
+    EXPLAINED,
+    MIXED,
+    MODES,
+    ONE,
+    PAPER,
+    InversionSettings,
+)
 from ftl_lightning.learning.stopping import Stopping
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.seeding import generator, task_key
@@ -62,6 +73,7 @@ class Inversion(nn.Module):
 
     basis: Tensor
     weights: Tensor
+    screened: Tensor | None
     _modes: Tensor
 
     def __init__(self, model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> None:
@@ -76,12 +88,18 @@ class Inversion(nn.Module):
         self.register_buffer("basis", basis, persistent=False)
         self.runs = self._runs()
         self.register_buffer("_modes", torch.tensor([run.mode > 0 for run in self.runs]), persistent=False)
+        # Those that go on after screening; kept in checkpoints, as nothing else tells.
+        self.register_buffer("screened", torch.ones(len(self.runs), dtype=torch.bool) if settings.budget.screening else None)
         # A generator for each concept, so that its start does not depend on what is learned beside it. Its modes start alike.
         shape = (settings.budget.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, task_key(name)) for name in self.concepts]
         starts = [torch.randn(shape, generator=draw) for draw in draws]
         start = torch.cat([starts[run.concept] for run in self.runs[:: settings.budget.restarts]])[:, :, None]
-        self.embeddings = nn.Parameter(settings.embeddings.initial_spread * start.repeat(1, 1, settings.embeddings.knots, 1))
+        start = settings.embeddings.initial_spread * start.repeat(1, 1, settings.embeddings.knots, 1)
+        if settings.embeddings.start == CONCEPTS:
+            turn = torch.arange(len(start)) % settings.budget.restarts % len(training)
+            start = start + training.cpu()[turn, None, None]
+        self.embeddings = nn.Parameter(start)
         runs = (len(start), settings.components)
         if settings.omega == "learned":
             self.weights = nn.Parameter(torch.full(runs, float(settings.weights.initial)))
@@ -186,6 +204,7 @@ class Inversion(nn.Module):
         found = []
         for samples, own in ((self.settings.budget.samples, ~self._modes), (self.settings.modes.samples, self._modes)):
             chosen = own if self.stopping is None else own & self.stopping.going
+            chosen = chosen if self.screened is None else chosen & self.screened
             if chosen.any():
                 # Anew for the modes, which would otherwise depend on whether any other run goes on.
                 draw = generator(self.embeddings.device, self.settings.seed, 1, step)
@@ -202,6 +221,9 @@ class Inversion(nn.Module):
         Returns:
             Whether any run goes on.
         """
+        if self.screened is not None and step + 1 == self.settings.budget.screening:
+            losses = self._held_out(self.embeddings, self.weights, None).unflatten(0, (-1, self.settings.budget.restarts))
+            self.screened = functional.one_hot(losses.argmin(dim=1), losses.shape[1]).bool().flatten()
         return self.stopping is None or self.stopping.stepped(step, self.embeddings, self.weights, self._held_out)
 
     @torch.no_grad()
@@ -237,6 +259,8 @@ class Inversion(nn.Module):
         source = self if self.stopping is None or not self.stopping.rounds else self.stopping
         raw, weights = source.embeddings.detach(), source.weights.detach()
         losses = self._final(raw, weights)
+        if self.screened is not None:
+            losses = losses.where(self.screened, torch.inf)
         best = torch.arange(0, len(losses), restarts, device=losses.device) + losses.unflatten(0, (-1, restarts)).argmin(dim=1)
         auto = self.settings.modes.sets == "auto"
         empty = self._final(raw, torch.zeros_like(weights)) if auto else losses

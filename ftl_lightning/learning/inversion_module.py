@@ -88,7 +88,9 @@ class InversionModule(ExactResume, Adaptation):
             "loss": loss,
         }
         self.save_hyperparameters(ignore=groups_of(INVERSION))
-        self.save_hyperparameters(flat(groups, INVERSION))
+        # Configurations from before there were these keep their hash.
+        usual = {"start": _USUAL.embeddings.start, "screening": _USUAL.budget.screening}
+        self.save_hyperparameters({name: value for name, value in flat(groups, INVERSION).items() if value != usual.get(name)})
         self.settings = InversionSettings(
             components=components,
             omega=omega,

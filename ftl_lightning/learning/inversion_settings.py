@@ -7,9 +7,9 @@ from typing import Any, Literal, Self
 
 from ftl_lightning.diffusion.prediction import LOSSES
 from ftl_lightning.diffusion.schedule import LARGEST_POWER
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, shown
 from ftl_lightning.option_groups import replaced
-from ftl_lightning.ranges import LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.regrouped import INVERSION
 
 EXPLAINED = 0.4
@@ -23,6 +23,8 @@ say, the paper's unless they add to it; the one that the demonstrations ask for.
 ONE, MODES, ADAPTED, MIXED = "one set", "modes", "adapter", "mixtures"
 """Forms: one set of embeddings; one for each demonstration, of which one is drawn; one set and a small adapter of the denoiser; one
 for each demonstration and an adapter that they share, with samples from mixtures."""
+MEAN, CONCEPTS = STARTS = "mean", "concepts"
+"""Where embeddings start."""
 FORMS = (UNSAID, PAPER, AUTO, ONE, MODES, ADAPTED, MIXED)
 
 
@@ -36,15 +38,21 @@ class EmbeddingOptions:
         off_span: how freely embeddings leave the affine span of the training embeddings: 1 is the paper's free form, 0 keeps
             them in the span, between the two the part off the span is scaled, which slows its learning down.
         initial_spread: embeddings start at the mean of the training embeddings plus so much normal noise a column.
+        start: ``'mean'`` for there, or ``'concepts'``: restart r starts at the r-th training embedding, with the noise. What
+            a network chooses by the concept, such as a thing that behaviour aims at, is steep between concepts and flat around
+            their mean.
     """
 
     knots: int = 1
     off_span: float = 1.0
     initial_spread: float = 0.05
+    start: str = MEAN
 
     def __post_init__(self) -> None:
         expect_count("model.embeddings.knots", self.knots, 1, MOST)
         expect_factor("model.embeddings.initial_spread", self.initial_spread, 0)
+        if self.start not in STARTS:
+            raise UserError(f"model.embeddings.start: expected {' or '.join(STARTS)}, found {shown(self.start)}")
         if not 0 <= self.off_span <= 1:
             raise UserError(f"model.embeddings.off_span: expected 0 (span) to 1 (free), found {self.off_span}")
 
@@ -130,6 +138,7 @@ class BudgetOptions:
     Attributes:
         samples: noised demonstrations a step and run, spread over the run's demonstrations and timesteps.
         restarts: independent starts of each concept; the one with the lowest loss on common noise is kept.
+        screening: steps after which, of each concept, the restart with the lowest loss on held-out noise goes on alone; 0 for none.
         learning_rate: of the embeddings (Adam).
         tolerance: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than this share of
             all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
@@ -139,12 +148,14 @@ class BudgetOptions:
 
     samples: int = 32
     restarts: int = 1
+    screening: int = 0
     learning_rate: float = 0.1
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
         expect_count("model.budget.samples", self.samples, 1, MOST_TOGETHER)
         expect_count("model.budget.restarts", self.restarts, 1, MOST)
+        expect_count("model.budget.screening", self.screening, 0, LARGEST)
         expect_factor("model.budget.learning_rate", self.learning_rate, 0, LARGEST_RATE)
         if self.tolerance is not None and not 0 <= self.tolerance < 1:
             raise UserError(f"model.budget.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")

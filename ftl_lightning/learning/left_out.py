@@ -23,7 +23,7 @@ ODD, HARMED = 1.7, 1.2
 COVERED = 0.95
 """Of the empty concept's loss: a demonstration is explained by a concept whose loss is less."""
 FAR = 10.0
-"""A task is far from anything pretrained where the loss of those left out is so many times that of what the model generates."""
+"""A task is far from anything pretrained where the loss of those learned from is so many times that of what the model generates."""
 FALLING = 0.05
 """Share that the loss of those left out falls by for one more demonstration, from which on more are likely to help."""
 
@@ -48,13 +48,16 @@ class LeftOut:
 
     @property
     def distance(self) -> float:
-        """How many times the loss of what the model generates the loss of those left out is, without the odd one."""
-        kept = [loss for row, loss in enumerate(self.left_out) if row != self.odd]
+        """How many times the loss of what the model generates the loss of those learned from is, without the odd one.
+
+        That of those left out is also large where demonstrations are too few to tell what is meant.
+        """
+        kept = [loss for row, loss in enumerate(self.learned_from) if row != self.odd]
         return sum(kept) / len(kept) / max(self.generated, 1e-12)
 
     @property
     def far(self) -> bool:
-        """Whether the model has seen nothing like them, so that no concept explains them as those that were pretrained."""
+        """Whether the model has seen nothing like them: no concept explains even those that it is learned from."""
         return self.distance >= FAR
 
     @property
@@ -87,8 +90,8 @@ class LeftOut:
         if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:
             verdict = "hardly falls, and those left out are not explained: look at samples"
         more = f"more: loss of those left out {curve}; it {verdict}" if curve else ""
-        times = f"those left out have {self.distance:.1f} times the loss of what the model generates itself"
-        near = f"near: {times} (far from anything pretrained: {FAR:.0f} and more)"
+        times = f"where it is learned from them, they have {self.distance:.1f} times the loss of what the model generates"
+        near = f"distance: {times} (from {FAR:.0f} on: far from anything pretrained)"
         far = f"far: {times}: nothing pretrained is like this; samples are likely to do something else"
         return [told, *([odd] if count > 2 else []), more, far if self.far else near]
 

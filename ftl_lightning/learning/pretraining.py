@@ -15,19 +15,20 @@ from torch import Tensor
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import EMPTY
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import READ, Feature, Observed, take
+from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import Batch, PretrainingData
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
-from ftl_lightning.errors import UserError, short
+from ftl_lightning.errors import UserError
 from ftl_lightning.learning.checkpoint import Random
 from ftl_lightning.learning.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.learning.model_config import ModelConfig, find_view
 from ftl_lightning.learning.model_folder import save_model
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.resume import ExactResume
+from ftl_lightning.learning.teaching import Teaching
 from ftl_lightning.option_groups import groups_of
 from ftl_lightning.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
 from ftl_lightning.seeding import generator
@@ -113,13 +114,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
         for name, share in self.feature_dropout.items():
             expect_range(f"model.feature_dropout.{name}", share, 0, 1)
-        self.privileged = dict(privileged or {})
-        for name, weight in self.privileged.items():
-            expect_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
-        expect_range("model.told", told, 0, 1)
-        if told == 1 or (told and len(self.privileged) != 1):
-            raise UserError(f"model.told: expected less than 1, and one name in model.privileged, found {told}")
-        self.told = told
+        self.teaching = Teaching(privileged or {}, told)
         self.seed = seed
         self.guidance = guidance
         self.register_parameter("unused", None)
@@ -203,32 +198,13 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                     beside.share(config.state_columns, normalization)
             self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
             self.model.examples = data.examples
-            self._expect_privileged()
+            self.teaching.expect_taught(self.domain, self.model.images)
         self.raw = copy.deepcopy(self.model)
-        if self.privileged and self.raw.images is not None:
-            self.raw.images.register_forward_hook(self._keep)
+        self.teaching.attach(self.raw.images)
         if not any(parameter.requires_grad for parameter in self.raw.parameters()):
             # Of a model that memorises: steps are still counted, so there has to be something that they are of.
             self.unused = torch.nn.Parameter(torch.zeros(()))
         self.model.requires_grad_(False).eval()
-
-    def _expect_privileged(self) -> None:
-        """Refuse to teach images what the domain does not show, or what no encoder of points reads."""
-        for name in self.privileged:
-            known, images = self.domain.privileged.get(name), self.model.images
-            if known is None or images is None:
-                told = ", ".join(self.domain.privileged) if images is not None else "none, as no image is observed"
-                raise UserError(f"model.privileged: expected {told or 'none'} (domain {self.domain.name}), found {short(name)!r}")
-            if images.size != known.feature.size:
-                raise UserError(
-                    f"model.privileged.{name}: expected image_encoder of {known.feature.shape[0]} points, "
-                    f"found one that reads {images.size} numbers"
-                )
-            if self.told and known.told is None:
-                raise UserError(f"model.told: expected 0, as nothing tells what is read of {name!r}, found {self.told}")
-
-    def _keep(self, module: torch.nn.Module, inputs: Any, read: Tensor) -> None:
-        self._read = read
 
     def train(self, mode: bool = True) -> Self:
         """Switch modes; the average is always in evaluation mode."""
@@ -253,10 +229,12 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     def training_step(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
-        looked_at, told = self._apart(batch)
+        looked_at, unseen = self.teaching.apart(self.domain, batch)
         losses, seen = self._perturbed_losses(self.raw, looked_at, draw)
-        if told is not None:
-            losses = torch.cat((losses, self._told_losses(told, draw)))
+        if unseen is not None:
+            states, observed = self.raw.perturbed(unseen.states, unseen.observed, draw)
+            told = unseen._replace(states=states, observed=self.teaching.told(self.domain, observed, draw))
+            losses = torch.cat((losses, self.losses(self.raw, told, draw)))
         loss = losses.mean()
         if not loss.isfinite():
             raise UserError(
@@ -264,37 +242,10 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                 "lower model.learning_rate"
             )
         self.log("train/loss", loss, prog_bar=True)
-        if self.privileged:
-            loss = loss + self._privileged_loss(seen.observed)
-        return loss if self.unused is None else loss + 0 * self.unused
-
-    def _apart(self, batch: Batch) -> tuple[Batch, Batch | None]:
-        """The windows of a step whose images are looked at, and those whose images are not."""
-        count = max(1, round((1 - self.told) * len(batch.states)))
-        if count >= len(batch.states):
-            return batch, None
-        images = [name for name, feature in self.domain.observed.items() if feature.kind == "image"]
-        unseen = {name: values[count:] for name, values in batch.observed.items() if name not in images}
-        first = Batch(batch.states[:count], batch.concepts[:count], take(batch.observed, slice(count)))
-        return first, Batch(batch.states[count:], batch.concepts[count:], unseen)
-
-    def _told_losses(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """The losses of windows whose images are not looked at."""
-        ((name, _),) = self.privileged.items()
-        told = self.domain.privileged[name].told
-        assert told is not None
-        states, observed = self.raw.perturbed(batch.states, batch.observed, draw)
-        observed = {**observed, READ: told(observed[name], draw)}
-        return self.losses(self.raw, batch._replace(states=states, observed=observed), draw)
-
-    def _privileged_loss(self, observed: Observed) -> Tensor:
-        """How badly what was read of the images in this step tells what they show, weighted."""
-        total = torch.zeros((), device=self.device)
-        for name, weight in self.privileged.items():
-            error = self.domain.privileged[name].error(self._read, observed[name]).mean()
+        for name, error in self.teaching.errors(self.domain, seen.observed).items():
             self.log(f"train/{name}", error)
-            total = total + weight * error
-        return total
+            loss = loss + self.teaching.weights[name] * error
+        return loss if self.unused is None else loss + 0 * self.unused
 
     def optimizer_step(self, *arguments: Any, **options: Any) -> None:
         """Step, then update the running average; here, so that no checkpoint falls between the two."""

@@ -118,16 +118,16 @@ def test_the_odd_one_is_far_above_all_others() -> None:
 
 
 def test_words_follow_the_numbers() -> None:
-    suffice = LeftOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None, 0.2)
+    suffice = LeftOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None, 0.1)
     assert (suffice.covered, suffice.falling) == (2, False)
     told = " ".join(suffice.lines())
     assert "explains 2 of 3, not demonstration 3" in told
     assert "these suffice" in told
-    more = LeftOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2, 0.04)
+    more = LeftOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2, 0.02)
     assert more.falling
-    assert suffice.lines()[-1].startswith("near: those left out have 3.1 times the loss")
+    assert suffice.lines()[-1].startswith("distance: where it is learned from them, they have 3.3 times")
     assert more.far  # without the odd one
-    assert more.lines()[-1].startswith("far: those left out have 11.2 times the loss")
+    assert more.lines()[-1].startswith("far: where it is learned from them, they have 15.0 times")
     assert "odd: demonstration 3, loss 1.90" in " ".join(more.lines())
     assert "more are likely to help" in " ".join(more.lines())
     assert "look at samples" in LeftOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None, 0.2).lines()[-2]
@@ -145,6 +145,7 @@ def test_a_stroke_of_another_kind_is_odd(own: Path) -> None:
     fine = left_out(model.model, good, model.tuned.inversion, 60)
     assert fine.odd is None
     assert sum(fine.left_out) / 5 < 1
+    assert not fine.far
 
 
 def test_the_verb_checks_learns_and_draws(own: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,80 @@
+"""``paper.md``: each table, figure and claim of the paper in its order, beside ours, from ``paper.yaml`` and rows of ``results``.
+
+    python docs/paper.py
+
+A line without rows is an error, so that nothing stands there that was not measured.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
+
+import pandas as pd
+import yaml
+
+from ftl_lightning.evaluation.results import latest, read_rows
+from ftl_lightning.reporting.tables import select, summarise
+from ftl_lightning.tensor_file import write_text
+
+ROOT = Path(__file__).parent.parent
+HEAD = """# The paper, item by item
+
+Each table, figure and claim of *Few-Shot Task Learning through Inverse Generative Modeling* in its order, with the paper's value
+beside ours. *Same*: the same setting. *Other*: the setting differs as said, so that the two numbers are not of the same thing.
+*Not there*: not measured, and why. Ours is the mean ± standard error over tasks, with the standard deviation over seeds. All
+differences stand [together](differences.md).
+"""
+VERDICTS = {"same": "same setting", "other": "other setting", "absent": "not there"}
+
+
+def measured(rows: pd.DataFrame, chosen: Mapping[str, Any], where: str) -> str:
+    """The number behind rows that have these values in their columns.
+
+    Raises:
+        SystemExit: if there are none, or rows of several settings.
+    """
+    found = latest(select(rows, **chosen))
+    number = summarise(found)
+    if number is None:
+        raise SystemExit(f"{where}: expected rows with {dict(chosen)}, found none")
+    for column in ("setting", "metric", "method", "form", "variant", "K", "omega"):
+        if len(set(found[column])) > 1:
+            raise SystemExit(f"{where}: expected rows of one {column}, found {sorted(set(map(str, found[column])))}")
+    return str(number)
+
+
+def section(item: Mapping[str, Any], files: Mapping[str, pd.DataFrame]) -> str:
+    """An item's heading, what it says, its verdict, command, numbers and pictures."""
+    told = [f"## {item['item']}", item["says"], f"**{VERDICTS[item['verdict']].capitalize()}**: {item['why']}."]
+    if "command" in item:
+        told.append("\n".join(f"    {command}" for command in item["command"].split("; ")))
+    if "rows" in item:
+        lines = ["| | paper | ours |", "|---|---|---|"]
+        for name, papers, chosen in item["rows"]:
+            values = {**item.get("all", {}), **chosen}
+            rows = files[values.pop("file")]
+            lines.append(f"| {name} | {papers or '-'} | {measured(rows, values, item['item'] + ', ' + name)} |")
+        told.append("\n".join(lines))
+    for table in item.get("include", ()):
+        told.append(f"```{{include}} ../results/report/{table}\n```")
+    if "look" in item:
+        told.append(item["look"] if item["look"].startswith("!") else f"See {item['look']}.")
+    return "\n\n".join(told)
+
+
+def page() -> str:
+    """The page."""
+    items = yaml.safe_load((ROOT / "docs" / "paper.yaml").read_text(encoding="utf-8"))
+    names = {row[2].get("file", item.get("all", {}).get("file")) for item in items for row in item.get("rows", ())}
+    files = {name: read_rows(ROOT / "results" / name) for name in sorted(names)}
+    counts = Counter(item["verdict"] for item in items)
+    told = ", ".join(f"{counts[verdict]} {text}" for verdict, text in VERDICTS.items())
+    return "\n".join([HEAD, f"{len(items)} items: {told}.", "", *(section(item, files) + "\n" for item in items)])
+
+
+if __name__ == "__main__":
+    write_text(ROOT / "docs" / "paper.md", page())
