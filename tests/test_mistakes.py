@@ -134,7 +134,10 @@ def test_options_of_fit(option: str, expected: str, capsys: Told) -> None:
         ("model.budget.tolerance=nan", "tolerance"),
         ("model.adapter.rank=true", "adapter"),
         ("model.components=1.5", "components"),
-        ("model.budget=null", "key 'model.budget': expected some of samples, restarts, learning_rate, tolerance, found null"),
+        (
+            "model.budget=null",
+            "key 'model.budget': expected some of samples, restarts, screening, learning_rate, tolerance, found null",
+        ),
         ("model.budget.samples=null", "key 'model.budget.samples': expected int, found null"),
         ("model.samples=null", "key 'model.budget.samples': expected int, found null"),
         ("model.modes.sets=null", "key 'model.modes.sets': expected a value, found null"),

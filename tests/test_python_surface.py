@@ -303,7 +303,7 @@ WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
     "True for a count": (lambda of: of.scenes.learn(of.five, adapter=True), "learn: adapter: expected a whole number, found True"),
     "a setting of another name": (
         lambda of: of.scenes.learn(of.five, lr=3),
-        "learn: expected components, omega, form, initial_omega, off_span, initial_spread, restarts, learning_rate, "
+        "learn: expected components, omega, form, initial_omega, off_span, initial_spread, start, restarts, "
         "... (or steps, seed, progress), found 'lr'; model.tuned shows all settings; "
         "did you mean learning_rate?",
     ),

@@ -17,7 +17,7 @@ from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
-from ftl_lightning.learning.inversion import explained, invert
+from ftl_lightning.learning.inversion import Inversion, explained, invert
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.pretrained import load_model
@@ -25,6 +25,9 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.tensor_file import file_hash
 from ftl_lightning.trainer import Trainer
 from tests.conftest import CONF, ROOT, inversion_module
+
+SCREENED = {"start": "concepts", "restarts": 3, "screening": 2}
+"""Three starts, each at another training concept, of which one goes on after two steps."""
 
 
 def learn(tiny: Path, data: InversionData | None = None, **options: Any) -> InversionModule:
@@ -64,7 +67,7 @@ def test_learning_lowers_the_loss(tiny: Path) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"omega": "learned", "components": 3}, {"off_span": 0.1, "restarts": 2, "loss": "v", "timestep_power": 3.0}],
+    [{}, {"omega": "learned", "components": 3}, {"off_span": 0.1, "restarts": 2, "loss": "v", "timestep_power": 3.0}, SCREENED],
     ids=str,
 )
 def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, options: dict[str, Any]) -> None:
@@ -88,6 +91,8 @@ def test_without_a_trainer_the_same_concepts_are_learned_to_the_bit(tiny: Path, 
     [
         ({"components": 0}, r"model\.components: expected 1 or more, found 0"),
         ({"restarts": 0}, r"model\.budget\.restarts: expected 1 or more, found 0"),
+        ({"screening": -1}, r"model\.budget\.screening: expected 0 or more, found -1"),
+        ({"start": "zero"}, r"model\.embeddings\.start: expected mean or concepts, found 'zero'"),
         ({"samples": 0}, r"model\.budget\.samples: expected 1 or more, found 0"),
         ({"off_span": 1.1}, r"model\.embeddings\.off_span: expected 0 \(span\) to 1 \(free\), found 1.1"),
         ({"timestep_power": 0.5}, r"model\.loss\.timestep_power: expected 1 or more, found 0.5"),
@@ -133,6 +138,29 @@ def test_what_is_learned_does_not_depend_on_what_is_learned_beside_it(tiny: Path
     one, other = (learn(tiny, data, form="paper").learned()[name] for data in (together, alone))
     assert one.origin.demonstrations == other.origin.demonstrations
     assert torch.allclose(one.embeddings, other.embeddings, atol=2e-4)
+
+
+def test_restarts_start_at_training_concepts_and_the_best_of_them_goes_on_alone(tiny: Path) -> None:
+    model, steps = load_model(tiny), 5
+    demonstrations = InversionData("object_rearrangement", suite="validation", steps=steps).demonstrations
+    settings = InversionSettings().changed(samples=8, initial_spread=0.0, components=1, **SCREENED)
+    inversion = Inversion(model, demonstrations, settings)
+    starts = inversion.embeddings.detach().clone()[:, 0, 0]
+    assert torch.equal(starts, model.training_embeddings[:3].repeat(len(inversion.concepts), 1))
+    optimizer, _ = inversion.optimizer(steps)
+    runs = []
+    for step in range(steps):
+        losses = inversion.step_losses(step)
+        runs.append(len(losses))
+        optimizer.zero_grad()
+        losses.sum().backward()
+        optimizer.step()
+        inversion.stepped(step)
+    assert runs == [3 * len(inversion.concepts)] * 2 + [len(inversion.concepts)] * 3
+    assert inversion.screened is not None
+    kept = inversion.embeddings[inversion.screened]
+    learned = inversion.learned()
+    assert torch.equal(torch.stack([concept.embeddings for concept in learned.values()]), kept)
 
 
 def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:

@@ -21,7 +21,9 @@ OTHER: Mapping[str, Any] = {
     "initial_omega": 0.7,
     "off_span": 0.5,
     "initial_spread": 0.2,
+    "start": "concepts",
     "restarts": 2,
+    "screening": 3,
     "learning_rate": 0.02,
     "weight_learning_rate": 0.004,
     "samples": 5,
@@ -76,7 +78,7 @@ def test_options_go_from_flat_names_into_groups_and_back() -> None:
     assert OTHER.keys() == INVERSION.keys()
     settings = InversionSettings().changed(**OTHER)
     assert flat(of_groups(settings), INVERSION) == OTHER
-    assert settings.budget == BudgetOptions(samples=5, restarts=2, learning_rate=0.02, tolerance=0.3)
+    assert settings.budget == BudgetOptions(samples=5, restarts=2, screening=3, learning_rate=0.02, tolerance=0.3)
     assert settings.modes == ModeOptions(sets="each", samples=6)
     assert settings.loss == LossOptions(kind="v", timestep_power=2.0)
     usual = InversionSettings()
@@ -103,6 +105,8 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
     module = inversion_module(tiny, **options, components=3, seed=2)
     assert {name: module.hparams[name] for name in INVERSION} == options
     assert set(module.hparams) == {*INVERSION, "pretrained", "components", "omega", "output", "seed", "form"}
+    older = inversion_module(tiny, **{name: value for name, value in options.items() if name not in ("start", "screening")})
+    assert INVERSION.keys() - set(older.hparams) == {"start", "screening"}  # of which older rows know nothing
     fit = PretrainingModule(loss=pretraining.LossOptions(kind="v", discount=0.9), codes=Codes(share=0.5, knots=2))
     found = {"loss": "v", "timestep_power": 1.0, "loss_discount": 0.9, "condition_dropout": 0.1}
     assert {name: fit.hparams[name] for name in PRETRAINING} == found | {
