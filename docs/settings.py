@@ -1,14 +1,18 @@
 """The table of settings in ``differences.md``, written from the configuration files: ``python docs/settings.py``."""
 
+import inspect
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
 from ftl_lightning.configuration import load
+from ftl_lightning.domains.data import InversionData, PretrainingData
 from ftl_lightning.tensor_file import write_text
+from ftl_lightning.tuned import Tuned
 
 PAGE = Path(__file__).parent / "differences.md"
 BEGIN, END = "<!-- settings: begin, written by docs/settings.py -->\n", "<!-- settings: end -->\n"
@@ -20,73 +24,82 @@ DOMAINS = {
     "tabletop": "table-top",
 }
 """Configurations, and what their domains are called."""
-DDPM = ("ddpm", 100, 0.1)
-"""Sampler, steps and temperature where a configuration does not say."""
-
-Keys = Mapping[str, Any]
 
 
-def _args(keys: Keys, part: str) -> Keys:
+@dataclass(frozen=True)
+class Settings:
+    """Of a domain: the keys of ``fit`` and ``invert`` in its configuration, and what they come to with their defaults."""
+
+    fit: Mapping[str, Any]
+    invert: Mapping[str, Any]
+    tuned: Tuned
+
+    @classmethod
+    def of(cls, name: str) -> "Settings":
+        """Of a configuration ``conf/NAME.yaml``."""
+        path = f"conf/{name}.yaml"
+        return cls(load(path, "fit"), load(path, "invert"), Tuned.read(path))
+
+
+def _default(function: Callable[..., Any], name: str) -> Any:
+    return inspect.signature(function).parameters[name].default
+
+
+def _args(keys: Mapping[str, Any], part: str) -> Mapping[str, Any]:
     return keys[part].get("init_args", {})
 
 
-def _network(fit: Keys, invert: Keys) -> str:
-    model = _args(fit, "model")
+def _network(of: Settings) -> str:
+    model = _args(of.fit, "model")
     sizes, unet = model["denoiser_args"], model.get("denoiser") == "TemporalUNet"
     return f"temporal U-Net, width {sizes['width']}" if unet else f"MLP, {sizes['depth']} x {sizes['hidden_dim']}"
 
 
-def _pretraining(fit: Keys, invert: Keys) -> str:
-    return f"{fit['trainer']['max_steps']:,} x {_args(fit, 'data').get('batch_size', 128)}"
+def _pretraining(of: Settings) -> str:
+    size = _args(of.fit, "data").get("batch_size", _default(PretrainingData.__init__, "batch_size"))
+    return f"{of.fit['trainer']['max_steps']:,} x {size}"
 
 
-def _concept(fit: Keys, invert: Keys) -> str:
-    model = _args(invert, "model")
-    parts = [f"K = {model.get('components', 2)}"]
-    if model.get("modes", {}).get("sets", 1) != 1:
+def _concept(of: Settings) -> str:
+    chosen = of.tuned.inversion
+    parts = [f"K = {chosen.components}"]
+    if chosen.modes.sets != 1:
         parts.append("modes")
-    if (knots := model.get("embeddings", {}).get("knots", 1)) != 1:
-        parts.append(f"{knots} knots")
+    if chosen.embeddings.knots != 1:
+        parts.append(f"{chosen.embeddings.knots} knots")
     return ", ".join(parts)
 
 
-def _omega(fit: Keys, invert: Keys) -> str:
-    model = _args(invert, "model")
-    omega, scale = model.get("omega", 1.2), model.get("weights", {}).get("scale", 1)
+def _omega(of: Settings) -> str:
+    omega, scale = of.tuned.inversion.omega, of.tuned.inversion.weights.scale
     return f"{omega}" + (f", times {scale}" if scale != 1 else "")
 
 
-def _training_weight(fit: Keys, invert: Keys) -> str:
-    model = _args(invert, "model")
-    own = model.get("weights", {}).get("training")
-    return str(own) if own is not None else "1" if model.get("omega") == "learned" else str(model.get("omega", 1.2))
+def _training_weight(of: Settings) -> str:
+    own, omega = of.tuned.inversion.weights.training, of.tuned.inversion.omega
+    return f"{own:g}" if own is not None else "1" if omega == "learned" else f"{omega:g}"
 
 
-def _learning(fit: Keys, invert: Keys) -> str:
-    model, budget = _args(invert, "model"), _args(invert, "model").get("budget", {})
-    modes = model.get("modes", {})
-    samples = modes.get("samples", 8) if modes.get("sets", 1) != 1 else budget.get("samples", 32)
-    return f"{_args(invert, 'data').get('steps', 400)} x {samples}"
+def _learning(of: Settings) -> str:
+    chosen = of.tuned.inversion
+    samples = chosen.modes.samples if chosen.modes.sets != 1 else chosen.budget.samples
+    return f"{of.tuned.learning_steps} x {samples}"
 
 
-def _demonstrations(fit: Keys, invert: Keys) -> str:
-    return str(_args(invert, "data").get("demonstrations_per_concept", 5))
+def _demonstrations(of: Settings) -> str:
+    return str(_args(of.invert, "data").get("demonstrations_per_concept", _default(InversionData.__init__, "demonstrations_per_concept")))
 
 
-def _sampler(fit: Keys, invert: Keys) -> str:
-    evaluation = invert.get("evaluation", {})
-    sampler, steps, temperature = (
-        evaluation.get(name, usual) for name, usual in zip(("sampler", "steps", "temperature"), DDPM, strict=True)
-    )
-    return f"{sampler}, {steps} steps, {temperature}"
+def _sampler(of: Settings) -> str:
+    sampling = of.tuned.sampling
+    return f"{sampling.sampler}, {sampling.steps} steps, {sampling.temperature}"
 
 
-def _followed(fit: Keys, invert: Keys) -> str:
-    evaluation = invert.get("evaluation", {})
-    return str(evaluation["replan"]) if evaluation.get("closed_loop") else "-"
+def _followed(of: Settings) -> str:
+    return str(of.tuned.replan) if of.invert.get("evaluation", {}).get("closed_loop") else "-"
 
 
-ROWS: tuple[tuple[str, Callable[[Keys, Keys], str], str], ...] = (
+ROWS: tuple[tuple[str, Callable[[Settings], str], str], ...] = (
     ("network", _network, "MLP; temporal U-Net of width 128 in all domains but object rearrangement; ResNet-18 for images"),
     ("pretraining: steps x windows", _pretraining, "not said"),
     ("form of a concept", _concept, "K = 2, one set, alike at all times"),
@@ -102,9 +115,9 @@ ROWS: tuple[tuple[str, Callable[[Keys, Keys], str], str], ...] = (
 
 def table() -> str:
     """Markdown: a column for each domain, the paper's last."""
-    keys = {name: (load(f"conf/{name}.yaml", "fit"), load(f"conf/{name}.yaml", "invert")) for name in DOMAINS}
+    domains = [Settings.of(name) for name in DOMAINS]
     lines = [["", *DOMAINS.values(), "the paper"], ["---"] * (len(DOMAINS) + 2)]
-    lines += [[name, *(says(*one) for one in keys.values()), papers] for name, says, papers in ROWS]
+    lines += [[name, *(says(one) for one in domains), papers] for name, says, papers in ROWS]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 

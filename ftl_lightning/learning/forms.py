@@ -115,7 +115,7 @@ def _with_modes(
     tell: Tell,
 ) -> dict[str, Concept]:
     """The first concepts with one set for each demonstration, learned without stopping: what samples are like depends on them."""
-    alone = settings.changed(form=PAPER, modes=1, adapter=0, restarts=1, samples=MODE_SAMPLES, tolerance=None)
+    alone = settings.from_one_start(form=PAPER, modes=1, adapter=0, samples=MODE_SAMPLES, tolerance=None)
     sets = learned_from(model, demonstrations, [[row] for row in range(len(demonstrations))], alone, min(steps, MODE_STEPS), tell)
     found = {}
     for name, concept in first.items():
@@ -131,8 +131,8 @@ def _adapted(
     """Concepts of one set and an adapter; or of mixtures that share one, and of a single demonstration there are none."""
     own = settings.adapter
     rank, rate = (own.rank, own.learning_rate) if own.rank else (RANK, RATE)
-    changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None, "restarts": 1}
-    found = invert(model, demonstrations, settings.changed(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
+    changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
+    found = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
     return {
         name: replace(concept, modes=replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes))))
         if concept.modes
@@ -247,7 +247,7 @@ def _chosen(
             forms[name][MIXED], qualities[name][MIXED] = _narrowed(model, own[name], concept, settings.seed)
     span: Mapping[str, Concept] = {}
     if composable := [name for name, share in shares.items() if share.composes]:
-        span = invert(model, _of(demonstrations, composable), _one_set(settings, off_span=0.0, restarts=1), steps, tell)
+        span = invert(model, _of(demonstrations, composable), _one_set(settings.from_one_start(), off_span=0.0), steps, tell)
     for name in several:
         form, because = _choice(shares[name], qualities[name])
         composing = None

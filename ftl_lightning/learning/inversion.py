@@ -224,6 +224,8 @@ class Inversion(nn.Module):
         if self.screened is not None and step + 1 == self.settings.budget.screening:
             losses = self._held_out(self.embeddings, self.weights, None).unflatten(0, (-1, self.settings.budget.restarts))
             self.screened = functional.one_hot(losses.argmin(dim=1), losses.shape[1]).bool().flatten()
+            if self.stopping is not None:
+                self.stopping.going &= self.screened  # or nothing would be left to step once the others stop
         return self.stopping is None or self.stopping.stepped(step, self.embeddings, self.weights, self._held_out)
 
     @torch.no_grad()

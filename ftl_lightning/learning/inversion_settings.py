@@ -233,6 +233,10 @@ class InversionSettings:
         unsaid = self.form == UNSAID and self.modes.sets == 1 and not self.adapter.rank
         return replace(self, form=AUTO) if unsaid and choose else self
 
+    def from_one_start(self, **options: Any) -> Self:
+        """The same with one start, at the mean of the training embeddings, and some options changed, see :meth:`changed`."""
+        return self.changed(start=MEAN, restarts=1, screening=0, **options)
+
     def changed(self, **options: Any) -> Self:
         """The same with some options changed, which are given by their flat names (:data:`ftl_lightning.regrouped.INVERSION`)."""
         return replaced(self, options, INVERSION)

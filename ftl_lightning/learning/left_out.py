@@ -128,11 +128,10 @@ def learned_from(
 
 def quickly(settings: InversionSettings) -> InversionSettings:
     """The same for sets of embeddings that only have to tell good from bad."""
-    return settings.changed(
+    return settings.from_one_start(
         form=PAPER,
         modes=1,
         adapter=0,
-        restarts=1,
         samples=min(settings.budget.samples, SAMPLES),
         tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
         guidance_scale=1.0,  # it is for generating, not for explaining

@@ -19,6 +19,7 @@ from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.inversion import Inversion, explained, invert
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
+from ftl_lightning.learning.left_out import quickly
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
@@ -161,6 +162,25 @@ def test_restarts_start_at_training_concepts_and_the_best_of_them_goes_on_alone(
     kept = inversion.embeddings[inversion.screened]
     learned = inversion.learned()
     assert torch.equal(torch.stack([concept.embeddings for concept in learned.values()]), kept)
+
+
+def test_after_screening_an_inversion_ends_when_those_that_go_on_have_stopped(tiny: Path) -> None:
+    demonstrations = InversionData("object_rearrangement", suite="validation", steps=60).demonstrations
+    settings = InversionSettings().changed(samples=8, components=1, tolerance=0.9, **SCREENED)
+    inversion = Inversion(load_model(tiny), demonstrations, settings)
+    assert inversion.stopping is not None
+    for step in range(60):
+        assert inversion.step_losses(step).isfinite().all()
+        if not inversion.stepped(step):
+            break
+    assert step < 59  # nothing moves without an optimizer, so rounds of ten steps gain nothing
+    assert inversion.screened is not None and not inversion.stopping.going.any()
+
+
+def test_from_one_start_settings_start_at_the_mean() -> None:
+    settings = InversionSettings().changed(tolerance=0.1, **SCREENED)
+    assert settings.from_one_start(samples=3) == InversionSettings().changed(tolerance=0.1, samples=3)
+    assert quickly(settings).budget.screening == 0 and quickly(settings).embeddings.start == "mean"
 
 
 def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
