@@ -92,7 +92,7 @@ class LeftOut:
         more = f"more: loss of those left out {curve}; it {verdict}" if curve else ""
         times = f"where it is learned from them, they have {self.distance:.1f} times the loss of what the model generates"
         near = f"distance: {times} (from {FAR:.0f} on: far from anything pretrained)"
-        far = f"far: {times}: nothing pretrained is like this; samples are likely to do something else"
+        far = f"far: {times}: nothing pretrained is like this; look at samples, they may do something else"
         return [told, *([odd] if count > 2 else []), more, far if self.far else near]
 
 
