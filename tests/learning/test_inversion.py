@@ -174,13 +174,15 @@ def test_after_screening_an_inversion_ends_when_those_that_go_on_have_stopped(ti
         if not inversion.stepped(step):
             break
     assert step < 59  # nothing moves without an optimizer, so rounds of ten steps gain nothing
-    assert inversion.screened is not None and not inversion.stopping.going.any()
+    assert inversion.screened is not None
+    assert not inversion.stopping.going.any()
 
 
 def test_from_one_start_settings_start_at_the_mean() -> None:
     settings = InversionSettings().changed(tolerance=0.1, **SCREENED)
     assert settings.from_one_start(samples=3) == InversionSettings().changed(tolerance=0.1, samples=3)
-    assert quickly(settings).budget.screening == 0 and quickly(settings).embeddings.start == "mean"
+    assert quickly(settings).budget.screening == 0
+    assert quickly(settings).embeddings.start == "mean"
 
 
 def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
