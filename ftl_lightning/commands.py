@@ -176,14 +176,20 @@ def ablate(
     run_ablation(stages, seeds, results, shard, executor, root)
 
 
-def report(results: str = "results", out: str = "results/report", readme: str = "") -> None:
-    """Tables and figures from results, beside the paper's numbers.
+def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
+    """Tables and figures from results, beside the paper's numbers; or one page to watch.
 
     Args:
         results: a results file, or a folder of them.
         out: folder for Markdown, LaTeX and figures.
         readme: a Markdown file to update between its marks.
+        html: a file to write a page to, in place of all these: overview, films, concepts and curves, without a network.
     """
+    if html:
+        from ftl_lightning.reporting.html.page import write_page
+
+        say(f"{html}: {write_page(Path(results), Path(html)) / 1e6:.1f} MB")
+        return
     from ftl_lightning.reporting.report import write_report
 
     say(write_report(Path(results), Path(out), Path(readme) if readme else None))

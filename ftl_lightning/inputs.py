@@ -70,6 +70,7 @@ TRAINER: Mapping[str, Check] = {
     "ckpt_path": _checkpoint,
     "model.output": _written("model.output", expect_writable_folder),
     "evaluation.results": _added("evaluation.results"),
+    "evaluation.films": _written("evaluation.films"),
 }
 """Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
 _COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _file("demonstrations")}
@@ -81,7 +82,7 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "encode": _OUT,
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
-    "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT)},
+    "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},
     "prepare": _FOLDER,
     "study": {**_FOLDER, "consent": _file("text", MOST_TEXT)},
 }

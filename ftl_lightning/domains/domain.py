@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import gymnasium
     from matplotlib.figure import Figure
 
+    from ftl_lightning.domains.vector_film import VectorFilm
     from ftl_lightning.domains.wireframe import Wireframe
 
 ACCURACY = "accuracy"
@@ -171,6 +172,8 @@ class Show:
         film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is not a motion.
         wireframe: ``states (horizon, state) -> moving points and lines``, from which a web page draws the same film in a twentieth
             of its size; ``None`` where a plan cannot be drawn in this way.
+        vector_film: ``(states (horizon, state), initial state or None) -> shapes that move``, which ``report --html`` shows;
+            ``None`` for those of the wireframe, if there is one.
         beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title) -> figure`` of both on one scale;
             ``None`` for one picture above the other.
         exports: by the ending of a file, such as ``'.bvh'``, ``states (horizon, state) -> text`` of one plan for other programs
@@ -180,6 +183,7 @@ class Show:
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
     wireframe: Callable[[Tensor], "Wireframe"] | None = None
+    vector_film: "Callable[[Tensor, InitialStates | None], VectorFilm] | None" = None
     beside: Callable[[Tensor, Tensor, str], "Figure"] | None = None
     exports: Mapping[str, Callable[[Tensor], str]] = field(default_factory=dict)
 
@@ -190,7 +194,8 @@ def line_drawings(plans: Plans) -> Show:
     Paths in two or three dimensions are also filmed.
     """
     film = line_plots.film if len(plans.columns) in (2, 3) else None
-    return Show(line_plots.picture(plans.columns), film, beside=line_plots.beside(plans.columns))
+    drawn = line_plots.path_film if len(plans.columns) == 2 else line_plots.line_film
+    return Show(line_plots.picture(plans.columns), film, vector_film=drawn, beside=line_plots.beside(plans.columns))
 
 
 Policy = Callable[[Observed, list[int], int], Tensor]
@@ -210,7 +215,8 @@ class ClosedLoop:
         judge: ``(goal, rollout) -> outcomes`` by name, each ``(episode,)``. One of them is ``'success'``, of bool.
         film: ``(rollout of one episode, plans (step, horizon, state) that were followed) -> frames``; ``None`` where episodes are
             not filmed.
-        keeps: names of the observed features that ``judge`` and ``film`` need; all where empty.
+        vector_film: ``rollout of one episode -> shapes that move``, which ``report --html`` shows; ``None`` for no film.
+        keeps: names of the observed features that ``judge`` and films need; all where empty.
         less_is_better: names of the outcomes of which a smaller value is better, such as ``'crash'``.
         identity: what outcomes depend on besides the code, such as the planner's name. It is part of the configuration's hash; may
             be empty.
@@ -227,6 +233,7 @@ class ClosedLoop:
     steps: int
     judge: Callable[[str, Rollout], dict[str, Tensor]]
     film: Callable[[Rollout, Tensor], Frames] | None = None
+    vector_film: "Callable[[Rollout], VectorFilm] | None" = None
     keeps: tuple[str, ...] = ()
     less_is_better: tuple[str, ...] = ()
     identity: str = ""

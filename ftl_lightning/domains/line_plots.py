@@ -1,5 +1,6 @@
 """Pictures and films of behaviour known by its columns alone: paths in two or three dimensions, or lines over time."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
 from ftl_lightning.escape import figure_text
 
 if TYPE_CHECKING:  # half a second of import, for what is drawn later
@@ -121,3 +123,36 @@ def film(states: Tensor) -> list[NDArray[np.uint8]]:
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return pictures
+
+
+SECONDS = 3.0
+"""A film of a plan takes, whatever a step of it means."""
+COLOURS = ("#3f6fb5", "#e4704a", "#4c9f70", "#8a63b3", "#c9a227", "#5b5b5b")
+
+
+def path_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
+    """A path ``(horizon, 2)`` that is drawn step by step."""
+    plan = states.numpy().astype(np.float32)
+    limits = _limits(plan.min(axis=0).tolist(), plan.max(axis=0).tolist())
+    (left, right), (low, high) = limits["xlim"], limits["ylim"]
+    times = some(len(plan), MAX_FRAMES)
+    moving, size = plan[times][:, None], right - left
+    shapes = (
+        still("line", plan, "#c9ced4", 0.008 * size),
+        Shape("way", moving, PATH, 0.02 * size),
+        Shape("dots", moving, START, 0.025 * size),
+    )
+    return VectorFilm(shapes, (left, low, right - left, high - low), len(times) / SECONDS)
+
+
+def line_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
+    """Columns over time ``(horizon, state)``, all on one scale from 0 to 1, drawn step by step."""
+    plan = states.numpy().astype(np.float32)
+    low, high = _room(float(plan.min()), float(plan.max()))
+    times = some(len(plan), MAX_FRAMES)
+    across = np.linspace(0, 1, len(plan), dtype=np.float32)[times]
+    shapes = [
+        Shape("way", np.stack((across, (column - low) / (high - low)), axis=-1)[:, None].astype(np.float32), colour, 0.01)
+        for column, colour in zip(plan[times].T, itertools.cycle(COLOURS), strict=False)
+    ]
+    return VectorFilm(shapes, (0.0, 0.0, 1.0, 1.0), len(times) / SECONDS)

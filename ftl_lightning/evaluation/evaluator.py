@@ -17,12 +17,14 @@ from ftl_lightning.errors import UserError, short
 from ftl_lightning.evaluation.diversity import lines, real_behaviour
 from ftl_lightning.evaluation.drawing import draw
 from ftl_lightning.evaluation.evaluable import Evaluable
+from ftl_lightning.evaluation.films import write_films
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import log_projector, log_test, setting_means
+from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_count
 
 _LOG = logging.getLogger(__name__)
@@ -42,6 +44,8 @@ class Evaluator(pl.Callback):
             for all but the user's own demonstrations.
         diversity: also measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.diversity`; adds rows and
             changes none.
+        films: JSON file to which films of the first :data:`~ftl_lightning.evaluation.films.FILMED` samples or episodes of each task
+            are written when testing, for ``report --html``; ``None`` for none.
         variant: what tables tell of this run beside the method's name, in place of the method's own words.
         **generation: how behaviour is generated: the attributes of :class:`~ftl_lightning.evaluation.generation.Generation`, which
             are keys of a configuration beside the others.
@@ -55,6 +59,7 @@ class Evaluator(pl.Callback):
         results: str | None = None,
         references: bool | None = None,
         diversity: bool = True,
+        films: str | None = None,
         variant: str | None = None,
         **generation: Any,
     ) -> None:
@@ -66,6 +71,7 @@ class Evaluator(pl.Callback):
         self.results = results
         self.references = references
         self.diversity = diversity
+        self.films = films
         self.variant = variant
         self.judged: list[Judged] = []
         self._projected = False
@@ -137,6 +143,9 @@ class Evaluator(pl.Callback):
         beside = self._compare(module, data) if self.judged else {}
         measured = rows(module, module.domain, self.judged, beside, configured, self.variant)
         record(measured, self.results, trainer.log_dir or trainer.default_root_dir)  # before anything is drawn, which may fail
+        if self.films and trainer.is_global_zero:
+            count = write_films(self.films, module.domain, self.judged, beside, measured)
+            say(f"{self.films}: {count} films")
         for logger in _boards(trainer):
             self._draw(logger, module.domain, trainer.global_step)
             self._project(logger, module, trainer.global_step)

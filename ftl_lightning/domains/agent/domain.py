@@ -196,6 +196,7 @@ DOMAIN = Domain(
         steps=MAX_STEPS,
         judge=reached,
         film=deferred(f"{RENDERING}:film"),
+        vector_film=deferred(f"{RENDERING}:vector_film"),
         expect=expect_simulator,
     ),
     distance=distance,

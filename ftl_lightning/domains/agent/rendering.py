@@ -12,10 +12,15 @@ from ftl_lightning.demonstrations.features import InitialStates, expect_starts
 from ftl_lightning.domains.agent.dynamics import expect_simulator
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
 from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.vector_film import Shape, VectorFilm, regular, some, still
 from ftl_lightning.escape import figure_text
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
 """A bowl is an open triangle that points down."""
+CORNERS = {"cone": (3, np.pi / 2), "cube": (4, np.pi / 4)}
+"""Of shapes with corners: how many, and at which angle one is."""
+SEEN = (-2.1, 2.1), (-4.8, -2.8)
+"""x and z that pictures show."""
 MAX_COLUMNS = 4
 FRAMES = 40
 """At most, of an episode."""
@@ -53,9 +58,15 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
     x, z = plan[:, list(PLANE)].T.tolist()
     axes.plot(x, z, color="#303030", linewidth=1)
     axes.plot(initial[0].item(), initial[2].item(), "^", color="#c79a2b", markersize=7)
-    axes.set(xlim=(-2.1, 2.1), ylim=(-4.8, -2.8), xticks=[], yticks=[], aspect="equal")
+    axes.set(xlim=SEEN[0], ylim=SEEN[1], xticks=[], yticks=[], aspect="equal")
     for spine in axes.spines.values():
         spine.set(color=frame, linewidth=2.0)
+
+
+def _end(observations: Tensor) -> int:
+    """After how many of the steps ``(step, 52)`` nothing moves any more."""
+    moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
+    return int(moving.nonzero().max()) + 2 if moving.any() else 1
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
@@ -67,9 +78,7 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
     observations = rollout.observed[OBSERVED][0]
-    moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
-    end = int(moving.nonzero().max()) + 2 if moving.any() else 1
-    times = np.linspace(0, end - 1, min(end, FRAMES)).round().astype(int)  # the first and the last are among them
+    times = some(_end(observations), FRAMES)
     environment = AgentEnvironment()
     pictures = []
     for time in times:
@@ -77,3 +86,28 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         pictures.append(environment.render())
     environment.close()
     return pictures
+
+
+SIZE = 0.1
+"""Half the width of a body in metres."""
+AGENT = "#c79a2b"
+STEPS_A_SECOND = 30.0
+
+
+def vector_film(rollout: Rollout) -> VectorFilm:
+    """An episode from above, until nothing moves any more, four times as fast as it was."""
+    observations = rollout.observed[OBSERVED][0]
+    times = some(_end(observations), FRAMES)
+    agent = observations[times][:, list(PLANE)].numpy()[:, None]
+    shapes = []
+    for (colour, shape), at in zip(looks(observations[0].tolist()), object_positions(observations[:1])[0].numpy(), strict=True):
+        place, shade = at[list(PLANE)], "#{:02x}{:02x}{:02x}".format(*COLOURS[colour])
+        shapes.append(still("line", regular(48, REACH)[[*range(48), 0]] + place, "#a8adb3", 0.01))
+        if shape in CORNERS:
+            corners, turn = CORNERS[shape]
+            shapes.append(still("area", regular(corners, 1.35 * SIZE, turn) + place, shade))
+        else:
+            shapes.append(Shape("dots", place[None, None].astype(np.float32), shade, SIZE, filled=shape == "sphere"))
+    shapes += [Shape("way", agent, AGENT, 0.025), Shape("dots", agent, AGENT, 0.07)]
+    (left, right), (low, high) = SEEN
+    return VectorFilm(shapes, (left, low, right - left, high - low), STEPS_A_SECOND * len(times) / max(_end(observations), 1))

@@ -158,6 +158,7 @@ DOMAIN = Domain(
         steps=MAX_STEPS,
         judge=judge,
         film=deferred(f"{RENDERING}:film"),
+        vector_film=deferred(f"{RENDERING}:vector_film"),
         less_is_better=("crash",),
         policies=policies.POLICIES,
         expect=expect_simulator,

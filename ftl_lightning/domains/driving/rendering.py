@@ -15,10 +15,13 @@ from torch import Tensor
 from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts, take
 from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, decision_seconds, expect_simulator
 from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
 from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
 EGO, OTHER, ROAD, PLAN = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a"
+MARK = "#f4f4f4"
+"""Of the middle of a lane."""
 RIGHT, WRONG = "#2e9e46", "#d03a3a"
 LENGTH, WIDTH, LANE = 5.0, 2.0, 4.0
 """Metres: of a vehicle, and a lane's width."""
@@ -115,6 +118,12 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     return figure
 
 
+def _end(observations: Tensor) -> int:
+    """After how many of the decisions ``(decision, vehicle * 7)`` nothing moves any more."""
+    moving = (observations[1:, 1:3] - observations[:-1, 1:3]).abs().amax(dim=1) > 0
+    return int(moving.nonzero().max()) + 2 if moving.any() else 1
+
+
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     """Pictures ``(height, width, 3)`` of an episode, one a decision, until nothing moves any more.
 
@@ -123,8 +132,7 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     """
     episode = take(rollout.observed, 0)
     observations = episode[TRAFFIC]
-    moving = (observations[1:, 1:3] - observations[:-1, 1:3]).abs().amax(dim=1) > 0
-    end = int(moving.nonzero().max()) + 2 if moving.any() else 1
+    end = _end(observations)
     ways = observations[:end, 1:3].numpy()
     planned = plans[:end, :, 1:3].reshape(-1, 2).numpy()
     near = np.clip(planned[np.isfinite(planned).all(axis=1)], ways.min(axis=0) - PLAN_REACH, ways.max(axis=0) + PLAN_REACH)
@@ -145,3 +153,54 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return pictures
+
+
+PLAYED = 2.0
+"""Films of shapes play so many times as fast as one drives."""
+
+
+FAR = 100.0
+"""Metres of road that films of shapes have around what moves, of which a page shows some."""
+SAME = 12.0
+"""Metres from where a vehicle was expected within which it is taken for the same one."""
+
+
+def vector_film(rollout: Rollout) -> VectorFilm:
+    """An episode from above, a frame a decision, until nothing moves any more; roads in grey, the controlled vehicle in green."""
+    episode = take(rollout.observed, 0)
+    name = NAMES[int(episode[SCENARIO][0].item())]
+    traffic = episode[TRAFFIC][: _end(episode[TRAFFIC])].unflatten(1, (VEHICLES, -1)).numpy()
+    low, high = _window(traffic[:, 0, 1:3])
+    near = [lane[((lane > low - FAR) & (lane < high + FAR)).all(axis=1)] for lane in _lanes(name)]
+    lanes = [lane * (1, -1) for lane in near if len(lane) > 1]
+    roads = [still("line", lane, colour, size) for colour, size in ((ROAD, LANE), (MARK, 0.3)) for lane in lanes]
+    others = [Shape("area", _corners(seen), OTHER) for seen in _followed(traffic[:, 1:], decision_seconds(name))]
+    way = Shape("way", (traffic[:, :1, 1:3] * (1, -1)).astype(np.float32), EGO, 0.6)
+    window = (float(low[0]), float(-high[1]), float(high[0] - low[0]), float(high[1] - low[1]))
+    shapes = (*roads, way, *others, Shape("area", _corners(traffic[:, 0]), EGO))
+    return VectorFilm(shapes, window, PLAYED / decision_seconds(name))
+
+
+def _corners(seen: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of a vehicle ``(decision, 7)`` its outline ``(decision, 4, 2)``, not finite where it is not present."""
+    present, x, y, _, _, cos, sin = (column[:, None] for column in seen.T)
+    along, aside = np.array((1, 1, -1, -1)) * LENGTH / 2, np.array((1, -1, -1, 1)) * WIDTH / 2
+    corners = np.stack((x + cos * along - sin * aside, -(y + sin * along + cos * aside)), axis=-1)
+    return np.where(present[..., None] > 0, corners, np.nan).astype(np.float32)
+
+
+def _followed(traffic: NDArray[np.float32], seconds: float) -> list[NDArray[np.float32]]:
+    """Each vehicle by itself ``(decision, 7)``; observed are the nearest ``(decision, vehicle, 7)``, in an order that changes."""
+    known: list[NDArray[np.float32]] = []
+    for time, seen in enumerate(traffic):
+        left = [vehicle for vehicle in seen if vehicle[0] > 0]
+        for one in known:
+            before = one[time - 1]
+            expected = before[1:3] + seconds * before[3:5]
+            away = [float(np.linalg.norm(vehicle[1:3] - expected)) for vehicle in left] if before[0] > 0 else []
+            if away and min(away) < SAME:
+                one[time] = left.pop(int(np.argmin(away)))
+        for vehicle in left:
+            known.append(np.zeros((len(traffic), seen.shape[1]), dtype=np.float32))
+            known[-1][time] = vehicle
+    return known

@@ -54,6 +54,7 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
     return path_distance(states[..., CENTRES], others[..., CENTRES])
 
 
+RENDERING = "ftl_lightning.domains.object_rearrangement.rendering"
 DOMAIN = Domain(
     name=NAME,
     plans=PLANS,
@@ -67,7 +68,7 @@ DOMAIN = Domain(
     ),
     source=lambda root: Generated(NAME, PLANS, TRAINING_CONCEPTS, lambda task, count, seed: generate(task, count, seed)[:, None]),
     metrics={ACCURACY: Metric(succeeded)},
-    show=Show(deferred("ftl_lightning.domains.object_rearrangement.rendering:render")),
+    show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:vector_film")),
     references={
         "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
         "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],

@@ -1,7 +1,9 @@
 """Pictures of scenes, framed green where the task holds and red where it does not (as in the paper's figures)."""
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, RegularPolygon
@@ -9,11 +11,14 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
+from ftl_lightning.domains.vector_film import VectorFilm, regular, still
 from ftl_lightning.escape import figure_text
 
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
 CORNERS = {"triangle": 3, "square": 4}
 MAX_COLUMNS = 8
+MARGIN = 1.0
+"""The largest radius."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None = None) -> Figure:
@@ -45,7 +50,19 @@ def _scene(axes: Axes, state: Tensor, frame: str) -> None:
             axes.add_patch(RegularPolygon((x, y), CORNERS[shape], radius=size, orientation=angle, color=colour))
         else:
             axes.add_patch(Circle((x, y), size, color=colour))
-    margin = 1.0  # the largest radius
-    axes.set(xlim=(-margin, EXTENT + margin), ylim=(-margin, EXTENT + margin), xticks=[], yticks=[], aspect="equal")
+    axes.set(xlim=(-MARGIN, EXTENT + MARGIN), ylim=(-MARGIN, EXTENT + MARGIN), xticks=[], yticks=[], aspect="equal")
     for spine in axes.spines.values():
         spine.set(color=frame, linewidth=2.5)
+
+
+def vector_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
+    """A scene ``(1, 21)``, which does not move."""
+    shapes = []
+    for shape, (x, y, radius, angle, *_) in zip(SHAPES, states[0].unflatten(0, (len(SHAPES), PER_SHAPE)).tolist(), strict=True):
+        size = max(radius, 0.0)
+        if shape in CORNERS:
+            turned = math.pi / 2 + angle  # as matplotlib, whose polygons begin at the top
+            shapes.append(still("area", regular(CORNERS[shape], size, turned) + np.array((x, y)), COLOURS[shape]))
+        else:
+            shapes.append(still("dots", [(x, y)], COLOURS[shape], size))
+    return VectorFilm(shapes, (-MARGIN, -MARGIN, EXTENT + 2 * MARGIN, EXTENT + 2 * MARGIN), 1.0)

@@ -106,6 +106,7 @@ _LOOP = ClosedLoop(
     steps=MAX_STEPS,
     judge=judge,
     film=deferred(f"{RENDERING}:film"),
+    vector_film=deferred(f"{RENDERING}:vector_film"),
     keeps=(POSE,),
     less_is_better=("book moved",),
     policies=POLICIES,

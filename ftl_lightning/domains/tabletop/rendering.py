@@ -11,9 +11,10 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop.interface import THRESHOLD, expect_simulator
-from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, SIGHT, WHITE, outlines
-from ftl_lightning.domains.tabletop.world import COLOUR, FRONT
+from ftl_lightning.domains.tabletop.interface import POSE, THRESHOLD, expect_simulator
+from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines
+from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, FRONT, TABLE_COLOUR
+from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
 from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS = 4
@@ -93,3 +94,60 @@ def _with_plan(picture: NDArray[np.uint8], plan: NDArray[np.float32]) -> NDArray
         if 1 <= x < width - 1 and 1 <= y < height - 1:
             drawn[y - 1 : y + 2, x - 1 : x + 2] = _OPEN if opening > THRESHOLD else _CLOSED
     return drawn
+
+
+DEPTH = 0.45
+"""Of how far behind something is, so much of upwards in films of shapes."""
+LAYERS = 4
+"""Outlines above one another that an object is drawn by."""
+SHAPE_FRAMES, SPEED = 50, 2.0
+"""At most, of films of shapes, and how many times as fast as it was they play."""
+HAND = "#5a5f66"
+
+
+def vector_film(rollout: Rollout) -> VectorFilm:
+    """An episode from the front, objects as layers above one another, the gripper as its two fingers."""
+    from ftl_lightning.domains.tabletop.environment import HERTZ
+
+    trace = np.stack(rollout.infos[0]["trace"]) if rollout.infos[0].get("trace") else np.zeros((1, 0))
+    scene = rollout.starts.require_scenes()[0].numpy()
+    times = some(len(trace), SHAPE_FRAMES)
+    hand = rollout.observed[POSE][0].numpy()[times]
+    (low, high), (left, right) = SIGHT  # y grows to the right from the front
+    table = [(low, right), (low, left), (high, left), (high, right)]
+    shapes = [still("area", _front(np.array([(*corner, 0.0) for corner in table])), _hex(TABLE_COLOUR, 1.25))]
+    present = [name for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5]
+    poses = dict(zip(present, np.split(trace[times, len(ARM) + len(FINGERS) :], max(len(present), 1), axis=1), strict=False))
+    for name in sorted(poses, key=(BOOK, WHITE).__contains__, reverse=True):  # what lies on the book is drawn after it
+        turned = [outline(name, x, y, _yaw(turn)) for (x, y, _, *turn) in poses[name]]
+        foot = poses[name][:, 2] - HEIGHT[name] / 2
+        for layer in range(LAYERS):
+            height = foot + HEIGHT[name] * layer / (LAYERS - 1)
+            corners = [np.column_stack((edge, np.full(len(edge), z))) for edge, z in zip(turned, height, strict=True)]
+            points = np.stack([_front(each) for each in corners]).astype(np.float32)
+            shapes.append(Shape("area", points, _hex(COLOUR[name], 0.75 if layer < LAYERS - 1 else 1.0)))
+    shapes.append(Shape("dots", _front(hand[:, :3] * (1, 1, 0))[:, None].astype(np.float32), _hex(TABLE_COLOUR, 0.8), 0.008))
+    for side in (-0.5, 0.5):
+        tip = hand[:, :3] + np.outer(hand[:, 7] + 0.012, (0, side, 0))
+        finger = np.stack((_front(tip), _front(tip + np.array((0, 0, 0.06)))), axis=1)
+        shapes.append(Shape("line", finger.astype(np.float32), HAND, 0.01))
+    window = (left, DEPTH * (FAR - high), right - left, DEPTH * (high - low) + 0.2)
+    return VectorFilm(shapes, window, SPEED * HERTZ * len(times) / max(len(trace), 1))
+
+
+FAR = 0.78
+"""x of what is drawn at height 0."""
+
+
+def _front(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Where places ``(..., 3)`` in metres are seen from the front, obliquely: ``(..., 2)``, to the right and upwards."""
+    return np.stack((points[..., 1], points[..., 2] + DEPTH * (FAR - points[..., 0])), axis=-1)
+
+
+def _yaw(quaternion: Sequence[float]) -> float:
+    x, y, z, w = quaternion
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def _hex(colour: Sequence[float], light: float) -> str:
+    return "#" + "".join(f"{min(round(255 * part * light), 255):02x}" for part in colour)

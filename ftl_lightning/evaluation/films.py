@@ -1,0 +1,115 @@
+"""Films of an evaluation in a file of shapes, with the rows that they belong to: what ``report --html`` shows."""
+
+import base64
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.vector_film import Shape, VectorFilm, of_wireframe
+from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.results import METHOD, Row
+from ftl_lightning.tensor_file import write_text
+
+FILMED = 4
+"""Samples or episodes of each task, the first."""
+FORMAT = 1
+STEPS, ABSENT = 10_000, -32_768
+"""Steps of a coordinate across the window's width, and the number of a point that is not there."""
+
+
+def film_of(behaviour: Judged, domain: Domain, number: int) -> VectorFilm | None:
+    """The film of an episode, or of a plan that was not executed; ``None`` where the domain draws none."""
+    loop = domain.closed_loop
+    if behaviour.rollout is not None and loop is not None:
+        return loop.vector_film(behaviour.rollout.take(number, number + 1)) if loop.vector_film else None
+    states = behaviour.states[number]
+    if not states.isfinite().all():
+        return None
+    if domain.show.vector_film is not None:
+        return domain.show.vector_film(states, None if behaviour.starts is None else behaviour.starts.take([number]))
+    return of_wireframe(domain.show.wireframe(states)) if domain.show.wireframe is not None else None
+
+
+def write_films(
+    path: str | Path, domain: Domain, judged: Sequence[Judged], references: Mapping[str, Sequence[Judged]], rows: Sequence[Row]
+) -> int:
+    """Write the films of an evaluation.
+
+    Args:
+        path: of a JSON file.
+        domain: that draws.
+        judged: what the method did.
+        references: what reference lines did, by name.
+        rows: of the evaluation, which say what each film is of.
+
+    Returns:
+        How many there are.
+    """
+    shapes: dict[str, int] = {}  # roads and tables are the same in many films
+    films = []
+    sources = [(None, judged), *references.items()]
+    for name, behaviours in sources:
+        for behaviour in behaviours:
+            own = [
+                row
+                for row in rows
+                if (row.setting, row.task) == (behaviour.task.setting, behaviour.task.name)
+                and (row.role == METHOD if name is None else row.method == name)
+            ]
+            if not own:
+                continue
+            values = {row.metric: row.value for row in own}
+            told = {key: value for key, value in asdict(own[0]).items() if key not in ("metric", "value")}
+            drawn = [_entry(behaviour, domain, number, shapes) for number in range(min(FILMED, len(behaviour.states)))]
+            if found := [entry for entry in drawn if entry]:
+                films.append({"row": told, "values": values, "goal": behaviour.task.goal, "films": found})
+    text = json.dumps({"format": FORMAT, "domain": domain.name, "shapes": [json.loads(one) for one in shapes], "tasks": films})
+    write_text(Path(path), text + "\n")
+    return sum(len(task["films"]) for task in films)
+
+
+def _entry(behaviour: Judged, domain: Domain, number: int, shapes: dict[str, int]) -> dict[str, Any] | None:
+    film = film_of(behaviour, domain, number)
+    if film is None:
+        return None
+    used = [shapes.setdefault(json.dumps(one), len(shapes)) for one in packed(film)]
+    window = [round(edge, 4) for edge in film.window]
+    return {"start": number, "rate": round(film.rate, 3), "frames": film.frames, "window": window, "shapes": used} | {
+        "outcomes": dict(_outcomes(behaviour, number))
+    }
+
+
+def _outcomes(behaviour: Judged, number: int) -> Iterator[tuple[str, bool | float]]:
+    """How an episode ended in the domain's own environment, or what metrics say of a plan."""
+    found: Mapping[str, Tensor] = behaviour.outcomes if behaviour.rollout is not None else behaviour.measured
+    for name, values in found.items():
+        if values.dim() and not name.endswith(")"):  # others' names stand in brackets
+            value = values[number]
+            if value.dtype == torch.bool:
+                yield name, bool(value)
+            elif value.isfinite():
+                yield name, round(float(value), 3)
+
+
+def packed(film: VectorFilm) -> list[dict[str, Any]]:
+    """Shapes as JSON: points as 16-bit numbers, in steps of the window's width from its lower left corner."""
+    return [_packed(shape, film.window) for shape in film.shapes]
+
+
+def _packed(shape: Shape, window: tuple[float, float, float, float]) -> dict[str, Any]:
+    left, lower, width, _ = window
+    steps = (np.asarray(shape.points, dtype=np.float64) - (left, lower)) / width * STEPS
+    there = np.isfinite(steps)
+    whole = np.where(there, np.clip(np.rint(np.where(there, steps, 0)), ABSENT + 1, -ABSENT - 1), ABSENT).astype("<i2")
+    whole = whole[:1] if (whole == whole[:1]).all() else whole  # most things on a table do not move
+    told: dict[str, Any] = {"kind": shape.kind, "colour": shape.colour, "count": shape.points.shape[1]}
+    told |= {"size": round(shape.size, 4)} if shape.size else {}
+    told |= {} if shape.filled else {"hollow": True}
+    return told | {"points": base64.b64encode(whole.tobytes()).decode()}

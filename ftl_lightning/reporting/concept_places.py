@@ -1,0 +1,56 @@
+"""Where concepts lie: embeddings of training concepts and of learned components in a plane."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.extras import expect_extra
+from ftl_lightning.learning.concept_model import ConceptModel
+
+
+@dataclass(frozen=True)
+class Place:
+    """An embedding in the plane.
+
+    Attributes:
+        concept: its name; component: ``'k1'`` for the first, empty for a training concept.
+        x, y: where.
+    """
+
+    concept: str
+    component: str
+    x: float
+    y: float
+
+    @property
+    def name(self) -> str:
+        """The concept, and in brackets the component."""
+        return f"{self.concept} [{self.component}]" if self.component else self.concept
+
+
+def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> list[Place]:
+    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008), in this order.
+
+    Args:
+        model: whose concept space it is.
+        concepts: learned with it.
+        seed: of the map.
+
+    Raises:
+        UserError: without scikit-learn.
+    """
+    expect_extra("notebooks", "concept_map")
+    from sklearn.manifold import TSNE
+
+    learned = [
+        (concept.origin.name, part.replace("component ", ""), embedding)
+        for concept in concepts
+        for part, (_, embedding) in concept.parts().items()
+    ]
+    embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for *_, embedding in learned)))
+    perplexity = min(10.0, (len(embeddings) - 1) / 3)
+    found = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
+    names = [*((name, "") for name in model.config.training_concepts), *((name, part) for name, part, _ in learned)]
+    return [Place(*name, float(x), float(y)) for name, (x, y) in zip(names, found, strict=True)]

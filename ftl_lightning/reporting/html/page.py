@@ -1,0 +1,228 @@
+"""``report --html``: one file that shows results and plays films, and asks nothing of a network."""
+
+import base64
+import gzip
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.domains.domain import CLOSED, Domain
+from ftl_lightning.domains.paper import OURS, Compared
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.films import FORMAT
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, label, latest, read_rows, read_study
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.printing import say
+from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
+from ftl_lightning.reporting.concept_places import concept_places
+from ftl_lightning.reporting.curves import AXES, points
+from ftl_lightning.reporting.shown import decisive, domain_of, headlines, lookup, settings
+from ftl_lightning.reporting.speed import read_speed
+from ftl_lightning.reporting.tables import of_method, select, summarise
+from ftl_lightning.schema import read_json
+from ftl_lightning.shipped import shipped
+from ftl_lightning.tensor_file import visible, write_text
+from ftl_lightning.version import __version__
+
+HERE = Path(__file__).parent
+FILMS, CONCEPTS = "films", "concepts"
+"""Folders of a folder of results: files of ``evaluation.films``, and concepts by domain and seed."""
+MOST = 15_000_000
+"""Bytes of a page, above which somebody is told."""
+PALETTE = ("#0072b2", "#56b4e9", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#8a63b3", "#6b7178", "#a0522d", "#b3a800")
+"""Told apart by the colour-blind too (Okabe & Ito, 2008, and more)."""
+
+
+def write_page(results: Path, path: Path) -> int:
+    """Write the page.
+
+    Args:
+        results: folder of results, with films and learned concepts in :data:`FILMS` and :data:`CONCEPTS`.
+        path: of the HTML file.
+
+    Returns:
+        Its size in bytes.
+
+    Raises:
+        UserError: if there are no results, or a file of films is none.
+    """
+    rows = read_rows(results)
+    comparison = read_study(results, COMPARISON)
+    ablations = read_study(results)
+    shown = [domain_of(name, rows) for name in dict.fromkeys((*sorted(set(comparison["domain"])), *sorted(set(rows["domain"]))))]
+    studies = {domain.name: comparison if domain.name in set(comparison["domain"]) else ablations for domain in shown}
+    films, shapes = _films(results, shown, rows)
+    overview = [line for domain in shown for line in _overview(domain, studies[domain.name])]
+    measured = dict.fromkeys(one["method"] for line in overview for one in line["methods"])
+    filmed = {film["domain"] for film in films}
+    content = {
+        "domains": [{"name": domain.name, "title": _title(domain)} for domain in shown if domain.name in filmed or not filmed],
+        "overview": overview,
+        "films": films,
+        "shapes": shapes,
+        "maps": [one for domain in shown for one in _map(results, domain)],
+        "curves": [*_curves(shown, read_study(results, CURVES)), *_speed(results)],
+        "colours": {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(_ordered(measured))},
+        "palette": PALETTE,
+        "about": f"Made by ftl-lightning {__version__} from {len(rows)} rows of results.",
+    }
+    text = _html(content)
+    write_text(path, text)
+    if (size := len(text.encode())) > MOST:
+        say(f"{path}: {size / 1e6:.0f} MB, more than {MOST / 1e6:.0f}; leave out some files of {results / FILMS}", error=True)
+    return size
+
+
+def _title(domain: Domain) -> str:
+    return domain.name.replace("_", " ")
+
+
+def _ordered(names: Mapping[str, None]) -> list[str]:
+    """Methods first, in the order of tables, so that each has the same colour everywhere."""
+    order = [label(*method) for method in METHODS]
+    return [*(name for name in order if name in names), *(name for name in names if name not in order)]
+
+
+def _overview(domain: Domain, results: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    rows, references = compared(domain, results), reference_lines(domain, results)
+    for setting, metric in headlines(domain, rows):
+        here, beside = (select(table, setting=setting, metric=metric) for table in (rows, references))
+        yield {
+            "domain": domain.name,
+            "name": _title(domain),
+            "setting": setting,
+            "metric": metric,
+            "less": domain.less_is_better(metric),
+            "methods": [one for method in methods(rows) if (one := _mean(domain, here, method, setting, metric))],
+            "references": {str(name): round(float(value), 4) for name, value in beside.groupby("method")["value"].mean().items()},
+        }
+
+
+def _mean(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> dict[str, Any] | None:
+    number, papers = summarise(of_method(rows, method)), lookup(domain, setting, metric, method=method)
+    if number is None:
+        return None
+    error = None if number.error is None else round(number.error, 4)
+    return {"method": label(*method), "mean": round(number.mean, 4), "error": error, "paper": papers.value if papers else None}
+
+
+def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """What each film is of, and the shapes of each file of films.
+
+    Raises:
+        UserError: for a file that is none of films.
+    """
+    by_name = {domain.name: domain for domain in shown}
+    found, shapes = [], {}
+    for path in visible(results / FILMS, "*.json"):
+        content = read_json(path)
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise UserError(f"{path}: expected films of format {FORMAT}, found something else; make them with evaluation.films")
+        if (domain := by_name.get(str(content["domain"]))) is None:
+            continue
+        shapes[path.stem] = content["shapes"]
+        for task in content["tasks"]:
+            row, metric = task["row"], decisive(domain, rows[rows["domain"] == domain.name])
+            for film in task["films"]:
+                film |= {"file": path.stem, "decisive": metric.removeprefix(f"{CLOSED} ")}
+            found.append(
+                {
+                    "domain": domain.name,
+                    "setting": row["setting"],
+                    "task": row["task"],
+                    "method": label(row["method"], row["form"]),
+                    "ours": row["method"] == OURS,
+                    "told": _told(results, row, task["values"], metric, rows),
+                    "films": task["films"],
+                }
+            )
+    order = {name: place for place, name in enumerate(_ordered(dict.fromkeys(film["method"] for film in found)))}
+    return sorted(found, key=lambda film: (film["domain"], order[film["method"]])), shapes
+
+
+def _told(results: Path, row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
+    """The row that films belong to, in words, and the mean over its seeds."""
+    subject = {key: row[key] for key in ("domain", "setting", "task", "method", "form", "variant", "role", "K", "demonstrations")}
+    same = latest(select(rows, **subject, metric=metric))
+    if metric not in values:
+        return [f"seed {row['seed']}, {row['n']} samples"]
+    told = [f"{metric} {values[metric]:.2f} of {row['n']} (seed {row['seed']})"]
+    if not same.empty:
+        own = same[same["omega"].astype(str) == str(row["omega"])]
+        told.append(f"over {own['seed'].nunique()} seeds {own['value'].mean():.2f}")
+    return told
+
+
+def _map(results: Path, domain: Domain) -> Iterator[dict[str, Any]]:
+    """Where the domain's concepts lie: those that its model that ships was pretrained on, and those learned with seed 0."""
+    files = visible(results / CONCEPTS / domain.name / "seed0", "*.safetensors")
+    folder = shipped(f"pretrained/{domain.name}")
+    if not files or not folder.is_dir():
+        return
+    try:
+        model = load_model(folder)
+        learned = [concept for concept in map(Concept.load, files) if concept.origin.pretrained == model.hash]
+        places = concept_places(model, learned)
+    except UserError as error:  # without scikit-learn, or without the domain's package: the rest of the page is there
+        say(f"concepts of {domain.name} are left out: {error}", error=True)
+        return
+    yield {
+        "domain": domain.name,
+        "name": _title(domain),
+        "points": [
+            {"x": round(one.x, 2), "y": round(one.y, 2), "name": one.name, "film": one.concept, "learned": bool(one.component)}
+            for one in places
+        ],
+    }
+
+
+def _curves(shown: Sequence[Domain], results: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    for domain in shown:
+        for axis in AXES:
+            rows = points(domain, results, axis)
+            if rows.empty:
+                continue
+            counts = sorted(set(map(int, rows[axis])))
+            lines = []
+            for setting in settings(domain, rows):
+                numbers = [(count, summarise(select(rows, setting=setting, **{axis: count}))) for count in counts]
+                lines.append(
+                    {
+                        "name": setting,
+                        "points": [[count, round(one.mean, 4), round(one.error or 0, 4)] for count, one in numbers if one],
+                    }
+                )
+            metric = " ".join(sorted(set(rows["metric"])))
+            title = f"{_title(domain)}, {metric}"
+            yield {"domain": domain.name, "title": title, "axis": axis, "log": False, "ticks": counts, "lines": lines}
+
+
+def _speed(results: Path) -> Iterator[dict[str, Any]]:
+    if curves := read_speed(results):
+        lines = [
+            {"name": name, "points": [[round(one.seconds, 3), one.accuracy, 0] for one in curve]} for name, curve in curves.items()
+        ]
+        yield {
+            "domain": "",
+            "title": "accuracy over learning time",
+            "axis": "seconds of learning",
+            "log": True,
+            "ticks": [0.1, 1, 10, 100, 1000],
+            "lines": lines,
+        }
+
+
+def _html(content: Mapping[str, Any]) -> str:
+    raw = json.dumps(content, separators=(",", ":")).encode()
+    parts = {
+        "STYLE": (HERE / "page.css").read_text(encoding="utf-8"),
+        "SCRIPT": (HERE / "page.js").read_text(encoding="utf-8"),
+        "DATA": base64.b64encode(gzip.compress(raw, mtime=0)).decode(),  # letters that end no script
+    }
+    template = (HERE / "page.html").read_text(encoding="utf-8")
+    return re.sub(f"%({'|'.join(parts)})%", lambda found: parts[found[1]], template)

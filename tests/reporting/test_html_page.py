@@ -1,0 +1,118 @@
+"""The page to watch: what is in it, and what it does in a browser."""
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ftl_lightning.cli import main
+from ftl_lightning.reporting.html.page import FILMS
+from tests.conftest import refused
+
+BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+QUIET = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+QUIET += ["--disable-component-update", "--disable-sync", "--enable-logging=stderr", "--virtual-time-budget=8000", "--dump-dom"]
+ASK = """<script>
+const told = { errors: [] };
+addEventListener("error", (event) => told.errors.push(String(event.message)));
+addEventListener("unhandledrejection", (event) => told.errors.push(String(event.reason)));
+const picture = () => [...document.querySelectorAll("#wall canvas")].map((one) => one.toDataURL()).join();
+const choose = (id, value) => { const box = find(id); box.value = value; box.dispatchEvent(new Event("change")); };
+setTimeout(() => {
+  told.lines = [...document.querySelectorAll("#wall h3")].map((one) => one.textContent);
+  play(false);
+  const before = picture();
+  step(1);
+  told.moved = picture() !== before;
+  told.early = [...document.querySelectorAll("figcaption")].map((one) => one.textContent).join("");
+  step(1000);
+  told.late = document.querySelector("figcaption").textContent;
+  told.edges = document.querySelectorAll("figure.right, figure.wrong").length;
+  document.querySelector("#methods input").click();
+  told.fewer = [...document.querySelectorAll("#wall h3")].map((one) => one.textContent);
+  document.querySelector("#methods input").click();
+  told.tasks = [...find("task").options].map((one) => one.value);
+  choose("task", told.tasks.at(-1));
+  told.other = picture() !== before;
+  document.dispatchEvent(new KeyboardEvent("keydown", { key: " ", bubbles: true }));
+  told.playing = playing;
+  told.marks = document.querySelectorAll("#chart circle").length;
+  told.wide = document.documentElement.scrollWidth - innerWidth;
+  told.loaded = performance.getEntriesByType("resource").length;
+  document.body.dataset.told = JSON.stringify(told);
+}, 1500);
+</script>"""
+
+
+@pytest.fixture
+def page(invert: Callable[..., Path], tmp_path: Path) -> Path:
+    """A page of one small evaluation, whose films are given a second frame: scenes do not move."""
+    films = tmp_path / "results" / FILMS / "scenes.json"
+    invert(f"--evaluation.films={films}", f"--evaluation.results={tmp_path / 'results' / 'rows.csv'}")
+    content = json.loads(films.read_text())
+    for shape in content["shapes"]:
+        shape["points"] = twice(shape["points"])
+    for task in content["tasks"]:
+        for film in task["films"]:
+            film["frames"] = 2
+    films.write_text(json.dumps(content))
+    assert main(["report", "--results", str(tmp_path / "results"), "--html", str(tmp_path / "page.html")]) == 0
+    return tmp_path / "page.html"
+
+
+def twice(points: str) -> str:
+    """The same points in two frames, in the second one moved."""
+    import base64
+
+    import numpy as np
+
+    at = np.frombuffer(base64.b64decode(points), dtype="<i2")
+    return base64.b64encode(np.concatenate((at, at + 500)).astype("<i2").tobytes()).decode()
+
+
+def test_the_page_names_no_address(page: Path) -> None:
+    text = page.read_text()
+    assert set(re.findall(r"\w+://[\w./]+", text)) == {"http://www.w3.org/2000/svg"}  # a name, which nothing asks for
+    assert "default-src 'none'" in text
+
+
+def test_the_same_results_give_the_same_page(page: Path, tmp_path: Path) -> None:
+    assert main(["report", "--results", str(tmp_path / "results"), "--html", str(tmp_path / "again.html")]) == 0
+    assert (tmp_path / "again.html").read_bytes() == page.read_bytes()
+
+
+def test_a_file_of_something_else_is_told(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "results" / FILMS / "other.json").write_text("{}")
+    arguments = ["report", "--results", str(tmp_path / "results"), "--html", str(tmp_path / "b.html")]
+    refused(capsys, arguments, "other.json", "format 1")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_in_a_browser_films_move_and_filters_filter(page: Path, tmp_path: Path, width: int) -> None:
+    asking = tmp_path / "asking.html"
+    asking.write_text(page.read_text().replace("</body>", f"{ASK}</body>"))
+    command = [str(BROWSER), *QUIET, f"--user-data-dir={tmp_path / 'browser'}", f"--window-size={width},900", asking.as_uri()]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert "CONSOLE" not in ran.stderr
+    found = re.search(r'data-told="([^"]*)"', ran.stdout)
+    assert found, ran.stdout[-2000:]
+    told = json.loads(found[1].replace("&quot;", '"').replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+    assert told["errors"] == []
+    assert told["loaded"] == 0
+    assert told["lines"][0] == "FTL-IGM"
+    assert "random scenes" in told["lines"]
+    assert told["moved"]
+    assert told["early"] == ""
+    assert told["late"].startswith("accuracy: ")
+    assert told["edges"] > 0
+    assert told["fewer"] == told["lines"][1:]
+    assert len(told["tasks"]) > 1
+    assert told["other"]
+    assert told["playing"]
+    assert told["marks"] > 0
+    assert told["wide"] <= 0
