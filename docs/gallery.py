@@ -1,6 +1,6 @@
 """Pictures of what committed concepts generate, as the paper's appendix shows them: ``docs/gallery``.
 
-    python docs/gallery.py
+    python docs/gallery.py [DOMAIN ...]
 
 Each line is one concept (or one component, or a concept composed with a training concept): the first eight samples of seed 0, green
 where the task holds and red where it does not. Nothing is chosen.
@@ -8,7 +8,7 @@ where the task holds and red where it does not. Nothing is chosen.
 
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
@@ -17,21 +17,19 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import EvaluationTask
+from ftl_lightning.domains.vector_film import some
 from ftl_lightning.few_shot import FewShot
 
 ROOT = Path(__file__).parent.parent
 FOLDER = Path(__file__).parent / "gallery"
 SAMPLES, SEED, WIDTH = 8, 0, 900
 """Samples of a line, their seed, and the width of a picture in pixels."""
+DOMAINS = ("object_rearrangement", "agent", "driving", "mocap", "tabletop")
+SUITES, MOST = ("training", "paper", "composition"), 8
+"""Whose settings are shown, and at most so many tasks of each."""
 Line = tuple[Composition, str, str]
 """A concept, what is asked of it, and what stands above its samples."""
-
-
-def tasks(domain: Domain, setting: str) -> list[EvaluationTask]:
-    """The paper's tasks of a setting."""
-    return [task for task in domain.concepts.suites["paper"].tasks if task.setting == setting]
 
 
 def learned(model: FewShot, folder: Path) -> dict[str, Composition]:
@@ -65,40 +63,46 @@ def _image(figure: Figure) -> Image.Image:
     return Image.open(drawn).convert("RGB")
 
 
-def relations() -> None:
-    """Figures 12, 14, 15 and 16: object rearrangement."""
+def composed(model: FewShot, known: Mapping[str, Composition], task: EvaluationTask) -> Composition:
+    """What a task is generated from: a learned concept, training concepts, or both."""
+    weight = model.tuned.inversion.weights.training or 1.0
+    parts = [known[name] for name in task.learned] + [(weight if task.learned else 1.0) * model[text] for text in task.texts]
+    whole = parts[0]
+    for part in parts[1:]:
+        whole = whole + part
+    return whole
+
+
+def settings(name: str) -> None:
+    """A picture of each of the domain's settings: of training concepts some evenly, of the paper's all tasks."""
+    model = FewShot.from_pretrained(name)
+    known = learned(model, ROOT / "results" / "concepts" / name / "seed0")
+    suites = [model.domain.concepts.suites[suite] for suite in SUITES if suite in model.domain.concepts.suites]
+    by_setting: dict[str, list[EvaluationTask]] = {}
+    for task in (task for suite in suites for task in suite.tasks):
+        if task.initial == "new" and not task.on and set(task.learned) <= set(known):
+            by_setting.setdefault(task.setting, []).append(task)
+    for setting, found in by_setting.items():
+        shown = [found[place] for place in some(len(found), MOST)]
+        lines = [(composed(model, known, task), task.goal, task.name) for task in shown]
+        picture(model, lines, FOLDER / f"{name}_{setting.replace(' + ', '_').replace(' ', '_')}.png")
+
+
+def components() -> None:
+    """Figure 12: what each component of two learned compositions generates alone."""
     model = FewShot.from_pretrained("object_rearrangement")
     known = learned(model, ROOT / "results" / "concepts" / "object_rearrangement" / "seed0")
-    weight = model.tuned.inversion.weights.training or 1.0
-    for setting, name in (
-        ("training composition", "compositions"),
-        ("new concept", "new_concepts"),
-        ("new + training", "composed"),
-    ):
-        lines: list[Line] = []
-        for task in tasks(model.domain, setting):
-            (own,) = task.learned
-            concept = known[own]
-            for text in task.texts:
-                concept = concept + weight * model[text]
-            lines.append((concept, task.goal, task.goal))
-        picture(model, lines, FOLDER / f"relations_{name}.png")
     parts: list[Line] = []
     for name in ("circle right of triangle and triangle right of square", "square right of circle and triangle above circle"):
         whole = known[name]
         for number in range(len(whole.weights)):
             alone = Composition(whole.embeddings[number : number + 1], whole.weights[number : number + 1])
             parts.append((alone, name, f"{name}: component {number + 1} alone"))
-    picture(model, parts, FOLDER / "relations_components.png")
-
-
-def targets() -> None:
-    """Navigation: each learned target from new initial states."""
-    model = FewShot.from_pretrained("agent")
-    known = learned(model, ROOT / "results" / "concepts" / "agent" / "seed0")
-    picture(model, [(concept, name, name) for name, concept in known.items()], FOLDER / "navigation.png")
+    picture(model, parts, FOLDER / "object_rearrangement_components.png")
 
 
 if __name__ == "__main__":
-    relations()
-    targets()
+    for name in sys.argv[1:] or DOMAINS:
+        settings(name)
+        if name == "object_rearrangement":
+            components()
