@@ -19,6 +19,7 @@ import pandas as pd
 import yaml
 from safetensors import safe_open
 
+from ftl_lightning.configuration import load
 from ftl_lightning.domains.paper import OURS, Compared
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
@@ -32,7 +33,21 @@ ONE_OF = ("setting", "metric", "method", "form", "variant", "K", "omega")
 """Columns in which rows behind one number must be alike."""
 EVERY = "*"
 """In place of a column's value or of a key: each that there is."""
-READERS: Mapping[str, Callable[[str], Any]] = {".json": json.loads, ".yaml": yaml.safe_load, ".toml": tomllib.loads, ".py": str, ".md": str}
+READERS: Mapping[str, Callable[[str], Any]] = {
+    ".json": json.loads,
+    ".yaml": yaml.safe_load,
+    ".toml": tomllib.loads,
+    ".py": str,
+    ".md": str,
+}
+
+
+def _same(numbers: list[float]) -> float:
+    if len(set(numbers)) != 1:
+        raise SourceError(f"expected the same number several times, found {numbers}")
+    return numbers[0]
+
+
 COMBINED: Mapping[str, Callable[[list[float]], float]] = {
     "mean": mean,
     "min": min,
@@ -40,6 +55,7 @@ COMBINED: Mapping[str, Callable[[list[float]], float]] = {
     "sum": sum,
     "difference": lambda values: values[0] - sum(values[1:]),
     "product": math.prod,
+    "same": _same,
     "ratio": lambda values: values[0] / math.prod(values[1:]),
 }
 """Numbers that are made of several."""
@@ -162,8 +178,8 @@ def _listed(key: Any) -> list[Any]:
 
 
 def _settings(name: str, rest: Mapping[str, Any]) -> Iterator[float]:
-    """``settings: conf/NAME.yaml``, ``at`` attributes of what it comes to with its groups and defaults."""
-    return _at(_tuned(name), rest["at"])
+    """``settings: conf/NAME.yaml``, ``at`` attributes of what ``invert`` comes to with groups and defaults; or keys of a ``verb``."""
+    return _at(load(name, rest["verb"]) if "verb" in rest else _tuned(name), rest["at"])
 
 
 def _code(name: str, rest: Mapping[str, Any]) -> Iterator[float]:
