@@ -38,7 +38,7 @@ READERS: Mapping[str, Callable[[str], Any]] = {
     ".yaml": yaml.safe_load,
     ".toml": tomllib.loads,
     ".py": str,
-    ".md": str,
+    ".ipynb": str,
 }
 
 
@@ -100,9 +100,12 @@ def values(reference: Mapping[str, Any]) -> list[float]:
         raise SourceError(f"expected one of {', '.join(KINDS)}, found {', '.join(map(str, reference))}")
     rest = {key: value for key, value in reference.items() if key != kinds[0]}
     try:
-        return list(KINDS[kinds[0]](reference[kinds[0]], rest))
+        found = list(KINDS[kinds[0]](reference[kinds[0]], rest))
     except (KeyError, IndexError, AttributeError, ImportError, OSError, TypeError, ZeroDivisionError) as error:
         raise SourceError(f"{type(error).__name__}: {error}") from error
+    if not all(isinstance(value, int | float) for value in found):
+        raise SourceError(f"expected numbers, found {found}")
+    return found
 
 
 def _rows(chosen: Mapping[str, Any], rest: Mapping[str, Any]) -> Iterator[float]:
@@ -178,7 +181,7 @@ def _listed(key: Any) -> list[Any]:
 
 
 def _settings(name: str, rest: Mapping[str, Any]) -> Iterator[float]:
-    """``settings: conf/NAME.yaml``, ``at`` attributes of what ``invert`` comes to with groups and defaults; or keys of a ``verb``."""
+    """``settings: conf/NAME.yaml``, ``at`` attributes of :class:`Tuned`, or keys of what a ``verb``'s groups come to."""
     return _at(load(name, rest["verb"]) if "verb" in rest else _tuned(name), rest["at"])
 
 
@@ -232,9 +235,11 @@ def _size(name: str, rest: Mapping[str, Any]) -> Iterator[float]:
 
 
 def _combined(kind: str) -> Callable[[Sequence[Any], Mapping[str, Any]], Iterator[float]]:
-    """``mean``, ``ratio`` and so on: of references, or plain factors."""
+    """``mean``, ``ratio`` and so on: of references and plain factors; of these alone with ``why``."""
 
     def numbers(parts: Sequence[Any], rest: Mapping[str, Any]) -> Iterator[float]:
+        if not rest.get("why") and not any(isinstance(part, Mapping) for part in parts):
+            raise SourceError("expected why plain numbers are the source")
         yield COMBINED[kind]([value for part in parts for value in (values(part) if isinstance(part, Mapping) else [part])])
 
     return numbers
