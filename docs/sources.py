@@ -39,6 +39,7 @@ READERS: Mapping[str, Callable[[str], Any]] = {
     ".toml": tomllib.loads,
     ".py": str,
     ".ipynb": str,
+    ".md": str,
 }
 
 
