@@ -87,9 +87,8 @@ def _learning(of: Settings) -> str:
 
 
 def _demonstrations(of: Settings) -> str:
-    return str(
-        _args(of.invert, "data").get("demonstrations_per_concept", _default(InversionData.__init__, "demonstrations_per_concept"))
-    )
+    name = "demonstrations_per_concept"
+    return str(_args(of.invert, "data").get(name, _default(InversionData.__init__, name)))
 
 
 def _sampler(of: Settings) -> str:
