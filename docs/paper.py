@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this che
 import pandas as pd
 import yaml
 
-from ftl_lightning.evaluation.results import latest, read_rows
-from ftl_lightning.reporting.tables import select, summarise
+from docs.sources import SourceError, measured
+from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.tensor_file import write_text
 
 ROOT = Path(__file__).parent.parent
@@ -31,20 +31,16 @@ differences stand [together](differences.md).
 VERDICTS = {"same": "same setting", "other": "other setting", "absent": "not there"}
 
 
-def measured(rows: pd.DataFrame, chosen: Mapping[str, Any], where: str) -> str:
+def shown(rows: pd.DataFrame, chosen: Mapping[str, Any], where: str) -> str:
     """The number behind rows that have these values in their columns.
 
     Raises:
         SystemExit: if there are none, or rows of several settings.
     """
-    found = latest(select(rows, **chosen))
-    number = summarise(found)
-    if number is None:
-        raise SystemExit(f"{where}: expected rows with {dict(chosen)}, found none")
-    for column in ("setting", "metric", "method", "form", "variant", "K", "omega"):
-        if len(set(found[column])) > 1:
-            raise SystemExit(f"{where}: expected rows of one {column}, found {sorted(set(map(str, found[column])))}")
-    return str(number)
+    try:
+        return str(measured(rows, chosen))
+    except SourceError as error:
+        raise SystemExit(f"{where}: {error}") from error
 
 
 def section(item: Mapping[str, Any], files: Mapping[str, pd.DataFrame]) -> str:
@@ -57,7 +53,7 @@ def section(item: Mapping[str, Any], files: Mapping[str, pd.DataFrame]) -> str:
         for name, papers, chosen in item["rows"]:
             values = {**item.get("all", {}), **chosen}
             rows = files[values.pop("file")]
-            lines.append(f"| {name} | {papers or '-'} | {measured(rows, values, item['item'] + ', ' + name)} |")
+            lines.append(f"| {name} | {papers or '-'} | {shown(rows, values, item['item'] + ', ' + name)} |")
         told.append("\n".join(lines))
     for table in item.get("include", ()):
         told.append(f"```{{include}} ../results/report/{table}\n```")

@@ -187,9 +187,13 @@ def episodes(won: int, lost: int, count: int) -> str:
     apart, all_four = won + lost, count + 2
     middle = (won - lost) / all_four
     error = 1.96 * math.sqrt((apart + 1) / all_four - middle**2) / math.sqrt(all_four)
-    p = min(1.0, 2 * float(binom.cdf(min(won, lost), apart, 0.5)))
     interval = f"[{middle - error:+.2f}, {middle + error:+.2f}]"
-    return f"{(won - lost) / count:+.2f} {interval}, {chance(p)}, {same_outcome(won, lost, count)}"
+    return f"{(won - lost) / count:+.2f} {interval}, {chance(mcnemar(won, lost))}, {same_outcome(won, lost, count)}"
+
+
+def mcnemar(won: int, lost: int) -> float:
+    """The exact two-sided p of so many pairs in which only the one succeeds, and only the other."""
+    return min(1.0, 2 * float(binom.cdf(min(won, lost), won + lost, 0.5)))
 
 
 def same_outcome(won: int, lost: int, count: int) -> str:
