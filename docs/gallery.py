@@ -2,7 +2,7 @@
 
     python docs/gallery.py [DOMAIN ...]
 
-Each line is one concept (or one component, or a concept composed with a training concept): the first eight samples of seed 0, green
+Each line is one concept (or one component, or a concept composed with a training concept): the first samples of seed 0, green
 where the task holds and red where it does not. Nothing is chosen.
 """
 
@@ -23,8 +23,8 @@ from ftl_lightning.few_shot import FewShot
 
 ROOT = Path(__file__).parent.parent
 FOLDER = Path(__file__).parent / "gallery"
-SAMPLES, SEED, WIDTH = 8, 0, 900
-"""Samples of a line, their seed, and the width of a picture in pixels."""
+SAMPLES, FEWER, SEED, WIDTH = 8, {"mocap": 2}, 0, 900
+"""Samples of a line, fewer where each is a strip of its own, their seed, and the width of a picture in pixels."""
 DOMAINS = ("object_rearrangement", "agent", "driving", "mocap", "tabletop")
 SUITES, MOST = ("training", "paper", "composition"), 8
 """Whose settings are shown, and at most so many tasks of each."""
@@ -40,10 +40,10 @@ def learned(model: FewShot, folder: Path) -> dict[str, Composition]:
 
 def picture(model: FewShot, lines: Sequence[Line], path: Path) -> None:
     """Samples of each line, one below the other."""
-    drawn = []
+    drawn, count = [], FEWER.get(model.domain.name, SAMPLES)
     for concept, goal, title in lines:
-        observed = model.starts(goal, SAMPLES, SEED) if model.domain.observed else None
-        plans = model.sample(concept, SAMPLES, observed=observed, seed=SEED)
+        observed = model.starts(goal, count, SEED) if model.domain.observed else None
+        plans = model.sample(concept, count, observed=observed, seed=SEED)
         figure = model.render(plans, goal)
         figure.suptitle(title, fontsize=9)
         drawn.append(_image(figure))

@@ -58,7 +58,8 @@ def section(item: Mapping[str, Any], files: Mapping[str, pd.DataFrame]) -> str:
     for table in item.get("include", ()):
         told.append(f"```{{include}} ../results/report/{table}\n```")
     if "look" in item:
-        told.append(item["look"] if item["look"].startswith("!") else f"See {item['look']}.")
+        look = item["look"]
+        told.append(look if look.startswith("!") or "\n" in look else f"See {look}.")
     return "\n\n".join(told)
 
 
