@@ -87,7 +87,9 @@ def _learning(of: Settings) -> str:
 
 
 def _demonstrations(of: Settings) -> str:
-    return str(_args(of.invert, "data").get("demonstrations_per_concept", _default(InversionData.__init__, "demonstrations_per_concept")))
+    return str(
+        _args(of.invert, "data").get("demonstrations_per_concept", _default(InversionData.__init__, "demonstrations_per_concept"))
+    )
 
 
 def _sampler(of: Settings) -> str:

@@ -171,8 +171,8 @@ class Show:
         film: ``states (horizon, state) -> frames`` of one plan; ``None`` where a plan is not a motion.
         wireframe: ``states (horizon, state) -> moving points and lines``, from which a web page draws the same film in a twentieth
             of its size; ``None`` where a plan cannot be drawn in this way.
-        beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title) -> figure`` of both on one scale;
-            ``None`` for one picture above the other.
+        beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title, right (sample,) of bool or None)
+            -> figure`` of both on one scale; ``None`` for one picture above the other.
         exports: by the ending of a file, such as ``'.bvh'``, ``states (horizon, state) -> text`` of one plan for other programs
             (``sample --export``); empty where none reads such behaviour.
     """
@@ -180,7 +180,7 @@ class Show:
     picture: Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]
     film: Callable[[Tensor], Frames] | None = None
     wireframe: Callable[[Tensor], "Wireframe"] | None = None
-    beside: Callable[[Tensor, Tensor, str], "Figure"] | None = None
+    beside: Callable[[Tensor, Tensor, str, Sequence[bool] | None], "Figure"] | None = None
     exports: Mapping[str, Callable[[Tensor], str]] = field(default_factory=dict)
 
 

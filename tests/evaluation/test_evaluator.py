@@ -11,6 +11,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.point import Point
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
@@ -49,8 +50,8 @@ class Trained:
             return None
         return Composition(torch.stack([self.model.concept(text)[None] for text in task.texts]), torch.ones(len(task.texts)))
 
-    def concept_embeddings(self) -> dict[str, torch.Tensor]:
-        return self.model.named_embeddings()
+    def concept_points(self) -> list[Point]:
+        return self.model.points()
 
 
 def test_accuracy_is_the_share_of_right_samples() -> None:

@@ -1,4 +1,5 @@
 import math
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -174,13 +175,15 @@ def test_after_screening_an_inversion_ends_when_those_that_go_on_have_stopped(ti
         if not inversion.stepped(step):
             break
     assert step < 59  # nothing moves without an optimizer, so rounds of ten steps gain nothing
-    assert inversion.screened is not None and not inversion.stopping.going.any()
+    assert inversion.screened is not None
+    assert not inversion.stopping.going.any()
 
 
 def test_from_one_start_settings_start_at_the_mean() -> None:
     settings = InversionSettings().changed(tolerance=0.1, **SCREENED)
     assert settings.from_one_start(samples=3) == InversionSettings().changed(tolerance=0.1, samples=3)
-    assert quickly(settings).budget.screening == 0 and quickly(settings).embeddings.start == "mean"
+    assert quickly(settings).budget.screening == 0
+    assert quickly(settings).embeddings.start == "mean"
 
 
 def test_the_best_of_several_restarts_is_kept(tiny: Path) -> None:
@@ -447,9 +450,13 @@ def test_the_projector_names_the_components_of_every_mode(tiny: Path) -> None:
         module = learn(tiny, modes=modes)
         module.on_validation_start()
         name = module.concepts[0]
-        own = [key for key in module.concept_embeddings() if key.startswith(name + " [")]
-        parts = ["", *(f"mode {mode}, " for mode in range(1, count + 1))]
-        assert own == [f"{name} [{part}component {number}]" for part in parts for number in (1, 2)]
+        points = module.concept_points()
+        own = [point.part for point in points if point.text == name]
+        assert [(part.mode, part.component) for part in own if part] == [
+            (mode, number) for mode in (None, *range(1, count + 1)) for number in (1, 2)
+        ]
+        sets = Counter(point.set for point in points)
+        assert sets == {"empty concept": 1, "training concept": 12, "new component": len(module.concepts) * 2 * (1 + count)}
 
 
 def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Path) -> None:
