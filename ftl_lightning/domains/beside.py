@@ -19,8 +19,8 @@ DPI = 100
 """Pixels of an inch of a domain's picture."""
 POINTS, LEAST = 2.2, 9.0
 """Points of letters, for each inch of a picture's width, so that they are read where it is shown as a card, and at least."""
-LETTER, LINE = 0.55, 1.8
-"""Width of a letter and height of a line, in sizes of letters."""
+LETTER, LINE = 0.68, 1.8
+"""Width of a bold letter and height of a line, in sizes of letters."""
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,15 @@ from typing import Any
 
 import lightning.pytorch as pl
 
+from ftl_lightning.errors import short
 from ftl_lightning.evaluation.evaluable import Evaluable
 from ftl_lightning.evaluation.results import Row
 from ftl_lightning.evaluation.rows import public
 
 USUAL = "usual"
 """Of a form that is not said to be otherwise."""
+MOST = 100
+"""Letters of the tasks' names that are shown."""
 OTHERS = "with "
 """How names of the other settings begin: TensorBoard shows the first five by name, or those in which runs differ."""
 TOLD = ("model/components", "model/omega", "model/guidance", "model/seed", "model/form", "data/domain", "data/seed", "data/steps")
@@ -41,7 +44,7 @@ def chosen(
         "form": first.form or USUAL,
         "seed": first.seed,
         "steps": data.hparams.get("steps", trainer.max_steps),
-        "tasks": ", ".join(dict.fromkeys(row.task for row in rows)),
+        "tasks": short(", ".join(dict.fromkeys(row.task for row in rows)), MOST),
         "variant": first.variant,
         **{f"{OTHERS}{name}": value for name, value in others.items() if name not in TOLD},
     }

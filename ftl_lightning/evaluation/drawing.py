@@ -50,7 +50,7 @@ def draw(
 
 def title(behaviour: Judged) -> str:
     """The task's name and the share of plans that are right, if they are judged."""
-    return behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f}"
+    return behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f} right"
 
 
 def picture(behaviour: Judged, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], figures: int) -> "Figure":
@@ -70,7 +70,7 @@ def picture(behaviour: Judged, domain: Domain, demonstrated: Callable[[str], Dem
     if known is None:
         return domain.show.picture(states, right, title(behaviour), starts)
     windows, first = first_windows(known, states.shape[1])
-    label = "samples" if right is None else f"samples: {sum(right)} of {len(right)} right (green), the others wrong (red)"
+    label = "samples" if right is None else f"samples: {sum(right)} right (green), {right.count(False)} wrong (red)"
     above = Drawn(
         f"demonstrations: {', '.join(behaviour.task.learned)}", windows[shown], first.take(shown) if domain.observed else None
     )
