@@ -8,7 +8,7 @@ from lightning.pytorch.utilities import rank_zero_only
 PICTURES, FILMS, ROLLOUTS = "pictures", "plans in motion", "rollouts"
 """Groups of pictures of plans, films of plans and films of episodes. TensorBoard shows groups by their names' order; these stand
 behind ``accuracy``, ``loss`` and ``optimizer``."""
-RESULTS = "results"
+RESULTS = "test results"
 """Group of a test's numbers, which are one point each."""
 
 

@@ -14,7 +14,7 @@ from ftl_lightning.board import Board, tag
         ("train/loss", "loss/train"),
         ("val/loss", "loss/val"),
         ("val/accuracy/new concept", "accuracy/new concept"),
-        ("test/loss", "results/loss"),
+        ("test/loss", "test results/loss"),
         ("optimizer/learning rate", "optimizer/learning rate"),
         ("train", "train"),
         ("training/mine", "training/mine"),

@@ -55,7 +55,7 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     tag = "rollouts/new initial state/go to red bowl"
     assert events.Images(tag)[0].encoded_image_string.startswith(b"GIF89a")
     assert "pictures/new initial state/go to red bowl" in events.Tags()["images"]
-    assert "results/closed loop success/new initial state" in events.Tags()["scalars"]
+    assert "test results/closed loop success/new initial state" in events.Tags()["scalars"]
 
 
 def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pytest.CaptureFixture[str]) -> None:

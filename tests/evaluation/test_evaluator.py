@@ -322,7 +322,7 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable
     assert [kind for kind, _ in itertools.groupby(tags[tag] for tag in order)] == ["curve", "picture", "point"]
     assert len(events.Scalars("loss/train")) == 5
     for setting in ("training concept", "training composition", "new concept", "new + training"):
-        assert 0 <= events.Scalars(f"results/accuracy/{setting}")[0].value <= 1
+        assert 0 <= events.Scalars(f"test results/accuracy/{setting}")[0].value <= 1
     image = events.Images("pictures/new concept/square diagonal to triangle")[0]
     assert image.encoded_image_string.startswith(b"\x89PNG")
     labels = [row.split("\t") for row in next(log.rglob("metadata.tsv")).read_text().splitlines()]

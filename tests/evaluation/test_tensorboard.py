@@ -46,14 +46,14 @@ def test_the_hparams_tab_shows_all_domains_with_their_metrics_and_tasks(tmp_path
     content = context.hparams_metadata(asked, "")
     assert set(content) == {"here/invert", "there/invert"}
     experiment = context.experiment_from_metadata(asked, "", True, content, [])
-    measured = {"results/accuracy/new concept", "results/accuracy/new initial state"}
+    measured = {"test results/accuracy/new concept", "test results/accuracy/new initial state"}
     assert {info.name.tag for info in experiment.metric_infos} == {"loss/train"} | measured
     found = {info.name: info for info in experiment.hparam_infos}
     assert set(found) == {"domain", "omega", "with model/levels"}
     assert set(found["domain"].domain_discrete) == {"here", "there"}
     assert found["omega"].domain_interval.min_value == found["omega"].domain_interval.max_value == 0.7
     events = EventAccumulator(str(tmp_path / "here" / "invert")).Reload()
-    assert [event.value for event in events.Scalars("results/accuracy/new concept")] == pytest.approx([0.7])
+    assert [event.value for event in events.Scalars("test results/accuracy/new concept")] == pytest.approx([0.7])
 
 
 def test_a_test_adds_tables_and_its_means_behind_everything_else(tmp_path: Path) -> None:
@@ -64,9 +64,9 @@ def test_a_test_adds_tables_and_its_means_behind_everything_else(tmp_path: Path)
     log_animation(own, "rollouts/new/a", [np.zeros((20, 60, 3), dtype=np.uint8)] * 2, 5, "a: success")
     own.experiment.close()
     events = EventAccumulator(str(tmp_path / "here" / "invert")).Reload()
-    assert events.Tags()["scalars"] == ["results/accuracy/new"]
+    assert events.Tags()["scalars"] == ["test results/accuracy/new"]
     settings, tasks = (
-        events.Tensors(f"results/{name}/text_summary")[0].tensor_proto.string_val[0].decode() for name in ("settings", "tasks")
+        events.Tensors(f"test results/{name}/text_summary")[0].tensor_proto.string_val[0].decode() for name in ("settings", "tasks")
     )
     assert "0.50 ± 0.25" in settings
     assert "a (new)" in tasks

@@ -54,7 +54,7 @@ def test_the_server_answers(get: Callable[..., bytes]) -> None:
     quoted = urllib.parse.quote(run, safe="")
     scalars = json.loads(get("plugin/scalars/tags"))
     assert set(scalars) == {run}  # one run, hparams included
-    assert {"loss/train", "results/accuracy/new concept"} < set(scalars[run])
+    assert {"loss/train", "test results/accuracy/new concept"} < set(scalars[run])
     curve = json.loads(get(f"plugin/scalars/scalars?run={quoted}&tag=loss%2Ftrain"))
     assert len(curve) == 5
     images = json.loads(get("plugin/images/tags"))
@@ -67,7 +67,7 @@ def test_the_server_answers(get: Callable[..., bytes]) -> None:
     names = [info["name"] for info in experiment["hparamInfos"]]
     assert names[:7] == ["K", "domain", "form", "method", "omega", "seed", "steps"]
     assert "with evaluation/temperature" in names
-    assert "results/accuracy/new concept" in {metric["name"]["tag"] for metric in experiment["metricInfos"]}
+    assert "test results/accuracy/new concept" in {metric["name"]["tag"] for metric in experiment["metricInfos"]}
     projector = json.loads(get("plugin/projector/runs"))
     assert projector
     info = json.loads(get(f"plugin/projector/info?run={urllib.parse.quote(projector[0], safe='')}"))
