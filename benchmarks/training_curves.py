@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import atomic, write_text
 
-TAG = "val/accuracy/training concept"
+TAG = "accuracy/training concept"
 
 
 def curve(folder: str, tag: str) -> list[tuple[int, float]]:
@@ -43,7 +43,7 @@ def drawn(curves: dict[str, list[tuple[int, float]]], tag: str, chance: float) -
     for name, points in curves.items():
         axes.plot(*zip(*points, strict=True), marker="o", markersize=3, label=name)
     axes.axhline(chance, color="grey", linestyle=":", label="nearest object")
-    axes.set(xscale="log", xlabel="steps of pretraining", ylabel=tag.removeprefix("val/"), ylim=(0, 1.03))
+    axes.set(xscale="log", xlabel="steps of pretraining", ylabel=tag, ylim=(0, 1.03))
     axes.legend()
     return figure
 

@@ -145,7 +145,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         say(f"form: {learned.choice}")
     if learned.composing is not None:
         say("composed it is another set of embeddings, in the span of the training concepts")
-    parts = [(f"{name}, weight {weight:.2f}", embedding) for name, (weight, embedding) in learned.parts().items()]
+    parts = [(f"{name}, weight {part.weight:.2f}", part.embedding) for name, part in learned.parts().items()]
     if len(learned.weights) > 1:
         whole = learned.at_knots(learned.weighted_sum)
         parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]

@@ -15,6 +15,7 @@ from ftl_lightning import log_folder
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
+from ftl_lightning.learning_rate import LearningRate
 from ftl_lightning.ranges import expect_range
 
 HARMLESS = {
@@ -137,7 +138,7 @@ class Trainer(pl.Trainer):
             for name, value in options.items()
             if name not in HARMLESS and value != usual.get(name)
         }
-        self.callbacks.append(_Begun())  # type: ignore[attr-defined]
+        self.callbacks += [_Begun(), LearningRate()]  # type: ignore[attr-defined]
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
             self.strategy.checkpoint_io = WholeCheckpoints()
 

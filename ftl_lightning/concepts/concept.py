@@ -11,6 +11,7 @@ from torch import Tensor
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition, space_of
 from ftl_lightning.concepts.modes import STRETCH, Modes
+from ftl_lightning.concepts.point import Part
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor
 from ftl_lightning.representation import Shown, counted, numbers
@@ -149,20 +150,19 @@ class Concept(Shown):
         one = replace(self, embeddings=self.embeddings[chosen], weights=self.weights[chosen], modes=None, composing=None)
         return one.composition
 
-    def parts(self) -> dict[str, tuple[float, Tensor]]:
-        """Weight and embedding ``(n,)`` of every knot of every component, and of those of every mode, by names such as
-        'component 1', 'mode 2, component 1' or 'component 1, knot 3'.
-        """
-        sets = {"": (self.weights, self.embeddings)}
+    def parts(self) -> dict[str, Part]:
+        """Every knot of every component, and those of every mode, by their names."""
+        sets: list[tuple[int | None, Tensor, Tensor]] = [(None, self.weights, self.embeddings)]
         if self.modes is not None:
             modes = zip(self.modes.weights, self.modes.embeddings, strict=True)
-            sets |= {f"mode {number}, ": mode for number, mode in enumerate(modes, start=1)}
-        return {
-            f"{name}component {number}{knot}": (weight, embedding)
-            for name, (weights, embeddings) in sets.items()
+            sets += [(number, weights, embeddings) for number, (weights, embeddings) in enumerate(modes, start=1)]
+        parts = [
+            Part(weight, embedding, number, mode, knot if self.knots > 1 else None)
+            for mode, weights, embeddings in sets
             for number, (weight, component) in enumerate(zip(weights.tolist(), embeddings, strict=True), start=1)
-            for knot, embedding in self.at_knots(component).items()
-        }
+            for knot, embedding in enumerate(component, start=1)
+        ]
+        return {part.name: part for part in parts}
 
     @property
     def weighted_sum(self) -> Tensor:

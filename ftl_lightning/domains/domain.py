@@ -174,8 +174,8 @@ class Show:
             of its size; ``None`` where a plan cannot be drawn in this way.
         vector_film: ``(states (horizon, state), initial state or None) -> shapes that move``, which ``report --html`` shows;
             ``None`` for those of the wireframe, if there is one.
-        beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title) -> figure`` of both on one scale;
-            ``None`` for one picture above the other.
+        beside: ``(demonstrations (demo, horizon, state), samples (sample, horizon, state), title, right (sample,) of bool or None)
+            -> figure`` of both on one scale; ``None`` for one picture above the other.
         exports: by the ending of a file, such as ``'.bvh'``, ``states (horizon, state) -> text`` of one plan for other programs
             (``sample --export``); empty where none reads such behaviour.
     """
@@ -184,7 +184,7 @@ class Show:
     film: Callable[[Tensor], Frames] | None = None
     wireframe: Callable[[Tensor], "Wireframe"] | None = None
     vector_film: "Callable[[Tensor, InitialStates | None], VectorFilm] | None" = None
-    beside: Callable[[Tensor, Tensor, str], "Figure"] | None = None
+    beside: Callable[[Tensor, Tensor, str, Sequence[bool] | None], "Figure"] | None = None
     exports: Mapping[str, Callable[[Tensor], str]] = field(default_factory=dict)
 
 

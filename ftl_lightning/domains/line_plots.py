@@ -25,27 +25,27 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
     """A renderer of plans with these columns, see :class:`ftl_lightning.domains.domain.Show`."""
 
     def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> "Figure":
-        return _drawn(names, {"": states}, right, title)
+        return _drawn(names, {"": states}, {"": right}, title)
 
     return render
 
 
-def beside(names: Sequence[str]) -> Callable[[Tensor, Tensor, str], "Figure"]:
+def beside(names: Sequence[str]) -> Callable[[Tensor, Tensor, str, Sequence[bool] | None], "Figure"]:
     """A renderer of demonstrations above samples on one scale, see :class:`ftl_lightning.domains.domain.Show`."""
 
-    def render(demonstrations: Tensor, samples: Tensor, title: str) -> "Figure":
-        return _drawn(names, {"demonstrations": demonstrations, "samples": samples}, None, title)
+    def render(demonstrations: Tensor, samples: Tensor, title: str, right: Sequence[bool] | None) -> "Figure":
+        return _drawn(names, {"demonstrations": demonstrations, "samples": samples}, {"samples": right}, title)
 
     return render
 
 
-def _drawn(names: Sequence[str], groups: Mapping[str, Tensor], right: Sequence[bool] | None, title: str) -> "Figure":
+def _drawn(names: Sequence[str], groups: Mapping[str, Tensor], right: Mapping[str, Sequence[bool] | None], title: str) -> "Figure":
     """Plans on one scale, those of each group from a new row on.
 
     Args:
         names: of columns.
         groups: plans ``(plan, time, state)`` by what stands beside their first row.
-        right: whether each plan of a single group is right; ``None`` if not judged.
+        right: whether each plan of a group is right; none or ``None`` for a group that is not judged.
         title: of the figure.
     """
     from matplotlib.figure import Figure
@@ -58,12 +58,13 @@ def _drawn(names: Sequence[str], groups: Mapping[str, Tensor], right: Sequence[b
     figure.suptitle(figure_text(title), fontsize=9)
     spatial = states.shape[2] == 3 and states.shape[1] > 1
     grid = figure.subplots(every, columns, squeeze=False, subplot_kw={"projection": "3d"} if spatial else {})
-    colours = [PLAIN] * len(states) if right is None else [RIGHT if good else WRONG for good in right]
     flat = states.flatten(0, 1)
     low, high = flat.amin(dim=0).tolist(), flat.amax(dim=0).tolist()
     first = 0
     for name, plans in groups.items():
         panels = grid[first : first + rows[name]].flatten()
+        judged = right.get(name)
+        colours = [PLAIN] * len(plans) if judged is None else [RIGHT if good else WRONG for good in judged]
         for axes, plan, colour in zip(panels, plans.numpy(), colours, strict=False):
             if states.shape[2] in (2, 3) and states.shape[1] > 1:
                 axes.plot(*plan.T, color=PATH, linewidth=1.2)

@@ -1,35 +1,77 @@
-"""What an evaluation draws: figures of plans, films of plans and of episodes."""
+"""What an evaluation draws: figures of plans below the demonstrations, films of plans and of episodes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from ftl_lightning.domains.domain import CLOSED, Domain
+from ftl_lightning.board import FILMS, PICTURES, ROLLOUTS
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.beside import Drawn, beside
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.animation import outcome_text
+from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import Judged, share
 from ftl_lightning.evaluation.tensorboard import log_animation
+from ftl_lightning.learning.quality import first_windows
+
+if TYPE_CHECKING:  # half a second of import, for what is drawn later
+    from matplotlib.figure import Figure
 
 
-def draw(logger: TensorBoardLogger, judged: Sequence[Judged], domain: Domain, figures: int, step: int) -> None:
+def draw(
+    logger: TensorBoardLogger,
+    judged: Sequence[Judged],
+    domain: Domain,
+    demonstrated: Callable[[str], Demonstrations | None],
+    figures: int,
+    step: int,
+) -> None:
     """Draw each task's plans into TensorBoard, film the first, and its first episode if there is one.
 
     Args:
         logger: where to.
         judged: what is drawn.
         domain: whose pictures they are.
-        figures: how many samples a figure shows, 1 or more.
+        demonstrated: what a concept was learned from, by its name; drawn above the plans.
+        figures: how many samples a figure shows, 1 or more, and demonstrations at most.
         step: the trainer's.
     """
-    shown = slice(0, figures)
     for behaviour in judged:
         name = f"{behaviour.task.setting}/{behaviour.task.name}"
-        start = None if behaviour.starts is None else behaviour.starts.take(shown)
-        right = None if behaviour.right is None else behaviour.right[shown].tolist()
-        title = behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f}"
-        logger.experiment.add_figure(name, domain.show.picture(behaviour.states[shown], right, title, start), step)
+        logger.experiment.add_figure(f"{PICTURES}/{name}", picture(behaviour, domain, demonstrated, figures), step)
         if domain.show.film is not None:
-            log_animation(logger, f"film/{name}", domain.show.film(behaviour.states[0]), step, title)
+            log_animation(logger, f"{FILMS}/{name}", domain.show.film(behaviour.states[0]), step, title(behaviour))
         film = domain.closed_loop.film if domain.closed_loop else None
         if film and behaviour.rollout is not None and behaviour.followed is not None:
             pictures = film(behaviour.rollout.take(0, 1), behaviour.followed)
-            log_animation(logger, f"{CLOSED}/{name}", pictures, step, behaviour.task.goal, outcome_text(behaviour.outcomes))
+            log_animation(logger, f"{ROLLOUTS}/{name}", pictures, step, behaviour.task.goal, outcome_text(behaviour.outcomes))
+
+
+def title(behaviour: Judged) -> str:
+    """The task's name and the share of plans that are right, if they are judged."""
+    return behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f} right"
+
+
+def picture(behaviour: Judged, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], figures: int) -> "Figure":
+    """Some of a task's plans, framed green where they are right and red where they are wrong, below what was learned from.
+
+    Args:
+        behaviour: the task's.
+        domain: whose picture it is.
+        demonstrated: what a concept was learned from, by its name.
+        figures: how many plans are shown, and demonstrations at most.
+    """
+    shown = slice(0, figures)
+    starts = None if behaviour.starts is None else behaviour.starts.take(shown)
+    right = None if behaviour.right is None else behaviour.right[shown].tolist()
+    states = behaviour.states[shown]
+    known = demonstrations_of(behaviour.task, demonstrated)
+    if known is None:
+        return domain.show.picture(states, right, title(behaviour), starts)
+    windows, first = first_windows(known, states.shape[1])
+    label = "samples" if right is None else f"samples: {sum(right)} right (green), {right.count(False)} wrong (red)"
+    above = Drawn(
+        f"demonstrations: {', '.join(behaviour.task.learned)}", windows[shown], first.take(shown) if domain.observed else None
+    )
+    return beside(domain.show, above, Drawn(label, states, starts, right), title(behaviour))

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
-from torch import Tensor
-
 from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.point import Point
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import EvaluationTask
@@ -14,7 +13,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 @runtime_checkable
 class Evaluable(Protocol):
-    """The model, names of the method, of its form, of its variant and of learned concepts, and embeddings."""
+    """The model, names of the method, of its form, of its variant and of learned concepts, and the points of concept space."""
 
     model: ConceptModel
     hparams: Any
@@ -38,7 +37,7 @@ class Evaluable(Protocol):
 
     def demonstrated(self, concept: str) -> Demonstrations | None: ...
 
-    def concept_embeddings(self) -> dict[str, Tensor]: ...
+    def concept_points(self) -> list[Point]: ...
 
 
 def demonstrations_of(task: EvaluationTask, demonstrated: Callable[[str], Demonstrations | None]) -> Demonstrations | None:

@@ -12,8 +12,8 @@ import lightning.pytorch as pl
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning.domains.data import InversionData, PretrainingData
-from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short
+from ftl_lightning.evaluation.chosen import chosen
 from ftl_lightning.evaluation.diversity import lines, real_behaviour
 from ftl_lightning.evaluation.drawing import draw
 from ftl_lightning.evaluation.evaluable import Evaluable
@@ -23,7 +23,7 @@ from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
-from ftl_lightning.evaluation.tensorboard import log_projector, log_test, setting_means
+from ftl_lightning.evaluation.tensorboard import log_projector, log_test, own_rows, setting_means
 from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_count
 
@@ -129,7 +129,7 @@ class Evaluator(pl.Callback):
         by_task = {(behaviour.task.setting, behaviour.task.name): behaviour.values for behaviour in self.judged}
         pl_module.log_dict({f"val/{name}": value for name, value in setting_means(by_task).items()}, batch_size=1)
         for logger in _boards(trainer):
-            self._draw(logger, module.domain, trainer.global_step)
+            self._draw(logger, module, trainer.global_step)
             if not self._projected:  # training embeddings do not change while fitting
                 self._project(logger, module, trainer.global_step)
 
@@ -146,10 +146,12 @@ class Evaluator(pl.Callback):
         if self.films and trainer.is_global_zero:
             count = write_films(self.films, module.domain, self.judged, beside, measured)
             say(f"{self.films}: {count} films")
+        own = own_rows(measured)
         for logger in _boards(trainer):
-            self._draw(logger, module.domain, trainer.global_step)
+            self._draw(logger, module, trainer.global_step)
             self._project(logger, module, trainer.global_step)
-            log_test(logger, configured, measured, trainer.global_step)
+            if own:
+                log_test(logger, chosen(module, data, self.settings(data), trainer, own), measured, trainer.global_step)
 
     def _generate(self, module: Evaluable, data: PretrainingData | InversionData) -> None:
         tasks = tasks_of(module.domain, self._asked(data), module.concepts)
@@ -166,15 +168,15 @@ class Evaluator(pl.Callback):
             beside |= lines(real) if compared else {}
         return beside
 
-    def _draw(self, logger: TensorBoardLogger, domain: Domain, step: int) -> None:
+    def _draw(self, logger: TensorBoardLogger, module: Evaluable, step: int) -> None:
         try:
             if self.figures:
-                draw(logger, self.judged, domain, self.figures, step)
+                draw(logger, self.judged, module.domain, module.demonstrated, self.figures, step)
         except Exception as error:  # whatever a domain's pictures raise: numbers are there already
-            _LOG.warning("domain %s: its pictures cannot be drawn: %r", domain.name, error)
+            _LOG.warning("domain %s: its pictures cannot be drawn: %r", module.domain.name, error)
 
     def _project(self, logger: TensorBoardLogger, module: Evaluable, step: int) -> None:
-        log_projector(logger, module.concept_embeddings(), step)
+        log_projector(logger, module.concept_points(), step)
         self._projected = True
 
 

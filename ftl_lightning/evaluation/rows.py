@@ -27,7 +27,7 @@ LATER = (
 """Settings that came later, at the values under which everything is as before: they are left out, so that hashes stay."""
 
 
-def _public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
+def public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Hyper-parameters without those that Lightning's command line adds for itself."""
     return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
 
@@ -45,10 +45,10 @@ def configuration(
     """
     demonstrations, loop = data.hparams.get("demonstrations"), module.model.domain.closed_loop
     unusual = getattr(trainer, "unusual", {}) if "pretrained" in module.hparams else {}
-    hparams = [(key, value) for key, value in _public(module.hparams) if key not in ("pretrained", "output")]
+    hparams = [(key, value) for key, value in public(module.hparams) if key not in ("pretrained", "output")]
     return {
         **{f"model/{key}": value for key, value in hparams if (key, value) not in LATER},
-        **{f"data/{key}": value for key, value in _public(data.hparams) if key not in ("demonstrations", "root")},
+        **{f"data/{key}": value for key, value in public(data.hparams) if key not in ("demonstrations", "root")},
         **{f"evaluation/{key}": value for key, value in settings.items()},
         **{f"trainer/{key}": value for key, value in unusual.items()},
         **({"environment": loop.identity} if "replan" in settings and loop and loop.identity else {}),

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import lightning.pytorch as pl
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch import Tensor
 
 from ftl_lightning import log_folder
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.point import NEW_COMPONENT, Point
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.from_file import OWN
@@ -204,14 +204,14 @@ class Adaptation(pl.LightningModule, ABC):
         """What a concept was learned from."""
         return self.demonstrations.select(concept)
 
-    def concept_embeddings(self) -> dict[str, Tensor]:
-        """Every embedding ``(n,)`` by name, for the projector: training concepts and learned components."""
-        learned = {
-            f"{name} [{part}]": embedding
+    def concept_points(self) -> list[Point]:
+        """Every embedding, for the projector: training concepts and learned components."""
+        learned = [
+            Point(name, NEW_COMPONENT, part.embedding, part)
             for name, concept in self._found.items()
-            for part, (_, embedding) in concept.parts().items()
-        }
-        return self.model.named_embeddings() | learned
+            for part in concept.parts().values()
+        ]
+        return self.model.points() + learned
 
 
 def file_name(concept: str) -> str:

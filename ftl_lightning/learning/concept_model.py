@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ftl_lightning.concepts.adapter import LowRank
 from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.point import EMPTY_CONCEPT, TRAINING_CONCEPT, Point
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import READ, Feature, Observed, expect_features
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
@@ -167,9 +168,10 @@ class ConceptModel(Shown, nn.Module, ABC):
             )
         return self.training_embeddings[self.config.training_concepts.index(text)]
 
-    def named_embeddings(self) -> dict[str, Tensor]:
-        """The training concepts' embeddings ``(n,)`` by text, and the empty one's."""
-        return {"(empty)": self.empty} | dict(zip(self.config.training_concepts, self.training_embeddings, strict=True))
+    def points(self) -> list[Point]:
+        """The empty concept's embedding and the training concepts'."""
+        training = zip(self.config.training_concepts, self.training_embeddings, strict=True)
+        return [Point("(empty)", EMPTY_CONCEPT, self.empty), *(Point(text, TRAINING_CONCEPT, each) for text, each in training)]
 
     def adaptable(self) -> dict[str, tuple[int, int]]:
         """The weights that an adapter changes, see :func:`ftl_lightning.concepts.adapter.adaptable`; none for a method without."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.encoder import EMPTY
+from ftl_lightning.concepts.point import Point
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.demonstrations.normalization import Normalization
@@ -310,9 +311,9 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         """What a concept was learned from: nothing is learned here."""
         return None
 
-    def concept_embeddings(self) -> dict[str, Tensor]:
-        """Every embedding ``(n,)`` by name, for the projector."""
-        return self.model.named_embeddings()
+    def concept_points(self) -> list[Point]:
+        """Every embedding, for the projector."""
+        return self.model.points()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Sign the checkpoint, and keep where the global generators stand."""

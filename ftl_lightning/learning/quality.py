@@ -11,7 +11,7 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.beside import beside
+from ftl_lightning.domains.beside import Drawn, beside
 from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.learning.concept_model import ConceptModel
@@ -193,8 +193,11 @@ class Inspection:
     def figure(self) -> "Figure":
         """Demonstrations above some of the samples."""
         shown = slice(0, SHOWN)
-        starts = self.starts.take(shown) if self.domain.observed else None
-        return beside(self.domain.show, self.demonstrations, self.samples[shown], f"{self.name}: {self}", starts)
+        observed = bool(self.domain.observed)
+        known = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # samples start like these, in turn
+        demonstrations = Drawn("demonstrations", self.demonstrations, known)
+        samples = Drawn("samples", self.samples[shown], self.starts.take(shown) if observed else None)
+        return beside(self.domain.show, demonstrations, samples, f"{self.name}: {self}")
 
 
 def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstrations, concept: Concept, seed: int) -> Inspection:

@@ -231,9 +231,9 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
 
     training = model.config.training_concepts
     learned = [
-        (f"{concept.origin.name} [{part.replace('component ', '')}]", embedding)
+        (f"{concept.origin.name} [{name.replace('component ', '')}]", part.embedding)
         for concept in concepts
-        for part, (_, embedding) in concept.parts().items()
+        for name, part in concept.parts().items()
     ]
     embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for _, embedding in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)

@@ -105,7 +105,8 @@ def test_parts_are_the_components_and_those_of_every_mode_by_name() -> None:
     assert own.modes is not None
     names = [f"{mode}component {number}" for mode in ("", "mode 1, ", "mode 2, ") for number in (1, 2)]
     assert list(own.parts()) == names
-    weight, embedding = own.parts()["mode 2, component 1"]
-    assert weight == pytest.approx(float(own.modes.weights[1, 0]))
-    assert torch.equal(embedding, own.modes.embeddings[1, 0, 0])
+    part = own.parts()["mode 2, component 1"]
+    assert part.weight == pytest.approx(float(own.modes.weights[1, 0]))
+    assert torch.equal(part.embedding, own.modes.embeddings[1, 0, 0])
+    assert (part.component, part.mode, part.knot) == (1, 2, None)
     assert list(replace(own, modes=None).parts()) == names[:2]

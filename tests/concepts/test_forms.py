@@ -206,7 +206,7 @@ def test_every_form_comes_back_from_its_file(network: TemporalUNet, knots: int, 
     found.save("c.safetensors")
     assert Path("c.safetensors").read_bytes() == before
     assert ("component 1, knot 3" in found.parts()) == (knots == 3)
-    assert {len(embedding) for _, embedding in found.parts().values()} == {4}
+    assert {len(part.embedding) for part in found.parts().values()} == {4}
 
 
 @pytest.fixture(scope="module")

@@ -52,11 +52,10 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     assert oracle.loc[oracle["metric"] == "closed loop success", "value"].mean() > 0.9
     events = EventAccumulator("logs/agent/invert", size_guidance={"images": 0})
     events.Reload()
-    tag = "closed loop/new initial state/go to red bowl"
+    tag = "rollouts/new initial state/go to red bowl"
     assert events.Images(tag)[0].encoded_image_string.startswith(b"GIF89a")
-    assert "new initial state/go to red bowl" in events.Tags()["images"]
-    tested = EventAccumulator("logs/agent/invert/hparams").Reload()
-    assert "closed loop success/new initial state" in tested.Tags()["scalars"]
+    assert "pictures/new initial state/go to red bowl" in events.Tags()["images"]
+    assert "test results/closed loop success/new initial state" in events.Tags()["scalars"]
 
 
 def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,3 +1,6 @@
+import itertools
+import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,15 +10,19 @@ import pandas as pd
 import pytest
 import torch
 from lightning.pytorch import LightningDataModule
+from matplotlib.figure import Figure
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.metadata import parse_session_start_info_plugin_data
 
 from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.point import Point
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.drawing import picture
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
@@ -49,8 +56,8 @@ class Trained:
             return None
         return Composition(torch.stack([self.model.concept(text)[None] for text in task.texts]), torch.ones(len(task.texts)))
 
-    def concept_embeddings(self) -> dict[str, torch.Tensor]:
-        return self.model.named_embeddings()
+    def concept_points(self) -> list[Point]:
+        return self.model.points()
 
 
 def test_accuracy_is_the_share_of_right_samples() -> None:
@@ -301,21 +308,81 @@ def test_a_foreign_results_file_is_refused(tmp_path: Path) -> None:
         read_rows(tmp_path)
 
 
-def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable[..., Path]) -> None:
+def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable[..., Path], tiny: Path) -> None:
     log = invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[training, paper]")
+    assert {path.parent for path in log.rglob("events.out.tfevents.*")} == {log}  # one run
     events = EventAccumulator(str(log), size_guidance={"images": 0, "scalars": 0}).Reload()
-    tested = EventAccumulator(str(log / "hparams")).Reload()
-    assert len(events.Scalars("train/loss")) == 5
+    fitted = EventAccumulator(str(tiny.parent), size_guidance={"images": 0, "scalars": 0}).Reload()
+    # In TensorBoard's order curves come first, accuracy and loss before the others, then pictures, then numbers of one point.
+    tags = {tag: "curve" for run in (events, fitted) for tag in run.Tags()["scalars"] if len(run.Scalars(tag)) > 1}
+    tags |= {tag: "picture" for run in (events, fitted) for tag in run.Tags()["images"]}
+    tags |= {tag: "point" for run in (events, fitted) for tag in run.Tags()["scalars"] if tag not in tags}
+    order = sorted(tags)
+    assert order[:4] == ["accuracy/training concept", "loss/train", "loss/val", "optimizer/learning rate"]
+    assert [kind for kind, _ in itertools.groupby(tags[tag] for tag in order)] == ["curve", "picture", "point"]
+    assert len(events.Scalars("loss/train")) == 5
     for setting in ("training concept", "training composition", "new concept", "new + training"):
-        assert 0 <= tested.Scalars(f"accuracy/{setting}")[0].value <= 1
-    assert not [tag for tag in events.Tags()["scalars"] if tag.startswith("test/accuracy")]  # a test is no curve
-    image = events.Images("new concept/square diagonal to triangle")[0]
+        assert 0 <= events.Scalars(f"test results/accuracy/{setting}")[0].value <= 1
+    image = events.Images("pictures/new concept/square diagonal to triangle")[0]
     assert image.encoded_image_string.startswith(b"\x89PNG")
-    assert tested.summary_metadata["_hparams_/session_start_info"]
-    labels = next(log.rglob("metadata.tsv")).read_text().splitlines()
-    assert "square diagonal to triangle [component 2]" in labels
-    assert "(empty)" in labels
-    assert len(labels) == 1 + 12 + 10 * 2
+    labels = [row.split("\t") for row in next(log.rglob("metadata.tsv")).read_text().splitlines()]
+    assert labels[0] == ["text", "set", "component", "part"]
+    assert Counter(row[1] for row in labels[1:]) == {"empty concept": 1, "training concept": 12, "new component": 10 * 2}
+    assert ["square diagonal to triangle", "new component", "2", "component 2"] in labels
+
+
+def test_hparams_are_what_a_person_chose_and_stand_with_the_curves(invert: Callable[..., Path], tiny: Path) -> None:
+    log = invert("--evaluation.suites=[paper]", "--seed_everything=3", "--model.omega=1.5", "--trainer.log_every_n_steps=1")
+    events = EventAccumulator(str(log)).Reload()
+    content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    values = parse_session_start_info_plugin_data(content).hparams
+    # TensorBoard shows the first five by name.
+    assert sorted(values)[:9] == ["K", "domain", "form", "method", "omega", "seed", "steps", "tasks", "variant"]
+    assert (values["K"].number_value, values["omega"].number_value, values["seed"].number_value) == (2, 1.5, 3)
+    assert values["steps"].number_value == 5
+    words = [values[name].string_value for name in ("domain", "method", "form")]
+    assert words == ["object_rearrangement", "FTL-IGM", "usual"]
+    assert values["with model/pretrained"].string_value == str(tiny)
+    assert "loss/train" in events.Tags()["scalars"]
+    known = read_rows(log / "results.csv")
+    hashes = {*known["config_hash"], *known["model_hash"]}
+    assert not (hashes - {""}) & {value.string_value for value in values.values()}
+
+
+def test_the_rate_of_each_step_is_a_curve(tiny: Path, invert: Callable[..., Path]) -> None:
+    fitted = EventAccumulator(str(tiny.parent)).Reload()
+    rates = [event.value for event in fitted.Scalars("optimizer/learning rate")]
+    assert max(rates) > rates[-1] > 0  # cosine decay
+    options = ["--evaluation.suites=[]", "--model.omega=learned", "--model.budget.tolerance=null", "--model.weights.training=null"]
+    events = EventAccumulator(str(invert("--trainer.log_every_n_steps=1", *options))).Reload()
+    for name, first in (("embeddings", 0.1), ("weights", 0.003)):
+        rates = [event.value for event in events.Scalars(f"optimizer/learning rate/inversion.{name}")]
+        assert rates == pytest.approx([first * (1 + math.cos(math.pi * step / 5)) / 2 for step in range(5)], rel=1e-4)
+
+
+def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(tiny: Path) -> None:
+    domain = load_domain("object_rearrangement")
+    source, (task, other) = domain.source(None), ("square diagonal to triangle", "circle right of square")
+    states = torch.cat((source.draw(task, 3, 0).states, source.draw(other, 1, 0).states))
+    seen: list[tuple[int, list[bool] | None]] = []
+
+    def drawn(states: torch.Tensor, right: list[bool] | None, title: str, starts: object) -> Figure:
+        seen.append((len(states), right))
+        return domain.show.picture(states, right, title, None)
+
+    watched = replace(domain, show=replace(domain.show, picture=drawn))
+    behaviour = Judged.of(EvaluationTask("new concept", task, (task,)), states, None, domain)
+    figure = picture(behaviour, watched, lambda concept: source.draw(concept, 5, 1), 16)
+    assert seen == [(5, None), (4, [True, True, True, False])]
+    assert [text.get_text() for text in figure.texts] == [
+        f"{task}: 0.75 right",
+        f"demonstrations: {task}",
+        "samples: 3 right (green), 1 wrong (red)",
+    ]
+    assert figure.axes[0].get_position().y0 > figure.axes[1].get_position().y1
+    seen.clear()
+    picture(behaviour, watched, lambda concept: None, 2)
+    assert seen == [(2, [True, True])]
 
 
 def test_a_run_may_have_words_of_its_own_in_tables(invert: Callable[..., Path]) -> None:

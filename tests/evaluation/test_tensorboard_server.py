@@ -53,18 +53,21 @@ def test_the_server_answers(get: Callable[..., bytes]) -> None:
     run = "object_rearrangement/invert"
     quoted = urllib.parse.quote(run, safe="")
     scalars = json.loads(get("plugin/scalars/tags"))
-    assert "train/loss" in scalars[run]
-    assert "accuracy/new concept" in scalars[f"{run}/hparams"]
-    curve = json.loads(get(f"plugin/scalars/scalars?run={quoted}&tag=train%2Floss"))
+    assert set(scalars) == {run}  # one run, hparams included
+    assert {"loss/train", "test results/accuracy/new concept"} < set(scalars[run])
+    curve = json.loads(get(f"plugin/scalars/scalars?run={quoted}&tag=loss%2Ftrain"))
     assert len(curve) == 5
     images = json.loads(get("plugin/images/tags"))
-    tag = "new concept/square diagonal to triangle"
+    tag = "pictures/new concept/square diagonal to triangle"
     assert tag in images[run]
     entry = json.loads(get(f"plugin/images/images?run={quoted}&tag={urllib.parse.quote(tag, safe='')}&sample=0"))[0]
     assert get(f"plugin/images/individualImage?{entry['query']}").startswith(b"\x89PNG")
     experiment = json.loads(get("plugin/hparams/experiment", {"experimentName": "", "hparamsLimit": 100}))
-    assert {"model/components", "model/omega", "evaluation/temperature"} <= {info["name"] for info in experiment["hparamInfos"]}
-    assert "accuracy/new concept" in {metric["name"]["tag"] for metric in experiment["metricInfos"]}
+    # The tab shows the first five.
+    names = [info["name"] for info in experiment["hparamInfos"]]
+    assert names[:7] == ["K", "domain", "form", "method", "omega", "seed", "steps"]
+    assert "with evaluation/temperature" in names
+    assert "test results/accuracy/new concept" in {metric["name"]["tag"] for metric in experiment["metricInfos"]}
     projector = json.loads(get("plugin/projector/runs"))
     assert projector
     info = json.loads(get(f"plugin/projector/info?run={urllib.parse.quote(projector[0], safe='')}"))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from matplotlib.colors import to_hex
 
 from ftl_lightning.cli import main
 from ftl_lightning.concepts.composition import Composition
@@ -205,13 +206,15 @@ def test_the_quality_of_what_was_learned_is_told_and_drawn(model: FewShot) -> No
 
 
 def test_own_data_is_drawn_with_its_demonstrations_above_on_one_scale() -> None:
-    from ftl_lightning.domains.line_plots import beside
+    from ftl_lightning.domains.line_plots import PLAIN, RIGHT, WRONG, beside
 
-    figure = beside(("x", "y"))(torch.zeros(2, 9, 2), torch.full((9, 9, 2), 3.0), "a title")
+    figure = beside(("x", "y"))(torch.zeros(2, 9, 2), torch.full((9, 9, 2), 3.0), "a title", [True] * 8 + [False])
     drawn = [axes for axes in figure.axes if axes.lines]
     assert len(drawn) == 11
     assert len({axes.get_xlim() for axes in drawn}) == 1
     assert [axes.get_ylabel() for axes in drawn if axes.get_ylabel()] == ["demonstrations", "samples"]
+    frames = [to_hex(axes.spines["left"].get_edgecolor()) for axes in drawn]
+    assert frames == [PLAIN] * 2 + [RIGHT] * 8 + [WRONG]
 
 
 def test_an_adapter_that_is_named_beside_the_choice_is_of_the_named_rank(model: FewShot) -> None:

@@ -1,4 +1,5 @@
 import math
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -449,9 +450,13 @@ def test_the_projector_names_the_components_of_every_mode(tiny: Path) -> None:
         module = learn(tiny, modes=modes)
         module.on_validation_start()
         name = module.concepts[0]
-        own = [key for key in module.concept_embeddings() if key.startswith(name + " [")]
-        parts = ["", *(f"mode {mode}, " for mode in range(1, count + 1))]
-        assert own == [f"{name} [{part}component {number}]" for part in parts for number in (1, 2)]
+        points = module.concept_points()
+        own = [point.part for point in points if point.text == name]
+        assert [(part.mode, part.component) for part in own if part] == [
+            (mode, number) for mode in (None, *range(1, count + 1)) for number in (1, 2)
+        ]
+        sets = Counter(point.set for point in points)
+        assert sets == {"empty concept": 1, "training concept": 12, "new component": len(module.concepts) * 2 * (1 + count)}
 
 
 def test_settings_that_came_later_are_known_by_their_other_values_alone(tiny: Path) -> None:

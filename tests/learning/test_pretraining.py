@@ -56,7 +56,7 @@ def test_training_lowers_the_loss(tiny: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(tiny.parent)).Reload()
-    losses = [event.value for event in events.Scalars("val/loss")]
+    losses = [event.value for event in events.Scalars("loss/val")]
     assert len(losses) == 2
     assert losses[-1] < losses[0] < 1.0
 

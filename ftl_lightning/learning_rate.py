@@ -1,0 +1,39 @@
+"""The learning rate as a curve, of whatever learns."""
+
+import re
+from typing import Any
+
+import lightning.pytorch as pl
+from torch.optim import Optimizer
+
+TAG = "optimizer/learning rate"
+
+
+class LearningRate(pl.Callback):
+    """Logs the rate of each step that is taken.
+
+    An optimiser with several groups of parameters has a curve for each name of a group's first parameter, without numbers: adapters
+    have a group for every factor.
+    """
+
+    def on_before_optimizer_step(self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer) -> None:
+        """Log the rates of the step that follows."""
+        pl_module.log_dict(rates(pl_module, optimizer), on_step=True, on_epoch=False)
+
+
+def rates(module: pl.LightningModule, optimizer: Optimizer) -> dict[str, float]:
+    """The learning rates by tag.
+
+    Args:
+        module: whose parameters they are of.
+        optimizer: what learns them.
+    """
+    groups: list[dict[str, Any]] = optimizer.param_groups
+    if len(groups) == 1:
+        return {TAG: float(groups[0]["lr"])}
+    names = {id(parameter): name for name, parameter in module.named_parameters()}
+    return {f"{TAG}/{_label(names.get(id(group['params'][0]), 'others'))}": float(group["lr"]) for group in groups}
+
+
+def _label(name: str) -> str:
+    return re.sub(r"\.\d+(?=\.|$)", "", name)
