@@ -124,7 +124,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 def _file(metric: str) -> str:
     """A name in the domain's folder, whatever the metric is called; no hidden one."""
-    return re.sub(r"[^\w+-]", "_", metric)[:100]
+    return re.sub(r"[^\w+-]+", "_", metric).strip("_")[:100] or "_"
 
 
 def _splice(path: Path, text: str) -> None:

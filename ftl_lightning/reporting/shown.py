@@ -72,8 +72,10 @@ def learned_settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
 
 
 def metrics(domain: Domain) -> tuple[str, ...]:
-    """What the methods are compared by: the main metric, success in closed loop, the headline, and the paper's."""
-    executed = [EXECUTED] if domain.closed_loop else []
+    """What the methods are compared by: the main metric, success in closed loop and what goes wrong there, the headline, and the
+    paper's.
+    """
+    executed = [EXECUTED, *(f"{CLOSED} {outcome}" for outcome in domain.closed_loop.less_is_better)] if domain.closed_loop else []
     names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(number.metric for number in published(domain))))
     return tuple(name for name in names if name)
 
