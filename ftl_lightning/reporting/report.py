@@ -68,8 +68,6 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         headline += domain_tables[:1]
         if name in set(comparison["domain"]):
             domain_tables += _compared(domain, comparison, out / name)
-            for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
-                _save(comparison_bars(domain, comparison, metric), out / name / f"comparison_{_file(metric)}.png")
         elif any(method.name != OURS for method in methods(compared(domain, ablations))):
             domain_tables += _compared(domain, as_learned_most(domain, select(ablations, domain=name)), out / name)
         if name in set(curves["domain"]):
@@ -122,7 +120,9 @@ def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
 
 
 def _compared(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
-    """Tables of all methods of a domain."""
+    """Tables and figures of all methods of a domain."""
+    for metric in sorted(set(metrics(domain)) & set(compared(domain, rows)["metric"])):
+        _save(comparison_bars(domain, rows, metric), folder / f"comparison_{_file(metric)}.png")
     return [_written(table, folder) for table in (*headline_tables(domain, rows), *comparison_tables(domain, rows))]
 
 
