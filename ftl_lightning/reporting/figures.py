@@ -1,5 +1,6 @@
 """Figures from results."""
 
+import textwrap
 from collections.abc import Mapping, Sequence, Set
 
 import pandas as pd
@@ -36,6 +37,11 @@ WIDEST = 60.0
 
 def _width(inches: float) -> float:
     return min(inches, WIDEST)
+
+
+def _wrapped(setting: str) -> str:
+    """In lines that stand beside each other without touching."""
+    return textwrap.fill(figure_text(setting), 18, break_long_words=False)
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
@@ -77,7 +83,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
             if reference:
                 line = LINES[index % len(LINES)]
                 axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=once(policy))  # type: ignore[arg-type]
-    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], [*map(figure_text, shown)])
+    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], [*map(_wrapped, shown)])
     axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(f"{domain.name}, {how}"))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
@@ -121,7 +127,7 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
             mean = select(policy_rows, setting=shown[place])["value"].mean()
             span, line = (place - 0.45, place + 0.45), LINES[index % len(LINES)]
             axes.hlines(mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
-    axes.set_xticks(range(len(shown)), [*map(figure_text, shown)])
+    axes.set_xticks(range(len(shown)), [*map(_wrapped, shown)])
     axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(domain.name))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
