@@ -23,24 +23,29 @@ OF_METHODS: Mapping[Compared, str] = {
     Compared("language"): "#cc79a7",
     Compared(FINE_TUNED): "#882255",
 }
-COLOURS = tuple(dict.fromkeys(OF_METHODS.values()))
+SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
+"""Of methods of one's own, before those of methods that a figure does not show."""
+COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)
 """In this order where lines are no methods."""
 PAPER = "#9a9a9a"
 
 
 def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
-    """A colour for each name: its method's own; of several names of one method the first has it, and the others have what is left.
+    """A colour for each name: its method's own; of several names of one method the others have one of its other forms'.
 
     Args:
-        named: what a figure shows, with the method that it is of; a method of one's own has what is left, too.
+        named: what a figure shows, with the method that it is of; a method of one's own has a spare colour.
     """
     found: dict[str, str] = {}
-    waiting = []
+    waiting: dict[str, Compared] = {}
     for name, method in named:
         own = OF_METHODS.get(method)
         if own is None or own in found.values():
-            waiting.append(name)
+            waiting[name] = method
         else:
-            found.setdefault(name, own)
-    left = [colour for colour in reversed(COLOURS) if colour not in found.values()] or list(COLOURS)
-    return found | {name: left[index % len(left)] for index, name in enumerate(waiting) if name not in found}
+            found[name] = own
+    for name, method in waiting.items():
+        forms = [colour for known, colour in OF_METHODS.items() if known.name == method.name]
+        left = [colour for colour in (*forms, *SPARE, *reversed(COLOURS)) if colour not in found.values()]
+        found[name] = left[0] if left else COLOURS[len(found) % len(COLOURS)]
+    return found

@@ -109,8 +109,8 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
                     cells = beside(number, lookup(domain, setting, metric, method=method))
                     lines.append([setting, metric, label(*method), _told(tested.get(method)), *cells])
     caption = (
-        f"{domain.name}: all methods{_learned_from(rows)}; ours is so much better ({label(*domain.ours)}), mean ± standard error "
-        "over tasks"
+        f"{domain.name}: all methods{_learned_from(rows)}, mean ± standard error over tasks; ours is: by how much "
+        f"{label(*domain.ours)} is better"
     )
     return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", "ours is", *BESIDE])
 
@@ -228,7 +228,12 @@ def overview_tables(results: pd.DataFrame) -> list[Table]:
         caption = f"The other methods, mean ± standard error over tasks{_brackets(results)}"
         shown = whole.cells[[subject, *others[start : start + step]]]
         found.append(Table("overview_methods" + (f"_{start // step + 1}" if start else ""), caption, shown))
-    lines = [[_subject(*line), _references(line[0], results, *line[1:])] for line in shown_lines(results)]
+    lines = [
+        [_subject(*line), _references(domain, rows, references, *line[1:])]
+        for domain in _domains(results)
+        for rows, references in [(compared(domain, results), reference_lines(domain, results))]
+        for line in shown_lines(select(results, domain=domain.name))
+    ]
     caption = "Reference lines: chance, trivial policies and oracles, the least first"
     references = Table("overview_references", caption, pd.DataFrame(lines, columns=[subject, "reference lines"], dtype=str))
     return [*found, references]
@@ -259,8 +264,9 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
     alone = [method for method in columns if method not in forms]
     first, rest = [method for method in alone if method == PAPERS_METHOD], [method for method in alone if method != PAPERS_METHOD]
     cells = []
+    rows_of = {domain.name: compared(domain, results) for domain, *_ in {line[0].name: line for line in lines}.values()}
     for domain, setting, metric in lines:
-        rows = compared(domain, results)
+        rows = rows_of[domain.name]
         lead = least_certain(_leads(domain, rows, setting, metric))
         form = f"{domain.ours.form}: " if domain.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
@@ -295,8 +301,7 @@ def _subject(domain: Domain, setting: str, metric: str) -> str:
     return f"{domain.name}: {setting}, {metric}"
 
 
-def _references(domain: Domain, results: pd.DataFrame, setting: str, metric: str) -> str:
-    rows, references = compared(domain, results), reference_lines(domain, results)
+def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str) -> str:
     agreeing = _agreeing(domain, of_method(select(rows, setting=setting), domain.ours)) if metric == domain.headline else {}
     return _means(select(references, setting=setting, metric=metric), agreeing)
 
