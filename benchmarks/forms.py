@@ -224,15 +224,17 @@ def page(content: Mapping[str, Any]) -> str:
                 f"| {one['spread']:.2f} ({one['least spread']:.2f}) | {one['novelty']:.2f} | {rough} |"
             )
     if relations := content["families"].get("relations"):
-        told += ["", "| relation | own | left out | in span | right: one set | adapter | modes | chosen | novelty | forms chosen |"]
-        told += ["|---|---|---|---|---|---|---|---|---|---|"]
+        lost = ["", "| relation | own | left out | in span | forms chosen |", "|---|---|---|---|---|"]
+        judged = ["", "| relation | right: one set | adapter | modes | chosen | novelty |", "|---|---|---|---|---|---|"]
         for kind, seeds in relations.items():
             entries = list(seeds.values())
             losses = [np.mean([entry["choice"][name] for entry in entries]) for name in LOSSES]
             right = [np.mean([entry[form]["recognised"] for entry in entries]) for form in (ONE, ADAPTED, MODES, AUTO)]
             new = np.mean([entry[AUTO]["novelty"] for entry in entries])
             chosen = ", ".join(entry["choice"]["form"] for entry in entries)
-            told.append(f"| {kind} | {' | '.join(f'{value:.2f}' for value in (*losses, *right, new))} | {chosen} |")
+            lost.append(f"| {kind} | {' | '.join(f'{value:.2f}' for value in losses)} | {chosen} |")
+            judged.append(f"| {kind} | {' | '.join(f'{value:.2f}' for value in (*right, new))} |")
+        told += [*lost, *judged]
         ranks = content["rank correlation, relations"]
         told += ["", "| form | losses whose sum is to tell | rank correlation with the share of right samples |", "|---|---|---|"]
         told += [f"| {form} | {'; '.join(PREDICTED[form])} | {value:.2f} |" for form, value in ranks.items()]

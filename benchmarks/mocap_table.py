@@ -60,46 +60,47 @@ def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines))
 
 
-def new_concepts(rows: pd.DataFrame, task: str, columns: Sequence[tuple[str, str, int]]) -> str:
+def new_concepts(rows: pd.DataFrame, task: str, columns: Sequence[tuple[str, tuple[str, ...], int]]) -> str:
     """A line for each method.
 
     Args:
         rows: of the results.
         task: the concept.
-        columns: name, metric and digits of each.
+        columns: name, metrics and digits of each.
     """
     lines = []
     for name, method, form, components in METHODS:
         own = selected(rows, method, form, components)
-        line = [cell(values(own, NEW, task, metric), digits) for _, metric, digits in columns]
-        if set(line) != {"-"}:
-            lines.append([name, *line])
+        told = [[cell(values(own, NEW, task, metric), digits) for metric in metrics] for _, metrics, digits in columns]
+        if {one for cells in told for one in cells} != {"-"}:
+            lines.append([name, *map(", ".join, told)])
     return table([f"{task} from new initial poses", *(name for name, *_ in columns)], lines)
 
 
 def compositions(rows: pd.DataFrame) -> str:
     """What the judge says of arms and trunk, and of the legs."""
-    lines = []
+    columns = [[*(f"{task}, by parts" for task in BOTH), *(f"{task}, whole body" for task in BOTH)]]
+    head = ["compositions, judge"]
     for name, method, form, components in METHODS:
         own = selected(rows, method, form, components)
-        line = [cell(values(own, setting, task, "accuracy")) for setting in (PARTS, WHOLE) for task in BOTH]
-        if set(line) != {"-"}:
-            lines.append([name, *line])
-    head = [*(f"{task}, by parts" for task in BOTH), *(f"{task}, whole body" for task in BOTH)]
-    return table(["compositions, judge", *head], lines)
+        column = [cell(values(own, setting, task, "accuracy")) for setting in (PARTS, WHOLE) for task in BOTH]
+        if set(column) != {"-"}:
+            head.append(name)
+            columns.append(column)
+    return table(head, list(zip(*columns, strict=True)))
 
 
 def protocol(rows: pd.DataFrame) -> str:
     """The paper's form of the concept from the demonstrations' last states."""
     own = rows[(rows["method"] == "FTL-IGM") & rows["setting"].isin((LAST, LAST_BOTH))]
-    lines = []
+    columns = [[f"{task}, {said}" for task in (JACKS, CIRCLE) for said in ("rule", "judge")] + [f"{task}, judge" for task in BOTH]]
+    head = ["the paper's form of the concept, from last states"]
     for (components, shown), part in own.groupby(["K", "demonstrations"]):
         alone = [cell(values(part, LAST, task, metric)) for task in (JACKS, CIRCLE) for metric in ("rule", "accuracy")]
         both = [cell(values(part, LAST_BOTH, task, "accuracy")) for task in BOTH]
-        lines.append([f"K = {components}, {shown} demonstrations", *alone, *both])
-    head = [f"{task}, {said}" for task in (JACKS, CIRCLE) for said in ("rule", "judge")]
-    head += [f"{task}, judge" for task in BOTH]
-    return table(["the paper's form of the concept, from last states", *head], lines)
+        head.append(f"K = {components}, {shown} demonstrations")
+        columns.append([*alone, *both])
+    return table(head, list(zip(*columns, strict=True)))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -111,22 +112,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = pd.read_csv(chosen.results, keep_default_na=False, na_values={"value": [""]})
     rows["K"] = rows["K"].replace("", 0).astype(int)
     jacks = (
-        ("rule", "rule", 2),
-        ("level starts", "level", 2),
-        ("strides", "strides", 2),
-        ("feet in time", "feet in time", 2),
-        ("hands, m", "amplitude of hands", 2),
-        ("feet, m", "amplitude of feet", 2),
-        ("judge", "accuracy", 2),
-        ("jerk", "jerk", 0),
+        ("rule", ("rule",), 2),
+        ("level starts", ("level",), 2),
+        ("strides", ("strides",), 2),
+        ("feet in time", ("feet in time",), 2),
+        ("hands, feet, m", ("amplitude of hands", "amplitude of feet"), 2),
+        ("judge", ("accuracy",), 2),
+        ("jerk", ("jerk",), 0),
     )
     circle = (
-        ("rule", "rule", 2),
-        ("level starts", "level", 2),
-        ("strides", "strides", 2),
-        ("degrees turned", "degrees turned", 0),
-        ("judge", "accuracy", 2),
-        ("jerk", "jerk", 0),
+        ("rule", ("rule",), 2),
+        ("level starts", ("level",), 2),
+        ("strides", ("strides",), 2),
+        ("degrees turned", ("degrees turned",), 0),
+        ("judge", ("accuracy",), 2),
+        ("jerk", ("jerk",), 0),
     )
     parts = [new_concepts(rows, JACKS, jacks), new_concepts(rows, CIRCLE, circle), compositions(rows), protocol(rows)]
     write_text(chosen.out, "\n\n".join(parts) + "\n")

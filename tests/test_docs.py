@@ -46,6 +46,11 @@ def targets(text: str) -> list[str]:
     return [target for target in found if not re.match(r"[a-z]+:|#", target)]
 
 
+def included(page: Path) -> list[Path]:
+    """Files that a page includes."""
+    return [(page.parent / name).resolve() for name in INCLUDED.findall(page.read_text(encoding="utf-8"))]
+
+
 def commands(text: str) -> list[tuple[str, list[str]]]:
     """The verb and the configuration files of every command that a page shows."""
     return [(verb, CONFIG.findall(options)) for verb, options in COMMAND.findall(text)]

@@ -617,7 +617,7 @@ def test_outputs_work_where_the_terminal_knows_ascii_alone(tmp_path: Path) -> No
     append_rows(tmp_path / "in" / "r.csv", rows)
     done = run("report", "--results=in", "--out=out", env=ASCII, capture_output=True)
     assert done.returncode == 0, done.stderr
-    assert "| new ? | 0.30 ? 0.10" in done.stdout.decode("ascii")
+    assert "| new ? | FTL-IGM | 0.30 ? 0.10" in done.stdout.decode("ascii")
     assert "0.30 ± 0.10" in Path("out/strange/accuracy.md").read_text(encoding="utf-8")
     done = run("study-report", str(strange_key(tmp_path)), env=ASCII, capture_output=True)
     assert done.returncode == 0, done.stderr

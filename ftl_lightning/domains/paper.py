@@ -64,8 +64,11 @@ class Paper:
         numbers: all of them.
         omega: guidance weight of two components in the paper's main figures, as text.
         ours: guidance weight that our main tables compare with it, as text.
+        comparable: whether its numbers were measured as ours are. Where they were not, such as on a robot, reports show none of
+            them beside ours.
     """
 
     numbers: tuple[Published, ...]
     omega: str
     ours: str
+    comparable: bool = True

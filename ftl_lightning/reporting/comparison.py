@@ -6,10 +6,10 @@ from itertools import zip_longest
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import CHOSEN, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
+from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
 from ftl_lightning.evaluation.results import METHOD, REFERENCE, label, latest
 from ftl_lightning.learning.methods import load_method
-from ftl_lightning.reporting.paired import leads, least_certain, same_outcome, signed
+from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome, signed
 from ftl_lightning.reporting.shown import (
     domain_of,
     headlines,
@@ -22,9 +22,11 @@ from ftl_lightning.reporting.shown import (
 )
 from ftl_lightning.reporting.tables import (
     MISSING,
+    MOST_COLUMNS,
     Number,
     Table,
     against,
+    as_learned_most,
     difference_to,
     make_table,
     of_method,
@@ -36,12 +38,33 @@ from ftl_lightning.reporting.tables import (
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
 """The paper's, by their names in tables."""
 LANGUAGE = BASELINES[-1]
-METHODS = (PAPERS_METHOD, Compared(OURS, CHOSEN), Compared(OURS, WITH_MODES), *map(Compared, BASELINES))
-"""The order of methods in tables; others come after them."""
+METHODS = (
+    PAPERS_METHOD,
+    Compared(OURS, CHOSEN),
+    Compared(OURS, WITH_MODES),
+    *map(Compared, BASELINES),
+    Compared(FINE_TUNED),
+)
+"""The order of methods in tables; other forms of ours come after ours, other methods come last."""
 ALIKE = 0.9
 """In this share of episodes, at least, a reference policy ends as ours does to be told."""
-LINES = 8
+LINES = 10
 """At most, of the short overview."""
+
+
+def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
+    """Rows of all domains in which a baseline was measured: those of the comparison, and of domains without such, of ablations.
+
+    Args:
+        comparison, ablations: rows of the results; of the latter each method is taken as it was learned mostly.
+    """
+    compared_domains = set(comparison["domain"])
+    others = [
+        as_learned_most(domain_of(str(name), rows), rows)
+        for name, rows in ablations.groupby("domain")
+        if name not in compared_domains and set(rows["method"]) & set(BASELINES)
+    ]
+    return pd.concat([comparison, *others], ignore_index=True) if others else comparison
 
 
 def reference_lines(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
@@ -58,37 +81,53 @@ def methods(rows: pd.DataFrame) -> list[Compared]:
     """The methods among the rows, each in its forms: ours, the paper's baselines, and others as they appear."""
     learned = rows[rows["role"] == METHOD]
     measured = dict.fromkeys(map(Compared, learned["method"], learned["form"]))
-    return [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
+    found = [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
+    return sorted(found, key=lambda method: method.name != OURS)
+
+
+def comparison_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
+    """All methods, and all reference lines."""
+    return [table for table in (comparison_table(domain, results), references_table(domain, results)) if not table.cells.empty]
 
 
 def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
-    """One line for each setting, metric and method: measured, its errors, the paper's number, the difference, the paired test.
+    """One line for each setting, metric and method: the paired test, measured, its errors, the paper's number, the difference.
 
     Args:
         domain: whose.
         results: with rows of it.
         shown: metrics; those that methods are compared by where none are named.
     """
-    rows, references = compared(domain, results), reference_lines(domain, results)
+    rows = compared(domain, results)
     lines = []
     for setting in settings(domain, rows):
         for metric in shown or metrics(domain):
-            method_rows, reference_rows = (select(table, setting=setting, metric=metric) for table in (rows, references))
-            names = sorted(set(reference_rows["method"]))
-            numbers = [(method, summarise(of_method(method_rows, method))) for method in methods(rows)]
-            numbers += [(Compared(name), summarise(select(reference_rows, method=name))) for name in names]
-            tested = {
-                lead.baseline: [signed(lead.difference), lead.shown]
-                for lead in leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
-            }
-            for method, number in numbers:
-                if number:
+            method_rows = select(rows, setting=setting, metric=metric)
+            tested = {lead.baseline: lead for lead in _leads(domain, rows, setting, metric)}
+            for method in methods(rows):
+                if number := summarise(of_method(method_rows, method)):
                     cells = beside(number, lookup(domain, setting, metric, method=method))
-                    lines.append([setting, metric, label(*method), *cells, *tested.get(method, [MISSING, MISSING])])
-    caption = f"{domain.name}: all methods{_learned_from(rows)}"
-    return make_table(
-        domain, "comparison", caption, lines, ["setting", "metric", "method", *BESIDE, "ours is better by", "ours is"]
+                    lines.append([setting, metric, label(*method), _told(tested.get(method)), *cells])
+    caption = (
+        f"{domain.name}: all methods{_learned_from(rows)}, mean ± standard error over tasks; ours is: by how much "
+        f"{label(*domain.ours)} is better"
     )
+    return make_table(domain, "comparison", caption, lines, ["setting", "metric", "method", "ours is", *BESIDE])
+
+
+def references_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
+    """One line for each setting, metric and reference line; see :func:`comparison_table`."""
+    references = reference_lines(domain, results)
+    lines = []
+    for setting in settings(domain, references):
+        for metric in shown or metrics(domain):
+            measured = select(references, setting=setting, metric=metric)
+            for name in sorted(set(measured["method"])):
+                if number := summarise(select(measured, method=name)):
+                    lines.append([setting, metric, name, *beside(number, None)[:2]])
+    caption = f"{domain.name}: reference lines (chance, trivial policies and oracles), mean ± standard error over tasks"
+    columns = ["setting", "metric", "reference line", *BESIDE[:2]]
+    return make_table(domain, "comparison_references", caption, lines, columns)
 
 
 def _learned_from(rows: pd.DataFrame) -> str:
@@ -99,13 +138,13 @@ def _learned_from(rows: pd.DataFrame) -> str:
     return f", learned from {few} demonstrations"
 
 
-BESIDE = ("measured", "standard error over tasks", "spread over seeds", "paper", "difference")
+BESIDE = ("measured", "spread over seeds", "paper", "difference")
 
 
 def beside(number: Number, papers: Published | None) -> list[str]:
     """The columns :data:`BESIDE`."""
-    error, spread = (MISSING if value is None else f"{value:.2f}" for value in (number.error, number.spread))
-    return [f"{number.mean:.2f}", error, spread, paper(papers), difference_to(papers, number)]
+    spread = MISSING if number.spread is None else f"{number.spread:.2f}"
+    return [number.with_error(), spread, paper(papers), difference_to(papers, number)]
 
 
 def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
@@ -114,66 +153,170 @@ def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
     return [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and same)]
 
 
-def overview(results: pd.DataFrame) -> Table:
-    """All domains on one screen: ours and the baselines, the paper's numbers in brackets."""
-    columns = methods(results)
-    lines = []
-    for domain in _domains(results):
-        rows, references = compared(domain, results), reference_lines(domain, results)
-        for setting in settings(domain, rows):
-            for metric in metrics(domain):
-                if not select(rows, setting=setting, metric=metric).empty:
-                    lines.append(_line(domain, rows, references, setting, metric, columns))
-    return _overview(results, lines, columns)
+def _leads(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> list[Lead]:
+    method_rows = select(rows, setting=setting, metric=metric)
+    return leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
 
 
-def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines: of each domain in turn what says most; modes only where no form is chosen."""
-    columns = methods(results)
-    if Compared(OURS, CHOSEN) in columns:
-        columns = [method for method in columns if method != Compared(OURS, WITH_MODES)]
+def _told(lead: Lead | None) -> str:
+    return MISSING if lead is None else f"{signed(lead.difference)}, {lead.shown}"
+
+
+def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
+    """Domain, setting and metric of all in which ours and a baseline were measured, in the order of the overview."""
+    return [
+        (domain, setting, metric)
+        for domain in _domains(results)
+        for rows in [compared(domain, results)]
+        for setting in settings(domain, rows)
+        for metric in metrics(domain)
+        if _comparable(domain, rows, setting, metric)
+    ]
+
+
+def short_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
+    """Of :func:`shown_lines` at most :data:`LINES`: of each domain in turn what says most."""
     lines = {
         domain.name: [
-            _line(domain, rows, reference_lines(domain, results), setting, metric, columns)
-            for setting, metric in headlines(domain, rows)
+            (domain, setting, metric) for setting, metric in headlines(domain, rows) if _comparable(domain, rows, setting, metric)
         ]
         for domain in _domains(results)
         for rows in [compared(domain, results)]
     }
     shown = [line for turn in zip_longest(*lines.values()) for line in turn if line][:LINES]
-    shown.sort(key=lambda line: list(lines).index(line[0]))
-    return _overview(results, shown, columns)
+    return sorted(shown, key=lambda line: list(lines).index(line[0].name))
 
 
-def _overview(results: pd.DataFrame, lines: list[list[str]], methods: Sequence[Compared]) -> Table:
-    papers = " [the paper's]" if any(map(published, _domains(results))) else ""
+def _comparable(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> bool:
+    """Whether there is something to compare: several methods, or the only ones that there are."""
+    measured = methods(select(rows, setting=setting, metric=metric))
+    return len({method.name for method in measured}) > 1 or (bool(measured) and len(set(rows["method"])) == 1)
+
+
+OTHER_FORMS = "other forms"
+"""The column of ours in other forms than the paper's."""
+
+
+def overview(results: pd.DataFrame) -> Table:
+    """All domains: who is ahead, ours and the baselines, the paper's numbers in brackets.
+
+    Args:
+        results: rows of a comparison; see :func:`all_methods`.
+    """
+    return _overview(results, shown_lines(results), methods(results))
+
+
+def short_overview(results: pd.DataFrame) -> Table:
+    """The overview in at most :data:`LINES` lines; of other forms the one that is chosen, and the domain's own."""
+    domains = _domains(results)
+    own = {domain.ours for domain in domains}
+    columns = [
+        method for method in methods(results) if method.name != OURS or not method.form or method in own or CHOSEN in method.form
+    ]
+    return _overview(results, short_lines(results), columns)
+
+
+def overview_tables(results: pd.DataFrame) -> list[Table]:
+    """The overview for pages, in tables of few columns: who is ahead and our forms, the other methods, the reference lines."""
+    whole = overview(results)
+    subject, lead, *columns = whole.cells.columns
+    ours = [name for name in columns if name in (label(*PAPERS_METHOD), OTHER_FORMS)]
+    others = [name for name in columns if name not in ours]
+    found = [Table("overview", whole.caption, whole.cells[[subject, lead, *ours]])]
+    step = MOST_COLUMNS - 1
+    for start in range(0, len(others), step):
+        caption = f"The other methods, mean ± standard error over tasks{_brackets(results)}"
+        shown = whole.cells[[subject, *others[start : start + step]]]
+        found.append(Table("overview_methods" + (f"_{start // step + 1}" if start else ""), caption, shown))
+    lines = [
+        [_subject(*line), _references(domain, rows, references, *line[1:])]
+        for domain in _domains(results)
+        for rows, references in [(compared(domain, results), reference_lines(domain, results))]
+        for line in shown_lines(select(results, domain=domain.name))
+    ]
+    caption = "Reference lines: chance, trivial policies and oracles, the least first"
+    references = Table("overview_references", caption, pd.DataFrame(lines, columns=[subject, "reference lines"], dtype=str))
+    return [*found, references]
+
+
+def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
+    """What says most of a domain: a line for each method, and for each reference line, a column for each setting and metric."""
+    rows, references = compared(domain, results), reference_lines(domain, results)
+    shown = headlines(domain, rows)[: MOST_COLUMNS - 1]
+    heads = [f"{setting}, {metric}" for setting, metric in shown]
+    lines = [[label(*method), *(_cell(domain, rows, method, *line) for line in shown)] for method in methods(rows)]
+    marks = " [the paper's]" if published(domain) else ""
+    found = [("headline", f"{domain.name}: mean ± standard error over tasks{marks}", "method", lines)]
+    named = [(str(name), select(references, method=name)) for name in sorted(set(references["method"]))]
+    lines = [[name, *(_mean(select(own, setting=setting, metric=metric)) for setting, metric in shown)] for name, own in named]
+    found += [("headline_references", f"{domain.name}: reference lines", "reference line", lines)]
+    tables = [
+        Table(
+            name, caption, pd.DataFrame([line for line in lines if set(line[1:]) != {MISSING}], columns=[head, *heads], dtype=str)
+        )
+        for name, caption, head, lines in found
+    ]
+    return [table for table in tables if not table.cells.empty]
+
+
+def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], columns: Sequence[Compared]) -> Table:
+    forms = [method for method in columns if method.name == OURS and method != PAPERS_METHOD]
+    alone = [method for method in columns if method not in forms]
+    first, rest = [method for method in alone if method == PAPERS_METHOD], [method for method in alone if method != PAPERS_METHOD]
+    cells = []
+    rows_of = {domain.name: compared(domain, results) for domain, *_ in {line[0].name: line for line in lines}.values()}
+    for domain, setting, metric in lines:
+        rows = rows_of[domain.name]
+        lead = least_certain(_leads(domain, rows, setting, metric))
+        form = f"{domain.ours.form}: " if domain.ours.form and lead else ""
+        line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
+        line += [_cell(domain, rows, method, setting, metric) for method in first]
+        if forms:
+            told = [(method.form, _cell(domain, rows, method, setting, metric)) for method in forms]
+            line.append(", ".join(f"{form} {cell}" for form, cell in told if cell != MISSING) or MISSING)
+        cells.append([*line, *(_cell(domain, rows, method, setting, metric) for method in rest)])
+    head = ["domain: setting, metric", "lead", *(label(*method) for method in first)]
+    head += [OTHER_FORMS] * bool(forms) + [label(*method) for method in rest]
+    unpublished = [domain.name for domain in _domains(results) if not published(domain)]
+    ours = ""
+    if forms and 0 < len(unpublished) < len(_domains(results)):
+        named = " and ".join(unpublished)
+        ours = f". {label(*PAPERS_METHOD)}: the paper's form of the concept; in {named} network, view and loss are ours"
     caption = (
-        f"Ours and the baselines, mean ± standard error over tasks{papers}; lead: by how much ours is better than the best baseline"
+        f"Ours and the baselines, mean ± standard error over tasks{_brackets(results)}; lead: by how much ours is better than the "
+        f"best baseline{ours}"
     )
-    columns = ["domain", "setting, metric", *(label(*method) for method in methods), "lead", "reference lines"]
-    return Table("overview", caption, pd.DataFrame(lines, columns=columns, dtype=str))
+    return Table("overview", caption, pd.DataFrame(cells, columns=head, dtype=str))
+
+
+def _brackets(results: pd.DataFrame) -> str:
+    return " [the paper's, in the same setting]" if any(map(published, _domains(results))) else ""
 
 
 def _domains(results: pd.DataFrame) -> list[Domain]:
     return [domain_of(name, results) for name in sorted(set(results["domain"]))]
 
 
-def _line(
-    domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str, columns: Sequence[Compared]
-) -> list[str]:
-    method_rows, reference_rows = (select(table, setting=setting, metric=metric) for table in (rows, references))
-    cells = [_cell(domain, method_rows, method, setting, metric) for method in columns]
-    lead = least_certain(leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric)))
+def _subject(domain: Domain, setting: str, metric: str) -> str:
+    return f"{domain.name}: {setting}, {metric}"
+
+
+def _references(domain: Domain, rows: pd.DataFrame, references: pd.DataFrame, setting: str, metric: str) -> str:
     agreeing = _agreeing(domain, of_method(select(rows, setting=setting), domain.ours)) if metric == domain.headline else {}
-    return [domain.name, f"{setting}, {metric}", *cells, MISSING if lead is None else str(lead), _means(reference_rows, agreeing)]
+    return _means(select(references, setting=setting, metric=metric), agreeing)
+
+
+def _mean(rows: pd.DataFrame) -> str:
+    number = summarise(rows)
+    return MISSING if number is None else number.with_error()
 
 
 def _cell(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> str:
-    number, papers = summarise(of_method(rows, method)), lookup(domain, setting, metric, method=method)
-    if number is None:
-        return MISSING
-    error = "" if number.error is None else f" ± {number.error:.2f}"
-    return f"{number.mean:.2f}{error}" + ("" if papers is None else f" [{papers.value:.2f}]")
+    text, papers = (
+        _mean(select(of_method(rows, method), setting=setting, metric=metric)),
+        lookup(domain, setting, metric, method=method),
+    )
+    return text if text == MISSING or papers is None else f"{text} [{papers.value:.2f}]"
 
 
 def _agreeing(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:

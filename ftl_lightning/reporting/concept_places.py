@@ -45,9 +45,9 @@ def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int =
     from sklearn.manifold import TSNE
 
     learned = [
-        (concept.origin.name, part.replace("component ", ""), embedding)
+        (concept.origin.name, name.replace("component ", ""), part.embedding)
         for concept in concepts
-        for part, (_, embedding) in concept.parts().items()
+        for name, part in concept.parts().items()
     ]
     embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for *_, embedding in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)

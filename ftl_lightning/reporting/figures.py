@@ -1,29 +1,31 @@
 """Figures from results."""
 
-import itertools
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Mapping, Sequence, Set
 
 import pandas as pd
-import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.paper import CHOSEN, OURS, Compared
 from ftl_lightning.escape import figure_text
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import REFERENCE, latest
 from ftl_lightning.evaluation.results import label as method_label
-from ftl_lightning.extras import expect_extra
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
+from ftl_lightning.reporting.colours import COLOURS, colours
+from ftl_lightning.reporting.colours import PAPER as PAPER_COLOUR
+from ftl_lightning.reporting.comparison import compared, methods, reference_lines, shown_lines
+from ftl_lightning.reporting.concept_places import concept_places
 from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.frontier import NOISY
 from ftl_lightning.reporting.shown import lookup, main_omega, settings
 from ftl_lightning.reporting.speed import Measured, reached
 from ftl_lightning.reporting.tables import labelled, main_rows, of_method, select, summarise
 
-PAPER_COLOUR = "#9a9a9a"
-COLOURS = ("#3f6fb5", "#4c9f70", "#e4704a", "#8a63b3", "#c9a227")
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
 """Of reference policies."""
 REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
@@ -34,6 +36,11 @@ WIDEST = 60.0
 
 def _width(inches: float) -> float:
     return min(inches, WIDEST)
+
+
+def _wrapped(setting: str) -> str:
+    """In lines that stand beside each other without touching."""
+    return textwrap.fill(figure_text(setting), 18, break_long_words=False)
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
@@ -51,6 +58,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     shown, learned = settings(domain, ours), sorted(set(ours["label"]))
     figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3.5), 3.4), layout="constrained")
     axes = figure.subplots()
+    colour_of = colours(_labelled_methods(ours))
     width = 0.8 / (len(learned) + 1)
     references = select(rows, role=REFERENCE)
     policies = sorted(set(references["label"]))
@@ -66,15 +74,15 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
         for index, label in enumerate(learned, start=1):
             number = summarise(select(ours, setting=setting, label=label))
             if number:
-                colour, where = COLOURS[(index - 1) % len(COLOURS)], place + index * width
-                axes.bar(where, number.mean, width, yerr=number.error, color=colour, capsize=2, label=once(label))
+                where = place + index * width
+                axes.bar(where, number.mean, width, yerr=number.error, color=colour_of[label], capsize=2, label=once(label))
         span = (place - width / 2, place + (len(learned) + 0.5) * width)
         for index, policy in enumerate(policies):
             reference = summarise(select(references, setting=setting, label=policy))
             if reference:
                 line = LINES[index % len(LINES)]
                 axes.hlines(reference.mean, *span, colors="black", linewidth=1, linestyles=line, label=once(policy))  # type: ignore[arg-type]
-    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], [*map(figure_text, shown)])
+    axes.set_xticks([place + width * len(learned) / 2 for place in range(len(shown))], [*map(_wrapped, shown)])
     axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(f"{domain.name}, {how}"))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
@@ -93,13 +101,12 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
     rows = compared(domain, results)
     rows = rows[rows["metric"] == metric]
     shown, names = settings(domain, rows), methods(compared(domain, results))
-    # The same colour in every domain, whichever methods it has.
-    colours = dict(zip(dict.fromkeys((*METHODS, *names)), itertools.cycle(COLOURS), strict=False))
+    colour_of = colours((method_label(*method), method) for method in names)
     width = 0.8 / len(names)
     figure = Figure(figsize=(_width(1.9 * max(len(shown), 2) + 3), 3.4), layout="constrained")
     axes = figure.subplots()
     for index, method in enumerate(names):
-        method_rows, colour = of_method(rows, method), colours[method]
+        method_rows, colour = of_method(rows, method), colour_of[method_label(*method)]
         for place, setting in enumerate(shown):
             where = place + (index - (len(names) - 1) / 2) * width
             label = None if place else figure_text(method_label(*method))
@@ -119,10 +126,100 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
             mean = select(policy_rows, setting=shown[place])["value"].mean()
             span, line = (place - 0.45, place + 0.45), LINES[index % len(LINES)]
             axes.hlines(mean, *span, colors="black", linewidth=1, linestyles=line, label=label)  # type: ignore[arg-type]
-    axes.set_xticks(range(len(shown)), [*map(figure_text, shown)])
+    axes.set_xticks(range(len(shown)), [*map(_wrapped, shown)])
     axes.set(ylim=(0, 1.05), ylabel=figure_text(metric), title=figure_text(domain.name))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
+
+
+MARKS = "os^Pv*X<h>p8d"
+"""Of methods in the overview, beside their colours."""
+ROW = 0.5
+"""Inches that a line of the overview is high."""
+
+
+def overview_dots(results: pd.DataFrame) -> Figure:
+    """All domains, settings and metrics of a comparison: a mark for each method, bars show standard errors over tasks.
+
+    Diamonds without filling are the paper's numbers, each beside the method that it is of; ticks are reference lines. Of ours in
+    other forms than the paper's those are shown that are chosen by themselves, and the domains' own.
+
+    Args:
+        results: see :func:`~ftl_lightning.reporting.comparison.all_methods`.
+    """
+    lines = shown_lines(results)
+    series = _series(methods(results), {domain.ours for domain, _, _ in lines})
+    colour_of = colours((label, forms[0]) for label, forms in series.items())
+    panels = {domain.name: [line for line in lines if line[0].name == domain.name] for domain, _, _ in lines}
+    sides: tuple[list[str], list[str]] = ([], [])
+    for name in panels:
+        min(sides, key=lambda side: sum(len(panels[shown]) + 1 for shown in side)).append(name)
+    most = max((sum(len(panels[name]) + 1 for name in side) for side in sides), default=1)
+    figure = Figure(figsize=(7.4, min(ROW * most + 0.9, WIDEST)), layout="constrained")
+    halves, legend = figure.subfigures(2, 1, squeeze=False, height_ratios=[ROW * most, 0.9])[:, 0]
+    for half, side in zip(halves.subfigures(1, 2, squeeze=False)[0], sides, strict=True):
+        if side:
+            spaces = [len(panels[name]) for name in side]
+            for axes, name in zip(half.subplots(len(side), 1, squeeze=False, height_ratios=spaces)[:, 0], side, strict=True):
+                _dots(axes, results, panels[name], series, colour_of)
+    handles = {
+        label: Line2D([], [], color=colour_of[label], marker=MARKS[index % len(MARKS)], linestyle="", markersize=5)
+        for index, label in enumerate(series)
+    }
+    handles["the paper's"] = Line2D([], [], color="black", marker="D", markerfacecolor="none", linestyle="", markersize=5)
+    handles["reference lines"] = Line2D([], [], color="black", marker="|", linestyle="", markersize=8)
+    legend.legend(list(handles.values()), list(map(figure_text, handles)), fontsize=8, loc="center", ncols=4, frameon=False)
+    return figure
+
+
+def _series(measured: Sequence[Compared], own: Set[Compared]) -> dict[str, list[Compared]]:
+    """What the overview's figure shows, by its label; forms that are chosen by themselves are one."""
+    series: dict[str, list[Compared]] = {}
+    for method in measured:
+        chosen = method.name == OURS and CHOSEN in method.form
+        if chosen or method.name != OURS or not method.form or method in own:
+            series.setdefault(method_label(OURS, CHOSEN) if chosen else method_label(*method), []).append(method)
+    return series
+
+
+def _dots(
+    axes: Axes,
+    results: pd.DataFrame,
+    lines: Sequence[tuple[Domain, str, str]],
+    series: Mapping[str, Sequence[Compared]],
+    colour_of: Mapping[str, str],
+) -> None:
+    """One domain's panel, the first line on top; in each line its name, reference lines, and the methods below each other."""
+    domain = lines[0][0]
+    rows, references = compared(domain, results), reference_lines(domain, results)
+    for place, (_, setting, metric) in enumerate(lines):
+        told = f"{setting}, {metric}" + (" (less is better)" if domain.less_is_better(metric) else "")
+        axes.text(0, place - 0.34, figure_text(told), fontsize=7, va="center")
+        means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean()
+        axes.plot(means, [place - 0.12] * len(means), "|", color="black", markersize=5, markeredgewidth=1)
+        for index, (label, forms) in enumerate(series.items()):
+            height = place + 0.4 * index / max(len(series) - 1, 1)
+            mark = {"color": colour_of[label], "markersize": 4}
+            for method in forms:
+                if number := summarise(select(of_method(rows, method), setting=setting, metric=metric)):
+                    axes.errorbar(number.mean, height, xerr=number.error, fmt=MARKS[index % len(MARKS)], elinewidth=1, **mark)  # type: ignore[arg-type]
+                    if papers := lookup(domain, setting, metric, method=method):
+                        between = [number.mean, papers.value]
+                        axes.plot(between, [height] * 2, color=colour_of[label], linewidth=0.5, linestyle="dotted")
+                        axes.plot(papers.value, height, "D", markerfacecolor="none", **mark)  # type: ignore[arg-type]
+        if place:
+            axes.axhline(place - 0.5, color=PAPER_COLOUR, linewidth=0.4)
+    axes.set(ylim=(len(lines) - 0.5, -0.5), yticks=[])
+    axes.set_xlim(-0.03, max(1.03, axes.get_xlim()[1]))
+    axes.tick_params(labelsize=7)
+    axes.grid(axis="x", linewidth=0.3)
+    axes.set_title(figure_text(domain.name), fontsize=9, loc="left", fontweight="bold")
+
+
+def _labelled_methods(rows: pd.DataFrame) -> list[tuple[str, Compared]]:
+    """Labels in their order, each with its method."""
+    known = rows.drop_duplicates("label").sort_values("label")
+    return [(str(row.label), Compared(str(row.method), str(row.form))) for row in known.itertuples()]
 
 
 def growth(domain: Domain, results: pd.DataFrame) -> Figure:
@@ -167,8 +264,9 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(_width(3.6 * max(len(shown), 1) + 2.2), 3.6), layout="constrained")
     panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     lines = labelled(rows[~rows["method"].isin(list(REFERENCE_MARKS))])
+    colour_of = colours(_labelled_methods(lines))
     for axes, panel in zip(panels, shown, strict=False):
-        for colour, label in zip(itertools.cycle(COLOURS), dict.fromkeys(lines["label"]), strict=False):
+        for label, colour in colour_of.items():
             means = (
                 select(lines, panel=panel, label=label)
                 .groupby("temperature", dropna=False)[["coverage", "accuracy"]]
@@ -216,7 +314,7 @@ def _range(lines: pd.DataFrame) -> str:
 
 
 def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> Figure:
-    """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008).
+    """t-SNE of training concepts and learned components (paper, figure 'tsne').
 
     Args:
         model: whose concept space it is.
@@ -226,25 +324,15 @@ def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0)
     Raises:
         UserError: without scikit-learn.
     """
-    expect_extra("notebooks", "concept_map")
-    from sklearn.manifold import TSNE
-
-    training = model.config.training_concepts
-    learned = [
-        (f"{concept.origin.name} [{name.replace('component ', '')}]", part.embedding)
-        for concept in concepts
-        for name, part in concept.parts().items()
-    ]
-    embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for _, embedding in learned)))
-    perplexity = min(10.0, (len(embeddings) - 1) / 3)
-    places = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
+    places = concept_places(model, concepts, seed)
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots()
-    axes.scatter(*places[: len(training)].T, color=PAPER_COLOUR, label="training concepts")
-    axes.scatter(*places[len(training) :].T, color=COLOURS[0], marker="^", label="learned components")
-    names = [*training, *(name for name, _ in learned)]
-    for place, name in zip(places, names, strict=True):
-        axes.annotate(figure_text(name), place, fontsize=6, xytext=(3, 3), textcoords="offset points")
+    kinds = (False, PAPER_COLOUR, "o", "training concepts"), (True, COLOURS[0], "^", "learned components")
+    for learned, colour, mark, label in kinds:
+        shown = [place for place in places if bool(place.component) == learned]
+        axes.scatter([place.x for place in shown], [place.y for place in shown], color=colour, marker=mark, label=label)
+    for place in places:
+        axes.annotate(figure_text(place.name), (place.x, place.y), fontsize=6, xytext=(3, 3), textcoords="offset points")
     axes.set(xticks=[], yticks=[], title=figure_text(f"{model.config.domain}: concepts, t-SNE"))
     axes.legend(fontsize=8)
     return figure

@@ -14,13 +14,21 @@ from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, METHOD
 from ftl_lightning.limits import read_text
 from ftl_lightning.printing import say
 from ftl_lightning.reporting.changes import changes_table
-from ftl_lightning.reporting.comparison import compared, comparison_table, methods, overview, short_overview
+from ftl_lightning.reporting.comparison import (
+    all_methods,
+    compared,
+    comparison_tables,
+    headline_tables,
+    methods,
+    overview_tables,
+    short_overview,
+)
 from ftl_lightning.reporting.curves import curves_table
-from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time
+from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, frontier, growth, learning_time, overview_dots
 from ftl_lightning.reporting.frontier import FRONTIER, frontier_table, read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.tables import Table, of_method, select, tables
+from ftl_lightning.reporting.tables import Table, as_learned_most, of_method, select, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
@@ -59,11 +67,9 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         domain_tables = _ablations(domain, ablations, out / name)
         headline += domain_tables[:1]
         if name in set(comparison["domain"]):
-            domain_tables.append(_written(comparison_table(domain, comparison), out / name))
-            for metric in sorted(set(metrics(domain)) & set(comparison.loc[comparison["domain"] == name, "metric"])):
-                _save(comparison_bars(domain, comparison, metric), out / name / f"comparison_{_file(metric)}.png")
+            domain_tables += _compared(domain, comparison, out / name)
         elif any(method.name != OURS for method in methods(compared(domain, ablations))):
-            domain_tables.append(_written(comparison_table(domain, ablations), out / name))
+            domain_tables += _compared(domain, as_learned_most(domain, select(ablations, domain=name)), out / name)
         if name in set(curves["domain"]):
             domain_tables.append(_written(curves_table(domain, curves), out / name))
             _save(growth(domain, curves), out / name / "curves.png")
@@ -75,9 +81,11 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
         everything += domain_tables
     if curve_by_name := read_speed(results):
         _save(learning_time(curve_by_name), out / "speed.png")
-    if not comparison.empty:
-        everything.append(_written(overview(comparison), out))
-        headline = [short_overview(comparison)]
+    beside = all_methods(comparison, ablations)
+    if not beside.empty:
+        everything += [_written(table, out) for table in overview_tables(beside)]
+        _save(overview_dots(beside), out / "overview.png")
+        headline = [short_overview(beside)]
     if readme:
         _splice(readme, "\n".join(table.markdown() for table in headline))
     return "\n".join(table.markdown() for table in everything)
@@ -111,6 +119,13 @@ def _ablations(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
     return written
 
 
+def _compared(domain: Domain, rows: pd.DataFrame, folder: Path) -> list[Table]:
+    """Tables and figures of all methods of a domain."""
+    for metric in sorted(set(metrics(domain)) & set(compared(domain, rows)["metric"])):
+        _save(comparison_bars(domain, rows, metric), folder / f"comparison_{_file(metric)}.png")
+    return [_written(table, folder) for table in (*headline_tables(domain, rows), *comparison_tables(domain, rows))]
+
+
 def _written(table: Table, folder: Path) -> Table:
     write_text(folder / f"{table.name}.md", table.markdown())
     write_text(folder / f"{table.name}.tex", table.latex())
@@ -124,7 +139,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 def _file(metric: str) -> str:
     """A name in the domain's folder, whatever the metric is called; no hidden one."""
-    return re.sub(r"[^\w+-]", "_", metric)[:100]
+    return re.sub(r"[^\w+-]+", "_", metric).strip("_")[:100] or "_"
 
 
 def _splice(path: Path, text: str) -> None:

@@ -72,8 +72,10 @@ def learned_settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
 
 
 def metrics(domain: Domain) -> tuple[str, ...]:
-    """What the methods are compared by: the main metric, success in closed loop, the headline, and the paper's."""
-    executed = [EXECUTED] if domain.closed_loop else []
+    """What the methods are compared by: the main metric, success in closed loop and what goes wrong there, the headline, and the
+    paper's.
+    """
+    executed = [EXECUTED, *(f"{CLOSED} {outcome}" for outcome in domain.closed_loop.less_is_better)] if domain.closed_loop else []
     names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(number.metric for number in published(domain))))
     return tuple(name for name in names if name)
 
@@ -94,8 +96,8 @@ def environments(domain: Domain) -> Sequence[str]:
 
 
 def published(domain: Domain) -> tuple[Published, ...]:
-    """The paper's numbers; none where there is no paper, and then tables have no columns for them."""
-    return domain.paper.numbers if domain.paper else ()
+    """The paper's numbers that were measured as ours are; where there are none, tables have no columns for them."""
+    return domain.paper.numbers if domain.paper and domain.paper.comparable else ()
 
 
 def main_omega(domain: Domain) -> str:
@@ -143,7 +145,7 @@ def paper_tasks(domain: Domain, setting: str) -> list[str]:
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
     """Settings and metrics that say most in few lines: those that the paper has numbers of, then the same settings in closed loop.
 
-    Without a paper the main metric of each setting.
+    Without a paper the first setting of the suite ``paper``, or all where it has none, each with its decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)
@@ -153,7 +155,9 @@ def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
         if not number.task and (number.method != OURS or (number.components, number.omega) == (2, papers_omega(domain)))
     }
     if not numbers:
-        return [(setting, domain.main_metric) for setting in measured_settings if (setting, domain.main_metric) in measured]
+        papers = [setting for setting in measured_settings if setting in _suite(domain, PAPER)][:1] or measured_settings
+        alone = [(setting, decisive(domain, rows[rows["setting"] == setting])) for setting in papers]
+        return [headline for headline in alone if headline in measured]
     reported = [(setting, metric) for setting in measured_settings for metric in metrics(domain) if (setting, metric) in numbers]
     executed = [(setting, domain.headline) for setting in dict.fromkeys(setting for setting, _ in reported)]
     return [headline for headline in dict.fromkeys((*reported, *executed)) if headline in measured]

@@ -2,8 +2,10 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import pandas as pd
 
@@ -20,6 +22,7 @@ from ftl_lightning.reporting.shown import (
     learned_settings,
     lookup,
     main_omega,
+    metrics,
     paper_tasks,
     papers_omega,
     policies,
@@ -32,6 +35,8 @@ USUAL_K = 2
 """Number of components of the main tables, the paper's."""
 LEARNED = "learned"
 """The guidance weight of components whose weights are learned."""
+MOST_COLUMNS = 8
+"""Of a table that a page of the documentation can show."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +56,12 @@ class Number:
     seeds: int
 
     def __str__(self) -> str:
-        error = "" if self.error is None else f" ± {self.error:.2f}"
         spread = "" if self.spread is None else f" (seeds {self.spread:.2f})"
-        return f"{self.mean:.2f}{error}{spread}"
+        return f"{self.with_error()}{spread}"
+
+    def with_error(self) -> str:
+        """Without the spread over seeds."""
+        return f"{self.mean:.2f}" + ("" if self.error is None else f" ± {self.error:.2f}")
 
 
 def summarise(rows: pd.DataFrame) -> Number | None:
@@ -133,28 +141,67 @@ PAPERS = ("paper", "difference")
 
 
 def make_table(domain: Domain, name: str, caption: str, lines: Sequence[Sequence[str]], columns: Sequence[str]) -> Table:
-    """A table, without the paper's columns where the domain has no numbers of a paper."""
+    """A table, without the paper's columns where the domain has no numbers of a paper, or none for any of the lines."""
     cells = pd.DataFrame(lines, columns=list(columns), dtype=str)
-    return Table(name, caption, cells if published(domain) else cells.loc[:, ~cells.columns.isin(PAPERS)])
+    told = bool(published(domain)) and any(set(cells[name]) - {MISSING} for name in PAPERS if name in cells)
+    return Table(name, caption, cells if told else cells.loc[:, ~cells.columns.isin(PAPERS)])
 
 
-def _cell(rows: pd.DataFrame) -> tuple[str, Number | None]:
+def _cell(rows: pd.DataFrame) -> str:
     """A number as a table shows it, with a mark if it was not measured as the caption says."""
     number = summarise(rows)
-    if number is None:
-        return MISSING, None
     marks = dict.fromkeys(rows["mark"]) if "mark" in rows else ()
-    return str(number) + "".join(marks), number
+    return MISSING if number is None else str(number) + "".join(marks)
 
 
-def _beside(papers: Published | None, measured: Sequence[pd.DataFrame]) -> list[str]:
-    """The paper's number, and each of ours with its difference from it."""
-    cells = map(_cell, measured)
-    return [paper(papers), *(text for shown, number in cells for text in (shown, difference_to(papers, number)))]
+BESIDE = ("method", "measured", *PAPERS)
+"""The last columns of tables of our method in all its forms."""
 
 
-def _beside_head(methods: Sequence[str]) -> list[str]:
-    return ["paper", *(head for method in methods for head in (method, "difference"))]
+def _beside(
+    rows: pd.DataFrame, names: Sequence[str], papers: Callable[[Compared], Published | None] = lambda method: None
+) -> list[list[str]]:
+    """The columns :data:`BESIDE` of each method that the rows have a number of.
+
+    Args:
+        rows: with labels, see :func:`labelled`.
+        names: labels of methods, in their order.
+        papers: the paper's number of a method, if it has one.
+    """
+    lines = []
+    for name in names:
+        own = select(rows, label=name)
+        if (number := summarise(own)) is not None:
+            published_number = papers(Compared(*own.iloc[0][["method", "form"]]))
+            lines.append([name, _cell(own), paper(published_number), difference_to(published_number, number)])
+    return lines
+
+
+def _references(
+    domain: Domain,
+    name: str,
+    caption: str,
+    rows: pd.DataFrame,
+    subjects: Sequence[tuple[list[str], pd.DataFrame]],
+    heads: Sequence[str],
+) -> Table:
+    """The reference lines beside a table.
+
+    Args:
+        domain: whose.
+        name, caption: of the table that they stand beside.
+        rows: all, for the order of lines.
+        subjects: the first cells of a line, and the rows behind it.
+        heads: of these cells.
+    """
+    _, names = _columns(rows)
+    lines = [
+        [*first, label, _cell(own)]
+        for first, subject_rows in subjects
+        for label in names
+        if not (own := select(subject_rows, role=REFERENCE, label=label)).empty
+    ]
+    return make_table(domain, f"{name}_references", f"{caption}: reference lines", lines, [*heads, "reference line", "measured"])
 
 
 def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
@@ -207,66 +254,81 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
     return selected.assign(mark=marks), "K and weights in brackets" if common is None else weighting(*common)
 
 
+def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
+    """Of each method, form and setting the rows of one way of learning, and all reference lines.
+
+    The guidance weight is that of the main tables (:func:`main_rows`); of variants and numbers of demonstrations it is what was
+    measured most, the largest number where several were measured alike.
+    """
+    chosen, _ = main_rows(labelled(latest(rows)), main_omega(domain))
+    kept = []
+    for _, own in chosen.groupby(["method", "form", "setting"], sort=False):
+        counts = own.groupby(["variant", "demonstrations"], sort=False).size()
+        variant, demonstrations = max(counts.index, key=lambda way: (counts[way], way[1]))
+        kept.append(select(own, variant=variant, demonstrations=demonstrations))
+    return pd.concat([*kept, select(latest(rows), role=REFERENCE)])[list(rows.columns)]
+
+
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """Every table of a domain for which there are results."""
+    """Every table of a domain for which there are results, reference lines in tables of their own."""
     domain_rows = labelled(latest(select(results, domain=domain.name)))
     metric = domain.main_metric
     rows = select(domain_rows, metric=metric)
     candidates = (
-        *(() if metric == EXECUTED else (_accuracy(domain, rows, metric, "accuracy"),)),
-        _accuracy(domain, select(domain_rows, metric=EXECUTED), EXECUTED, "closed_loop"),
-        _outcomes(domain, domain_rows),
+        *(() if metric == EXECUTED else _accuracy(domain, rows, metric, "accuracy")),
+        *_accuracy(domain, select(domain_rows, metric=EXECUTED), EXECUTED, "closed_loop"),
+        *_outcomes(domain, domain_rows),
         _paired(domain, domain_rows),
-        _count(domain, rows, metric),
-        _omega(domain, rows, metric),
+        _count(domain, domain_rows),
+        _omega(domain, domain_rows),
         _components(domain, rows, metric),
     )
     return [table for table in candidates if not table.cells.empty]
 
 
-def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> Table:
-    """The bars of the paper's main figure, with trivial policies and the oracle beside them."""
-    learned_labels, reference_labels = _columns(rows)
+def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> list[Table]:
+    """The bars of the paper's main figure, and trivial policies and the oracle."""
+    learned_labels, _ = _columns(rows)
     selected, how = main_rows(rows, main_omega(domain))
-    lines = []
+    lines, subjects = [], []
     for setting in settings(domain, selected):
         for task in ("", *paper_tasks(domain, setting)):
             subject = {"setting": setting} | ({"task": task} if task else {})
-            task_rows = select(selected, **subject)
-            if task_rows.empty:
-                continue
-            line = [f"- {task}" if task else setting]
-            line += _beside(lookup(domain, setting, metric, task), [select(task_rows, label=label) for label in learned_labels])
-            line += [_cell(select(rows, role=REFERENCE, label=label, **subject))[0] for label in reference_labels]
-            lines.append(line)
-    papers_weight = "" if main_omega(domain) == papers_omega(domain) else f" (the paper's: {papers_omega(domain)})"
+            first = [f"- {task}" if task else setting]
+            number = partial(_of_paper, domain, setting, metric, task=task)
+            lines += [[*first, *line] for line in _beside(select(selected, **subject), learned_labels, number)]
+            if not select(selected, **subject).empty:
+                subjects.append((first, select(rows, **subject)))
+    papers_weight = ""
+    if published(domain) and main_omega(domain) != papers_omega(domain):
+        papers_weight = f" (the paper's: {papers_omega(domain)})"
     caption = f"{domain.name}: {metric}, {how}{papers_weight}. Mean ± standard error over tasks (spread over seeds)"
-    return make_table(domain, name, caption, lines, ["setting", *_beside_head(learned_labels), *reference_labels])
+    references = _references(domain, name, f"{domain.name}: {metric}", rows, subjects, ["setting"])
+    return [make_table(domain, name, caption, lines, ["setting", *BESIDE]), references]
 
 
-def _outcomes(domain: Domain, rows: pd.DataFrame) -> Table:
+def _of_paper(domain: Domain, setting: str, metric: str, method: Compared, task: str = "", **learned: Any) -> Published | None:
+    return lookup(domain, setting, metric, task, method=method, **learned)
+
+
+def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
     """All that happened in closed loop, by setting."""
     executed = rows[rows["metric"].str.startswith(CLOSED)]
     selected, how = main_rows(executed, main_omega(domain))
-    learned_labels, reference_labels = _columns(executed)
-    lines = [
-        [
-            setting,
-            metric.removeprefix(f"{CLOSED} "),
-            *_beside(
-                lookup(domain, setting, metric),
-                [select(selected, setting=setting, metric=metric, label=label) for label in learned_labels],
-            ),
-            *(
-                _cell(select(executed, setting=setting, metric=metric, role=REFERENCE, label=label))[0]
-                for label in reference_labels
-            ),
-        ]
-        for setting in settings(domain, selected)
-        for metric in dict.fromkeys(select(selected, setting=setting)["metric"])
+    learned_labels, _ = _columns(executed)
+    lines, subjects = [], []
+    for setting in settings(domain, selected):
+        for metric in dict.fromkeys(select(selected, setting=setting)["metric"]):
+            first = [setting, metric.removeprefix(f"{CLOSED} ")]
+            number = partial(_of_paper, domain, setting, metric)
+            measured = select(selected, setting=setting, metric=metric)
+            lines += [[*first, *line] for line in _beside(measured, learned_labels, number)]
+            subjects.append((first, select(executed, setting=setting, metric=metric)))
+    caption, heads = f"{domain.name}: what happened in closed loop", ["setting", "outcome"]
+    return [
+        make_table(domain, "outcomes", f"{caption}, {how}", lines, [*heads, *BESIDE]),
+        _references(domain, "outcomes", caption, executed, subjects, heads),
     ]
-    caption = f"{domain.name}: what happened in closed loop, {how}"
-    return make_table(domain, "outcomes", caption, lines, ["setting", "", *_beside_head(learned_labels), *reference_labels])
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
@@ -293,19 +355,18 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
     selected, _ = main_rows(rows, main_omega(domain))
     learned_labels, _ = _columns(selected[selected["metric"].str.startswith(WON)])
     lines, elsewhere = [], ""
-    for setting in settings(domain, selected):
+    for setting, label in itertools.product(settings(domain, selected), learned_labels):
         for place, name in itertools.product(environments(domain), policies(domain)):
-            counted = [against(select(selected, setting=setting, label=label), f"{name}{place}") for label in learned_labels]
-            line = [MISSING if counts is None else episodes(*counts) for counts in counted]
-            if set(line) - {MISSING}:
-                lines.append([setting, f"{name}{place}", *line])
+            counts = against(select(selected, setting=setting, label=label), f"{name}{place}")
+            if counts is not None:
+                lines.append([setting, label, f"{name}{place}", episodes(*counts)])
                 elsewhere = "; an environment other than the domain's own is named behind the policy" if place else elsewhere
     compared = domain.headline.removeprefix(f"{CLOSED} ")
     caption = (
         f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
         f"(of these learned concepts: the episodes of a seed share one){elsewhere}"
     )
-    return make_table(domain, "paired", caption, lines, ["setting", "compared with", *learned_labels])
+    return make_table(domain, "paired", caption, lines, ["setting", "method", "compared with", "difference"])
 
 
 def _grid(
@@ -313,47 +374,57 @@ def _grid(
     name: str,
     caption: str,
     rows: pd.DataFrame,
-    lines: Sequence[tuple[str, str, Published | None, pd.DataFrame]],
-    heads: tuple[str, str],
+    lines: Sequence[tuple[Sequence[str], Callable[[Compared], Published | None], pd.DataFrame]],
+    heads: Sequence[str],
 ) -> Table:
+    """A table with a line for each method of each subject: its first cells, the paper's number of a method, the rows behind it."""
     learned_labels, _ = _columns(rows)
-    cells = [
-        [first, second, *_beside(papers, [select(line_rows, label=label) for label in learned_labels])]
-        for first, second, papers, line_rows in lines
-        if not line_rows.empty
-    ]
-    return make_table(domain, name, caption, cells, [*heads, *_beside_head(learned_labels)])
+    cells = [[*first, *line] for first, papers, line_rows in lines for line in _beside(line_rows, learned_labels, papers)]
+    return make_table(domain, name, caption, cells, [*heads, *BESIDE])
 
 
-def _count(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
+def _judged(domain: Domain, rows: pd.DataFrame) -> list[str]:
+    """The metrics of tables of K and omega: the main one, what goes wrong in closed loop, and the paper's."""
+    wrong = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
+    papers = [number.metric for number in published(domain)]
+    return [metric for metric in dict.fromkeys((domain.main_metric, *wrong, *papers)) if metric in set(rows["metric"])]
+
+
+def _count(domain: Domain, rows: pd.DataFrame) -> Table:
     """The ablation on the number of learned concepts, with learned weights."""
     ours = select(of_method(rows, PAPERS_METHOD), omega=LEARNED)
     lines = [
         (
-            setting,
-            str(count),
-            lookup(domain, setting, metric, components=count, omega=LEARNED),
-            select(ours, setting=setting, K=count),
+            (setting, str(count), metric),
+            partial(_of_paper, domain, setting, metric, components=count, omega=LEARNED),
+            select(ours, setting=setting, K=count, metric=metric),
         )
         for setting in learned_settings(domain, ours)
         for count in sorted(set(ours.loc[ours["K"] > 0, "K"]))
+        for metric in _judged(domain, ours)
     ]
     caption = f"{domain.name}: number of learned concepts K, with learned weights"
-    return _grid(domain, "concept_count", caption, ours, lines, ("setting", "K"))
+    return _grid(domain, "concept_count", caption, ours, lines, ("setting", "K", "metric"))
 
 
-def _omega(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
+def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
     """The effect of the guidance weight, K = 2, or the K that was measured most."""
     ours = of_method(rows, PAPERS_METHOD)
     counts = Counter(components for components, _ in _weightings(ours) if components)
     count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
     ours = select(ours, K=count)
     lines = [
-        (setting, omega, lookup(domain, setting, metric, components=count, omega=omega), select(ours, setting=setting, omega=omega))
+        (
+            (setting, omega, metric),
+            partial(_of_paper, domain, setting, metric, components=count, omega=omega),
+            select(ours, setting=setting, omega=omega, metric=metric),
+        )
         for setting in learned_settings(domain, ours)
         for omega in sorted(set(ours["omega"]))
+        for metric in _judged(domain, ours)
     ]
-    return _grid(domain, "omega", f"{domain.name}: guidance weight omega, K = {count}", ours, lines, ("setting", "omega"))
+    caption = f"{domain.name}: guidance weight omega, K = {count}"
+    return _grid(domain, "omega", caption, ours, lines, ("setting", "omega", "metric"))
 
 
 def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
@@ -362,9 +433,8 @@ def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
     selected, how = main_rows(rows[rows["setting"].isin({task.setting for task in tasks})], LEARNED)
     lines = [
         (
-            task.name,
-            task.setting,
-            lookup(domain, task.setting, metric, task.name, omega=LEARNED),
+            (task.name, task.setting),
+            partial(_of_paper, domain, task.setting, metric, task=task.name, omega=LEARNED),
             select(selected, setting=task.setting, task=task.name),
         )
         for task in tasks

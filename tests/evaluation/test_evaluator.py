@@ -104,6 +104,8 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
     assert Judged.of(task, states, None, replace(domain, metrics={"distance": Metric(distance, True)})).right is None
     driving = load_domain("driving")
     assert driving.less_is_better("closed loop crash")
+    assert driving.less_is_better("closed loop crash (step veto)")
+    assert not driving.less_is_better("closed loop success (step veto)")
     assert not driving.less_is_better("closed loop success")
     assert driving.main_metric == "closed loop success"
 

@@ -1,7 +1,9 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import pandas as pd
 import pytest
 import torch
 
@@ -12,10 +14,18 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.reporting.changes import changes_table
-from ftl_lightning.reporting.comparison import comparison_table, overview, short_overview
+from ftl_lightning.reporting.colours import COLOURS, OF_METHODS, colours
+from ftl_lightning.reporting.comparison import (
+    all_methods,
+    comparison_table,
+    overview,
+    overview_tables,
+    references_table,
+    short_overview,
+)
 from ftl_lightning.reporting.curves import curves_table
-from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
-from ftl_lightning.reporting.tables import tables
+from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth, overview_dots
+from ftl_lightning.reporting.tables import MOST_COLUMNS, tables
 from tests.conftest import ROOT
 
 DOMAIN = load_domain("object_rearrangement")
@@ -58,10 +68,12 @@ def results(tmp_path: Path) -> Path:
 
 def test_every_number_stands_beside_the_papers_with_their_difference(results: Path) -> None:
     table = comparison_table(DOMAIN, read_study(results, "comparison")).cells.set_index("method")
-    assert list(table.index) == ["FTL-IGM", "BC", "CVAE", "language", "random scenes"]
-    measured = ["new concept", "accuracy", "0.50", "0.30", "-", "0.67 ± 0.15", "-0.17"]
-    assert table.loc["BC"].tolist() == [*measured, "+0.30", "undecided (2 pairs)"]
-    assert table.loc["random scenes", ["ours is better by", "ours is"]].tolist() == ["-", "-"]
+    assert list(table.index) == ["FTL-IGM", "BC", "CVAE", "language"]
+    told = ["new concept", "accuracy", "+0.30, undecided (2 pairs)", "0.50 ± 0.30", "-", "0.67 ± 0.15", "-0.17"]
+    assert table.loc["BC"].tolist() == told
+    assert list(table.columns[:3]) == ["setting", "metric", "ours is"]  # the verdict is right beside the method
+    references = references_table(DOMAIN, read_study(results, "comparison")).cells
+    assert references.to_numpy().tolist() == [["new concept", "accuracy", "random scenes", "0.15 ± 0.00", "-"]]
     assert table.loc["FTL-IGM", ["paper", "difference"]].tolist() == ["0.82 ± 0.09", "-0.02"]
 
 
@@ -72,29 +84,69 @@ def test_the_overview_fits_on_one_screen_and_names_the_best_baseline(results: Pa
     assert line["FTL-IGM"] == "0.80 ± 0.10 [0.82]"
     assert "in-context" not in cells
     assert line["lead"] == "+0.30 against BC, undecided (2 pairs)"
-    assert line["reference lines"] == "random scenes 0.15"
+    *_, references = overview_tables(read_study(results, "comparison"))
+    assert references.cells["reference lines"].tolist() == ["random scenes 0.15"]
 
 
-def test_the_short_overview_has_at_most_eight_lines_and_all_domains() -> None:
-    committed = read_study(ROOT / "results", "comparison")
+def test_the_short_overview_has_at_most_ten_lines_and_all_domains() -> None:
+    committed = all_methods(*(read_study(ROOT / "results", name) for name in ("comparison", "")))
     cells = short_overview(committed).cells
-    assert len(cells) == 8
-    assert list(dict.fromkeys(cells["domain"])) == ["agent", "driving", "object_rearrangement"]
+    assert len(cells) == 10
+    subject = cells.columns[0]
+    names = [told.partition(":")[0] for told in cells[subject]]
+    assert list(dict.fromkeys(names)) == ["agent", "driving", "mocap", "object_rearrangement", "tabletop"]
     whole = overview(committed).cells
-    assert len(whole) > 8
-    assert set(map(tuple, cells.to_numpy())) < set(map(tuple, whole[cells.columns].to_numpy()))  # the same lines
+    assert len(whole) > 10
+    same = [name for name in cells.columns if name != "other forms"]
+    assert set(map(tuple, cells[same].to_numpy())) < set(map(tuple, whole[same].to_numpy()))  # the same lines
     assert "[" in "".join(cells["FTL-IGM"])
     one = short_overview(committed[committed["domain"] == "driving"]).cells
-    assert one["setting, metric"].tolist() == [
-        f"new initial state, closed loop {name}" for name in ("success", "crash", "strict success")
+    assert one[subject].tolist() == [
+        f"driving: new initial state, closed loop {name}" for name in ("success (step veto)", "crash (step veto)", "strict success")
     ]
+
+
+def test_the_overview_takes_in_domains_whose_methods_were_all_measured_in_their_ablation() -> None:
+    ablations = read_study(ROOT / "results")
+    beside = all_methods(read_study(ROOT / "results", "comparison"), ablations)
+    assert "tabletop_wide" not in set(beside["domain"])  # no baseline was measured there
+    learned = beside[(beside["domain"] == "tabletop") & (beside["role"] == "method") & (beside["setting"] == "new concept")]
+    assert set(learned["demonstrations"]) == {10}  # and not from fewer
+    assert set(learned.loc[learned["method"] == "FTL-IGM", "K"]) == {1, 2}  # with an adapter, and in the paper's form
+    assert set(learned.loc[(learned["method"] == "FTL-IGM") & (learned["form"] == ""), "K"]) == {2}
+    whole = overview(beside)
+    assert "in mocap and tabletop network, view and loss are ours" in whole.caption
+    lines = whole.cells.set_index(whole.cells.columns[0])
+    pushed = lines.loc["tabletop: new concept, closed loop success"]
+    kept = ablations[(ablations["domain"] == "tabletop") & (ablations["setting"] == "new concept")]
+    kept = kept[kept["metric"] == "closed loop success"]
+    tuned = kept[kept["method"] == "LoRA fine-tuning"]["value"].mean()
+    assert pushed["LoRA fine-tuning"] == f"{tuned:.2f}"
+    assert "[" not in pushed["FTL-IGM"]  # the paper's number is a robot's
+    moved = lines.loc["mocap: new concept, rule"]
+    assert moved["lead"].startswith("with modes over time: ")
+    assert re.search(r"with modes over time \d.*over time form chosen \d", moved["other forms"])
+
+
+def test_tables_of_the_overview_are_narrow_and_together_say_what_it_says() -> None:
+    beside = all_methods(*(read_study(ROOT / "results", name) for name in ("comparison", "")))
+    whole = overview(beside).cells
+    first, *methods, references = overview_tables(beside)
+    for table in (first, *methods, references):
+        assert len(table.cells.columns) <= MOST_COLUMNS
+        assert table.cells.iloc[:, 0].tolist() == whole.iloc[:, 0].tolist()
+    beside_each_other = pd.concat([first.cells, *(table.cells.iloc[:, 1:] for table in methods)], axis=1)
+    assert set(whole.columns) == set(beside_each_other.columns)
+    many = pd.concat([beside, *(beside[beside["method"] == "BC"].assign(method=f"mine {count}") for count in range(9))])
+    assert max(len(table.cells.columns) for table in overview_tables(many)) == MOST_COLUMNS
+    assert {table.name for table in overview_tables(many)} >= {"overview_methods", "overview_methods_2"}
 
 
 def test_a_method_of_ones_own_stands_beside_the_others(results: Path) -> None:
     append_rows(results / "comparison.csv", [row("mine", task, 1.0, variant="") for task in "ab"])
     rows = read_study(results, "comparison")
     cells = overview(rows).cells
-    assert list(cells.columns[2:-2]) == ["FTL-IGM", "BC", "CVAE", "language", "mine"]
+    assert list(cells.columns[2:]) == ["FTL-IGM", "BC", "CVAE", "language", "mine"]
     assert cells.iloc[0]["lead"] == "-0.20 against mine, undecided (2 pairs)"
     assert "mine" in comparison_table(DOMAIN, rows).cells["method"].tolist()
 
@@ -105,13 +157,13 @@ def test_a_form_of_a_method_of_ones_own_is_a_column_of_its_own(results: Path) ->
     append_rows(results / "own.csv", mine)
     rows = read_study(results, "comparison")
     cells = overview(rows).cells
-    assert list(cells.columns[5:-2]) == ["language", "MY-METHOD", "MY-METHOD with prompts"]
+    assert list(cells.columns[5:]) == ["language", "MY-METHOD", "MY-METHOD with prompts"]
     assert cells.iloc[0][["MY-METHOD", "MY-METHOD with prompts"]].tolist() == ["0.10 ± 0.00", "1.00 ± 0.00"]
     assert cells.iloc[0]["lead"] == "-0.20 against MY-METHOD with prompts, undecided (2 pairs)"
     told = comparison_table(DOMAIN, rows).cells.set_index("method")["measured"]
-    assert told[["MY-METHOD", "MY-METHOD with prompts"]].tolist() == ["0.10", "1.00"]
+    assert told[["MY-METHOD", "MY-METHOD with prompts"]].tolist() == ["0.10 ± 0.00", "1.00 ± 0.00"]
     accuracy = next(table.cells for table in tables(DOMAIN, read_study(results)) if table.name == "accuracy")
-    assert {"MY-METHOD (free)", "MY-METHOD with prompts (free)"} < set(accuracy.columns)
+    assert set(accuracy["method"]) == {"MY-METHOD (free)", "MY-METHOD with prompts (free)"}
     legend = comparison_bars(DOMAIN, rows).axes[0].get_legend_handles_labels()[1]
     assert {"MY-METHOD", "MY-METHOD with prompts"} < set(legend)
 
@@ -120,11 +172,11 @@ def test_a_form_of_ours_is_no_baseline_and_others_are_compared_with_the_domains_
     append_rows(results / "comparison.csv", [row("FTL-IGM", task, 1.0, form="with modes") for task in "ab"])
     rows = read_study(results, "comparison")
     line = overview(rows).cells.iloc[0]
-    assert line["FTL-IGM with modes"] == "1.00 ± 0.00"  # the paper has no number of it
+    assert line["other forms"] == "with modes 1.00 ± 0.00"  # the paper has no number of it
     assert line["lead"] == "+0.30 against BC, undecided (2 pairs)"
     by_modes = replace(DOMAIN, ours=Compared("FTL-IGM", "with modes"))
-    told = comparison_table(by_modes, rows).cells.set_index("method")["ours is better by"]
-    assert told[["FTL-IGM", "FTL-IGM with modes", "BC"]].tolist() == ["-", "-", "+0.50"]
+    told = comparison_table(by_modes, rows).cells.set_index("method")["ours is"]
+    assert told[["FTL-IGM", "FTL-IGM with modes", "BC"]].tolist() == ["-", "-", "+0.50, undecided (2 pairs)"]
 
 
 def test_the_overview_says_who_is_ahead_by_the_paired_test(results: Path) -> None:
@@ -145,9 +197,10 @@ def test_where_a_policy_of_no_learning_ends_as_ours_does_the_overview_says_in_ho
             rows += [row("FTL-IGM", seed=seed, value=0.0, **(driving | {"metric": f"won against {policy}"}))]
             rows += [row("FTL-IGM", seed=seed, value=lost * seed, **(driving | {"metric": f"lost against {policy}"}))]
     append_rows(tmp_path / "comparison.csv", rows)
-    line = overview(read_study(tmp_path, "comparison")).cells.iloc[0]
-    assert line["reference lines"] == "FASTER 0.40 (same outcome in 99 of 100), IDLE 0.40"
-    assert line["lead"] == "-"
+    beside = read_study(tmp_path, "comparison")
+    *_, references = overview_tables(beside)
+    assert references.cells["reference lines"].tolist() == ["FASTER 0.40 (same outcome in 99 of 100), IDLE 0.40"]
+    assert overview(beside).cells.iloc[0]["lead"] == "-"
 
 
 def test_figures_show_measured_bars_and_the_papers_diamonds(results: Path) -> None:
@@ -220,3 +273,51 @@ def test_the_map_of_concepts_names_them_all() -> None:
     concept = Concept(torch.randn(2, 1, model.config.concept_dim), torch.ones(2), origin)
     texts = {text.get_text() for text in concept_map(model, [concept]).axes[0].texts}
     assert texts == {*model.config.training_concepts, "go to green cone [1]", "go to green cone [2]"}
+
+
+def test_the_papers_numbers_of_driving_stand_beside_the_same_planner_alone() -> None:
+    driving = load_domain("driving")
+    committed = read_study(ROOT / "results", "comparison")
+    cells = comparison_table(driving, committed).cells
+    ours = cells[cells["method"] == "FTL-IGM"].set_index("metric")
+    assert ours["paper"].to_dict() == {
+        "closed loop success": "-",
+        "closed loop crash": "-",
+        "closed loop strict success": "-",
+        "closed loop success (step veto)": "0.24",
+        "closed loop crash (step veto)": "0.32",
+    }
+    # Fewer crashes are better, with every planner: the CVAE crashes less than ours with the paper's.
+    theirs = cells[cells["method"] == "CVAE"].set_index("metric")
+    crash = "closed loop crash (step veto)"
+    assert float(ours.loc[crash, "measured"]) > float(theirs.loc[crash, "measured"])
+    assert theirs.loc[crash, "ours is"].startswith("-0.")
+
+
+def test_the_overviews_figure_has_a_panel_for_each_domain_and_diamonds_where_settings_are_the_same() -> None:
+    beside = all_methods(*(read_study(ROOT / "results", name) for name in ("comparison", "")))
+    figure = overview_dots(beside)
+    panels = {axes.get_title(loc="left"): axes for axes in figure.get_axes()}
+    assert set(panels) == {"agent", "driving", "mocap", "object_rearrangement", "tabletop"}
+    diamonds = {
+        name: sorted(round(float(line.get_xdata()[0]), 2) for line in axes.lines if line.get_marker() == "D")  # type: ignore[arg-type]
+        for name, axes in panels.items()
+    }
+    assert diamonds["driving"] == [0.0, 0.04, 0.16, 0.24, 0.24, 0.32, 0.48, 0.64]  # all of them with the paper's planner
+    assert diamonds["mocap"] == diamonds["tabletop"] == []
+    texts = [text.get_text() for text in panels["driving"].texts]
+    assert len(texts) == 5
+    assert "new initial state, closed loop crash (step veto) (less is better)" in texts
+    plt.close("all")
+
+
+def test_every_method_has_a_colour_of_its_own_in_all_figures() -> None:
+    named = [(" ".join(method), method) for method in OF_METHODS if "form chosen" not in method.form]
+    found = colours(named)
+    assert len(set(found.values())) == len(named)
+    assert colours(reversed(named)) == found
+    two = colours([("one", Compared("BC")), ("two", Compared("BC")), ("mine", Compared("MINE"))])
+    assert two["one"] == OF_METHODS[Compared("BC")]
+    assert len(set(two.values())) == 3
+    many = colours([(str(count), Compared("MINE", str(count))) for count in range(2 * len(COLOURS))])
+    assert set(many.values()) == set(COLOURS)

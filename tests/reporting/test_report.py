@@ -62,11 +62,11 @@ def test_a_number_tells_error_over_tasks_from_spread_over_seeds(tmp_path: Path) 
 
 
 def test_a_figure_names_everything_once_and_shows_the_papers_number_of_two_components(tmp_path: Path) -> None:
-    driving = {"domain": "driving", "omega": "learned", "metric": "closed loop success"}
+    driving = {"domain": "driving", "omega": "learned", "metric": "closed loop success (step veto)"}
     places = (("training concept", "steps"), ("new initial state", "steps"), ("new initial state", "map"))
     rows = [row(setting, "a", 0.5, variant=variant, **driving) for setting, variant in places]
     append_rows(tmp_path / "r.csv", rows)
-    axes = accuracy_bars(load_domain("driving"), read_rows(tmp_path / "r.csv"), "closed loop success").axes[0]
+    axes = accuracy_bars(load_domain("driving"), read_rows(tmp_path / "r.csv"), driving["metric"]).axes[0]
     assert sorted(axes.get_legend_handles_labels()[1]) == ["FTL-IGM (map)", "FTL-IGM (steps)", "paper"]
     heights = {bars.get_label(): [bar.get_height() for bar in bars] for bars in axes.containers if hasattr(bars, "patches")}
     assert heights["paper"] == [0.24]
@@ -75,9 +75,11 @@ def test_a_figure_names_everything_once_and_shows_the_papers_number_of_two_compo
 def test_tables_stand_beside_the_papers_numbers(results: Path) -> None:
     found = {table.name: table for table in tables(DOMAIN, read_rows(results))}
     accuracy = found["accuracy"].cells.set_index("setting")
+    assert accuracy.loc["training composition", "method"] == "FTL-IGM (free)"
     assert accuracy.loc["training composition", "paper"] == "0.90 ± 0.04"
-    assert accuracy.loc["training composition", "FTL-IGM (free)"].startswith("0.90 ± 0.10")
-    assert accuracy.loc["new concept", "random scenes"].startswith("0.10")
+    assert accuracy.loc["training composition", "measured"].startswith("0.90 ± 0.10")
+    references = found["accuracy_references"].cells
+    assert references.to_numpy().tolist() == [["new concept", "random scenes", "0.10 ± 0.00"]]
     count = found["concept_count"].cells
     assert count[["setting", "K", "paper"]].to_numpy().tolist() == [["new concept", "1", "0.49 ± 0.11"]]
     assert "omega" in found
@@ -105,7 +107,7 @@ def test_the_report_writes_files_and_updates_a_readme(results: Path, tmp_path: P
     assert text.startswith("before\n")
     assert text.endswith(f"{END}\nafter\n")
     assert "old" not in text
-    assert "| training composition | 0.90 ± 0.04 |" in text
+    assert "| training composition | FTL-IGM (free) | 0.90 ± 0.10 (seeds 0.00) | 0.90 ± 0.04 | +0.00 |" in text
     folder = Path("out") / DOMAIN.name
     assert {path.name for path in folder.iterdir()} >= {"accuracy.md", "accuracy.tex", "accuracy.png"}
     readme.write_text("no marks")
@@ -124,12 +126,12 @@ def test_the_main_table_shows_what_there_is_and_says_how_it_was_learned(tmp_path
     append_rows(tmp_path / "r.csv", [row("new concept", "one", 0.7, omega="learned", K=1)])
     table = tables(DOMAIN, read_rows(tmp_path / "r.csv"))[0]
     assert table.caption.startswith("object_rearrangement: accuracy, K = 1, learned weights. ")
-    assert table.cells["FTL-IGM (free)"].tolist() == ["0.70"]
+    assert table.cells["measured"].tolist() == ["0.70"]
     # Beside the usual ones, others say in brackets how they were learned.
     append_rows(tmp_path / "r.csv", [row("training composition", "one", 0.8), row("training composition", "one", 0.1, omega="1.4")])
     table = tables(DOMAIN, read_rows(tmp_path / "r.csv"))[0]
     assert table.caption.startswith("object_rearrangement: accuracy, K = 2, fixed omega 1.2. ")
-    assert table.cells["FTL-IGM (free)"].tolist() == ["0.80", "0.70 (K = 1, learned weights)"]
+    assert table.cells["measured"].tolist() == ["0.80", "0.70 (K = 1, learned weights)"]
 
 
 def test_paired_episodes_have_a_line_for_each_policy_in_each_environment(tmp_path: Path) -> None:
@@ -143,7 +145,8 @@ def test_paired_episodes_have_a_line_for_each_policy_in_each_environment(tmp_pat
     append_rows(tmp_path / "r.csv", rows)
     cells = next(table.cells for table in tables(driving, read_rows(tmp_path / "r.csv")) if table.name == "paired")
     assert cells["compared with"].tolist() == ["FASTER", "FASTER (step veto)"]
-    assert [cell.split(" ")[0] for cell in cells["FTL-IGM (free)"]] == ["+0.10", "-0.40"]
+    assert set(cells["method"]) == {"FTL-IGM (free)"}
+    assert [cell.split(" ")[0] for cell in cells["difference"]] == ["+0.10", "-0.40"]
 
 
 def test_settings_of_ones_own_come_last_and_components_apart(tmp_path: Path) -> None:
@@ -161,17 +164,11 @@ def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_c
     append_rows(tmp_path / "r.csv", rows)
     results = read_rows(tmp_path / "r.csv")
     found = {table.name: table.cells for table in tables(alone, results)}
-    assert found["accuracy"].columns.tolist() == ["setting", "FTL-IGM (free)", "random scenes"]
+    assert found["accuracy"].columns.tolist() == ["setting", "method", "measured"]
     assert found["accuracy"]["setting"].tolist() == ["mine", "new concept"]
-    assert found["omega"].columns.tolist() == ["setting", "omega", "FTL-IGM (free)"]
-    assert comparison_table(alone, results).cells.columns.tolist()[2:] == [
-        "method",
-        "measured",
-        "standard error over tasks",
-        "spread over seeds",
-        "ours is better by",
-        "ours is",
-    ]
+    assert found["omega"].columns.tolist() == ["setting", "omega", "metric", "method", "measured"]
+    compared = comparison_table(alone, results).cells.columns.tolist()
+    assert compared == ["setting", "metric", "method", "ours is", "measured", "spread over seeds"]
     assert [label.get_text() for label in accuracy_bars(alone, results).axes[0].get_xticklabels()] == ["mine", "new concept"]
 
 

@@ -46,6 +46,7 @@ DOMAIN = Domain(
         "jerk": Metric(deferred(f"{_MEASURES}:jerk"), less_is_better=True),
     },
     ours=Compared(OURS, f"{WITH_MODES} {WITH_KNOTS}"),
+    headline="rule",
     references={"frozen frame": _frozen},
     views=VIEWS,
     show=Show(
