@@ -14,6 +14,7 @@ from nbformat import NotebookNode
 from PIL import Image
 
 from tests.conftest import ROOT
+from tests.test_docs import targets
 
 EXECUTE = runpy.run_path(str(ROOT / "notebooks" / "execute.py"))
 PATHS: list[Path] = EXECUTE["notebooks"]()
@@ -96,7 +97,25 @@ def test_a_notebook_is_small_and_as_the_command_writes_it(path: Path) -> None:
     assert set(notebook.metadata) == {"kernelspec", "language_info"}, AGAIN
     assert "stderr" not in {kind for cell in code for kind, _ in parts(cell)}, AGAIN
     varying = [cell.source for cell in code if "varies" in cell.metadata.get("tags", [])]
-    assert [source for source in varying if "assert " not in source] == []
+    assert [
+        source for source in varying if "assert " not in source and not source.startswith("%%sh")
+    ] == []  # which asserts success
+
+
+@everywhere
+def test_every_link_of_a_notebook_points_to_something(path: Path) -> None:
+    texts = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "markdown"]
+    links = [link for text in texts for link in targets(text)]
+    assert [link for link in links if not (path.parent / link.partition("#")[0]).exists()] == []
+
+
+def test_tutorials_link_to_the_next_and_end_with_exercises() -> None:
+    tutorials = sorted(TUTORIALS.glob("*.ipynb"))
+    assert len(tutorials) == 5
+    for path, following in zip(tutorials, (*tutorials[1:], tutorials[0]), strict=True):
+        last = nbformat.read(path, as_version=4).cells[-1].source
+        assert "## Exercises" in last
+        assert targets(last)[-1] == following.name
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
