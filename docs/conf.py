@@ -41,7 +41,9 @@ html_show_sourcelink = False
 
 
 # Links are written for readers of the repository. Pages below are links to files outside this folder, which Sphinx would not find.
-OUTSIDE = ((r"(?:\.\./)+notebooks/(\w+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
+OUTSIDE = ((r"(?:\.\./)+notebooks/([\w/]+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
+BACK, BESIDE = re.compile(r"\]\((?:\.\./)+docs/([^)]*\.md(?:#[^)]*)?)\)"), re.compile(r"\[([^]]*)\]\((\w+)\.ipynb\)")
+"""Notebooks' links to pages of this folder, and to one another."""
 DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:results|ftl_lightning|examples|conf)/[^)]*\.md)\)")
 
 
@@ -49,6 +51,8 @@ def _links(app: Sphinx, page: str, source: list[str]) -> None:
     """Turn links out of this folder into links to pages, or into downloads."""
     for pattern, folder in OUTSIDE:
         source[0] = re.sub(rf"\[([^]]*)\]\({pattern}\)", rf"{{doc}}`\1 <{folder}/\2>`", source[0])
+    if page.startswith("notebooks/"):
+        source[0] = BESIDE.sub(rf"{{doc}}`\1 </{page.rpartition('/')[0]}/\2>`", BACK.sub(r"](/\1)", source[0]))
     source[0] = DOWNLOADS.sub(r"](path:\1)", source[0])
 
 

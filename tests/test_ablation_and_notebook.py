@@ -1,11 +1,10 @@
 """The ablation and the notebook that shows it, in miniature."""
 
+import runpy
 from pathlib import Path
 
-import nbformat
 import pytest
 import yaml
-from nbclient import NotebookClient
 
 from ftl_lightning.ablation import Stage
 from ftl_lightning.cli import main
@@ -13,15 +12,6 @@ from ftl_lightning.configuration import load
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from tests.conftest import CONF, ROOT
-
-NOTEBOOKS = ROOT / "notebooks"
-
-
-def run(name: str, folder: Path) -> list[str]:
-    """Tables that a notebook shows when it is run in a folder."""
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(folder)}}).execute()
-    return [output.get("data", {}).get("text/markdown", "") for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
 def test_cells_are_the_product_of_names_and_grid() -> None:
@@ -67,21 +57,15 @@ def test_every_cell_of_an_ablation_has_a_name_of_its_own(path: Path) -> None:
     assert len(set(names)) == len(names)
 
 
-@pytest.fixture
-def checkout(tmp_path: Path) -> Path:
-    """The folders that the commands' relative paths name."""
-    for name in ("conf", "notebooks"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    return tmp_path
-
-
 def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
-    checkout: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = "conf/ablation/smoke.yaml"
     monkeypatch.setenv("FTL_ABLATION", config)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    assert sum("| paper |" in text for text in run("object_rearrangement", checkout)) == 4
+    executed = runpy.run_path(str(ROOT / "notebooks" / "execute.py"))["executed"]
+    notebook = executed(ROOT / "notebooks" / "object_rearrangement.ipynb", tmp_path)
+    tables = [output.get("data", {}).get("text/markdown", "") for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("| paper |" in text for text in tables) == 4
     path = yaml.safe_load((CONF / "ablation" / "smoke.yaml").read_text())["results"]
     rows = read_rows(path)
     assert set(rows["seed"]) == {0, 1}
@@ -92,34 +76,6 @@ def test_the_notebook_runs_an_ablation_that_skips_what_is_known(
     assert out.count("in the results already") == 8
     assert out.count("done before") == 2
     assert read_rows(path).equals(rows)
-
-
-@pytest.mark.parametrize(("name", "tables"), [("agent", 5), ("driving", 4)])
-def test_a_notebook_shows_the_committed_results(name: str, tables: int, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (checkout / "results").symlink_to(ROOT / "results")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    assert sum("| paper |" in text for text in run(name, checkout)) == tables
-
-
-@pytest.mark.parametrize(("name", "tables"), [("comparison", 4), ("curves", 3), ("concepts", 0), ("mocap", 2)])
-def test_a_notebook_beyond_one_domain_shows_the_committed_results(
-    name: str, tables: int, checkout: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for folder in ("results", "pretrained"):
-        (checkout / folder).symlink_to(ROOT / folder)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(checkout)}}).execute()
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    assert sum("| --- |" in output.get("data", {}).get("text/markdown", "") for output in outputs) == tables
-    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
-    assert name != "concepts" or sum(output.get("text", "").count("best combination") for output in outputs) >= 16 * 2
-
-
-@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
-def test_a_notebook_holds_no_logic(path: Path) -> None:
-    code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
-    assert not any(word in source for source in code for word in ("def ", "class ", ".mean(", ".std("))
 
 
 def plan(path: str, *stages: dict[str, object], **more: object) -> str:

@@ -146,7 +146,8 @@ def test_every_page_is_in_the_contents() -> None:
     listed = {line for block in re.findall(r"```\{toctree\}\n(.*?)```", index.read_text(), re.DOTALL) for line in block.split()}
     pages = {str(path.relative_to(index.parent).with_suffix("")) for path in PAGES} - {"index"}
     pages |= {f"cards/{path.stem}" for path in (ROOT / "docs" / "cards").iterdir()}
-    pages |= {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    notebooks = (ROOT / "notebooks").rglob("*.ipynb")
+    pages |= {str(path.relative_to(ROOT).with_suffix("")) for path in notebooks if ".ipynb_checkpoints" not in path.parts}
     assert pages - listed == set()
 
 
