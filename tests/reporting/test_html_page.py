@@ -24,11 +24,12 @@ const picture = () => [...document.querySelectorAll("#wall canvas")].map((one) =
 const choose = (id, value) => { const box = find(id); box.value = value; box.dispatchEvent(new Event("change")); };
 setTimeout(() => {
   told.lines = [...document.querySelectorAll("#wall h3")].map((one) => one.textContent);
-  play(false);
+  find("time").value = 0;
+  find("time").dispatchEvent(new Event("input"));
   const before = picture();
+  told.early = [...document.querySelectorAll("figcaption")].map((one) => one.textContent).join("");
   step(1);
   told.moved = picture() !== before;
-  told.early = [...document.querySelectorAll("figcaption")].map((one) => one.textContent).join("");
   step(1000);
   told.late = document.querySelector("figcaption").textContent;
   told.edges = document.querySelectorAll("figure.right, figure.wrong").length;

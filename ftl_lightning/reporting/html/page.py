@@ -15,13 +15,14 @@ from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.domains.paper import OURS, Compared
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.films import FORMAT
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, label, latest, read_rows, read_study
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, label, latest, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.printing import say
-from ftl_lightning.reporting.comparison import METHODS, compared, methods, reference_lines
+from ftl_lightning.reporting.colours import COLOURS, colours
+from ftl_lightning.reporting.comparison import METHODS, all_methods, compared, methods, reference_lines, shown_lines
 from ftl_lightning.reporting.concept_places import concept_places
 from ftl_lightning.reporting.curves import AXES, points
-from ftl_lightning.reporting.shown import decisive, domain_of, headlines, lookup, settings
+from ftl_lightning.reporting.shown import decisive, domain_of, lookup, settings
 from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.tables import of_method, select, summarise
 from ftl_lightning.schema import read_json
@@ -34,8 +35,6 @@ FILMS, CONCEPTS = "films", "concepts"
 """Folders of a folder of results: files of ``evaluation.films``, and concepts by domain and seed."""
 MOST = 15_000_000
 """Bytes of a page, above which somebody is told."""
-PALETTE = ("#0072b2", "#56b4e9", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#8a63b3", "#6b7178", "#a0522d", "#b3a800")
-"""Told apart by the colour-blind too (Okabe & Ito, 2008, and more)."""
 
 
 def write_page(results: Path, path: Path) -> int:
@@ -52,13 +51,13 @@ def write_page(results: Path, path: Path) -> int:
         UserError: if there are no results, or a file of films is none.
     """
     rows = read_rows(results)
-    comparison = read_study(results, COMPARISON)
-    ablations = read_study(results)
-    shown = [domain_of(name, rows) for name in dict.fromkeys((*sorted(set(comparison["domain"])), *sorted(set(rows["domain"]))))]
-    studies = {domain.name: comparison if domain.name in set(comparison["domain"]) else ablations for domain in shown}
+    compared_rows = all_methods(read_study(results, COMPARISON), read_study(results))
+    if compared_rows.empty:
+        compared_rows = rows
+    shown = [domain_of(name, rows) for name in sorted(set(rows["domain"]))]
     films, shapes = _films(results, shown, rows)
-    overview = [line for domain in shown for line in _overview(domain, studies[domain.name])]
-    measured = dict.fromkeys(one["method"] for line in overview for one in line["methods"])
+    overview = [_line(*line, compared_rows) for line in shown_lines(compared_rows)]
+    measured = dict.fromkeys(Compared(row["method"], row["form"]) for _, row in rows[rows["role"] == METHOD].iterrows())
     filmed = {film["domain"] for film in films}
     content = {
         "domains": [{"name": domain.name, "title": _title(domain)} for domain in shown if domain.name in filmed or not filmed],
@@ -67,8 +66,8 @@ def write_page(results: Path, path: Path) -> int:
         "shapes": shapes,
         "maps": [one for domain in shown for one in _map(results, domain)],
         "curves": [*_curves(shown, read_study(results, CURVES)), *_speed(results)],
-        "colours": {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(_ordered(measured))},
-        "palette": PALETTE,
+        "colours": colours((label(*method), method) for method in measured),
+        "palette": COLOURS,
         "about": f"Made by ftl-lightning {__version__} from {len(rows)} rows of results.",
     }
     text = _html(content)
@@ -88,19 +87,19 @@ def _ordered(names: Mapping[str, None]) -> list[str]:
     return [*(name for name in order if name in names), *(name for name in names if name not in order)]
 
 
-def _overview(domain: Domain, results: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    rows, references = compared(domain, results), reference_lines(domain, results)
-    for setting, metric in headlines(domain, rows):
-        here, beside = (select(table, setting=setting, metric=metric) for table in (rows, references))
-        yield {
-            "domain": domain.name,
-            "name": _title(domain),
-            "setting": setting,
-            "metric": metric,
-            "less": domain.less_is_better(metric),
-            "methods": [one for method in methods(rows) if (one := _mean(domain, here, method, setting, metric))],
-            "references": {str(name): round(float(value), 4) for name, value in beside.groupby("method")["value"].mean().items()},
-        }
+def _line(domain: Domain, setting: str, metric: str, results: pd.DataFrame) -> dict[str, Any]:
+    """Means of all methods and reference lines."""
+    rows = compared(domain, results)
+    here, beside = (select(table, setting=setting, metric=metric) for table in (rows, reference_lines(domain, results)))
+    return {
+        "domain": domain.name,
+        "name": _title(domain),
+        "setting": setting,
+        "metric": metric,
+        "less": domain.less_is_better(metric),
+        "methods": [one for method in methods(rows) if (one := _mean(domain, here, method, setting, metric))],
+        "references": {str(name): round(float(value), 4) for name, value in beside.groupby("method")["value"].mean().items()},
+    }
 
 
 def _mean(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, metric: str) -> dict[str, Any] | None:
@@ -137,7 +136,7 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
                     "task": row["task"],
                     "method": label(row["method"], row["form"]),
                     "ours": row["method"] == OURS,
-                    "told": _told(results, row, task["values"], metric, rows),
+                    "told": _told(row, task["values"], metric, rows),
                     "films": task["films"],
                 }
             )
@@ -145,17 +144,17 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
     return sorted(found, key=lambda film: (film["domain"], order[film["method"]])), shapes
 
 
-def _told(results: Path, row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
+def _told(row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
     """The row that films belong to, in words, and the mean over its seeds."""
-    subject = {key: row[key] for key in ("domain", "setting", "task", "method", "form", "variant", "role", "K", "demonstrations")}
-    same = latest(select(rows, **subject, metric=metric))
+    subject = {key: row[key] for key in ("domain", "setting", "task", "method", "form", "variant", "role", "K", "omega")}
+    same = latest(select(rows, **subject, demonstrations=row["demonstrations"], metric=metric))
     if metric not in values:
-        return [f"seed {row['seed']}, {row['n']} samples"]
-    told = [f"{metric} {values[metric]:.2f} of {row['n']} (seed {row['seed']})"]
-    if not same.empty:
-        own = same[same["omega"].astype(str) == str(row["omega"])]
-        told.append(f"over {own['seed'].nunique()} seeds {own['value'].mean():.2f}")
-    return told
+        return [f"{row['n']} samples of seed {row['seed']}"]
+    if same.empty:
+        return [f"{metric} {values[metric]:.2f} of {row['n']}, seed {row['seed']}"]
+    own = select(same, seed=row["seed"])
+    told = [f"seed {row['seed']}: {own['value'].mean():.2f} of {own['n'].iloc[-1]}"] if not own.empty else []
+    return [f"{metric} {same['value'].mean():.2f} over {same['seed'].nunique()} seeds", *told]
 
 
 def _map(results: Path, domain: Domain) -> Iterator[dict[str, Any]]:
