@@ -8,6 +8,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from statistics import mean
@@ -210,6 +211,8 @@ def _paper(given: Mapping[str, Any] | float, rest: Mapping[str, Any]) -> Iterato
         return
     wanted = dict(given)
     domain = domain_of_file(wanted.pop("domain"))
+    if domain.paper:  # texts may name numbers beside which tables put none
+        domain = replace(domain, paper=replace(domain.paper, comparable=True))
     method = Compared(wanted.pop("method", OURS))
     number = lookup(domain, wanted.pop("setting"), wanted.pop("metric", "accuracy"), method=method, **wanted)
     if number is None:
