@@ -10,6 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this che
 from sphinx.application import Sphinx
 
 from ftl_lightning import __version__
+from ftl_lightning.reporting.html.page import write_page
 
 project = "ftl-lightning"
 author = "The ftl-lightning authors"
@@ -56,6 +57,13 @@ def _links(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = DOWNLOADS.sub(r"](path:\1)", source[0])
 
 
+def _watch(app: Sphinx, error: Exception | None) -> None:
+    """Put the page to watch, which ``report --html`` writes, beside the pages of a site."""
+    if error is None and app.builder.name == "html":
+        write_page(Path(__file__).parent.parent / "results", Path(app.outdir) / "watch.html")
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("source-read", _links)
+    app.connect("build-finished", _watch)

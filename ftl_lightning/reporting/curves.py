@@ -9,13 +9,13 @@ from ftl_lightning.reporting.tables import LEARNED, MISSING, Table, select, summ
 
 AXES = {"demonstrations": "K", "K": "demonstrations"}
 """What grows, and what stays meanwhile."""
-USUAL = {"demonstrations": 5, "K": 2}
 
 
 def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
     """The rows of a domain's headline, or if it was not measured, its main metric, in which what else could grow is as usual.
 
-    Demonstrations grow with the main tables' guidance weight, components with learned weights: with a fixed one for each, guidance
+    What else could grow, and the guidance weight, are those with which it was measured at most values of the axis; of several, the
+    main tables' weight where demonstrations grow, and learned weights where components do: with a fixed one for each, guidance
     would grow with them. Settings that start where the demonstrations did are left out: they have no more samples than these.
 
     Args:
@@ -24,9 +24,14 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
         axis: ``'demonstrations'`` or ``'K'``.
     """
     rows = latest(select(results, domain=domain.name, role=METHOD))
-    omega = main_omega(domain) if axis == "demonstrations" else LEARNED
-    rows = select(rows, metric=decisive(domain, rows), omega=omega, **{AXES[axis]: USUAL[AXES[axis]]})
-    return rows[(rows["K"] > 0) & (rows["demonstrations"] > 0) & (rows["n"] > rows["demonstrations"])]
+    rows = select(rows, metric=decisive(domain, rows))
+    rows = rows[(rows["K"] > 0) & (rows["demonstrations"] > 0) & (rows["n"] > rows["demonstrations"])]
+    if rows.empty:
+        return rows
+    preferred = main_omega(domain) if axis == "demonstrations" else LEARNED
+    measured = rows.groupby([AXES[axis], "omega"])[axis].nunique()
+    stays, omega = max(measured.index, key=lambda held: (measured[held], held[1] == preferred))
+    return select(rows, omega=omega, **{AXES[axis]: stays})
 
 
 def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
@@ -38,8 +43,7 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
             numbers = [summarise(rows[(rows["setting"] == setting) & (rows[axis] == count)]) for count in counts]
             lines.append([setting, axis, *(MISSING if number is None else str(number) for number in numbers)])
     metric = next((name for rows in grown.values() for name in rows["metric"]), domain.main_metric)
-    caption = (
-        f"{domain.name}: {metric} as demonstrations (with K = 2) and components K (from five demonstrations, learned weights) "
-        "grow. Mean ± standard error over tasks (spread over seeds)"
-    )
+    kept = {axis: rows.iloc[0] for axis, rows in grown.items() if len(rows)}
+    held = ", ".join(f"{axis} ({AXES[axis]} = {one[AXES[axis]]}, omega {one['omega']})" for axis, one in kept.items())
+    caption = f"{domain.name}: {metric} by {held}. Mean ± standard error over tasks (spread over seeds)"
     return Table("curves", caption, pd.DataFrame(lines, columns=["setting", "of", *map(str, counts)], dtype=str))
