@@ -230,7 +230,20 @@ def test_curves_are_of_the_headline_where_it_was_measured(tmp_path: Path) -> Non
     append_rows(tmp_path / "curves.csv", rows)
     table = curves_table(load_domain("driving"), read_study(tmp_path, "curves"))
     assert table.cells.set_index("of").loc["demonstrations", ["1", "5"]].tolist() == ["0.10", "0.50"]
-    assert table.caption.startswith("driving: closed loop strict success as demonstrations ")
+    assert table.caption.startswith("driving: closed loop strict success by demonstrations (K = 2, omega learned)")
+
+
+def test_what_does_not_grow_is_what_most_points_were_measured_with(tmp_path: Path) -> None:
+    pushed = {"domain": "tabletop", "setting": "new concept", "task": "push", "metric": "closed loop success", "omega": "1.0"}
+    grown = [(1, 1, 0.1), (1, 10, 0.5), (2, 10, 0.6), (3, 10, 0.7)]
+    rows = [
+        row("FTL-IGM", value=value, K=count, demonstrations=shown, config_hash=f"{count} {shown}", **pushed)  # type: ignore[arg-type]
+        for count, shown, value in grown
+    ]
+    append_rows(tmp_path / "curves.csv", rows)
+    found = curves_table(load_domain("tabletop"), read_study(tmp_path, "curves")).cells.set_index("of")
+    assert found.loc["demonstrations", ["1", "10"]].tolist() == ["0.10", "0.50"]
+    assert found.loc["K", ["1", "2", "3"]].tolist() == ["0.50", "0.60", "0.70"]
 
 
 def test_changes_stand_in_their_order_with_the_headline_if_it_was_measured(tmp_path: Path) -> None:
