@@ -1,8 +1,10 @@
+import itertools
+
 import torch
 from matplotlib.figure import Figure
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.driving.rendering import film, render
+from ftl_lightning.domains.driving.rendering import BETWEEN, film, render
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.driving.traffic import TRAFFIC
 from ftl_lightning.domains.rollout import Rollout
@@ -35,7 +37,8 @@ def test_an_episodes_pictures_have_one_size_and_end_when_nothing_moves() -> None
     observed[TRAFFIC][0, 4:, :7] = states[3]
     episode = Rollout(shipped.initial_states, observed, torch.zeros(1, dtype=torch.bool), [{}])
     pictures = film(episode, torch.stack([states[:8]] * 5))
-    assert len(pictures) == 4
+    assert len(pictures) == 3 * BETWEEN + 1
+    assert all((one != other).any() for one, other in itertools.pairwise(pictures))  # between decisions, too
     assert len({picture.shape for picture in pictures}) == 1
 
 

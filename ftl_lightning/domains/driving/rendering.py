@@ -12,13 +12,15 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts, take
+from ftl_lightning.demonstrations.features import InitialStates, expect_starts, take
 from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, decision_seconds, expect_simulator
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
 from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
+BETWEEN = 4
+"""Pictures of an episode for each decision."""
 EGO, OTHER, ROAD, PLAN = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a"
 MARK = "#f4f4f4"
 """Of the middle of a lane."""
@@ -65,21 +67,22 @@ def _window(around: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[n
 
 def _draw(
     axes: Axes,
-    seen: Observed,
+    name: str,
+    vehicles: NDArray[np.float32],
     plan: NDArray[np.float32] | None,
     window: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
-    """What is observed in one scene, to scale."""
+    """A scenario's lanes and vehicles ``(vehicle, 7)``, the controlled one first, to scale."""
     low, high = window
-    for lane in _lanes(NAMES[int(seen[SCENARIO].item())]):
+    for lane in _lanes(name):
         along = np.gradient(lane, axis=0)
         length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
         across = np.stack((-along[:, 1], along[:, 0]), axis=1) / length * LANE / 2
         axes.add_patch(Polygon(np.concatenate((lane + across, (lane - across)[::-1])), color=ROAD, linewidth=0, zorder=0))
         for side in (lane + across, lane - across):
             axes.plot(*side.T, color="white", linewidth=0.6, zorder=0.5)
-    for number, (present, x, y, _, _, cos, sin) in enumerate(seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).tolist()):
-        if present:
+    for number, (present, x, y, _, _, cos, sin) in enumerate(vehicles.tolist()):
+        if present > 0:
             ahead, aside = np.array((cos, sin)) * LENGTH / 2, np.array((-sin, cos)) * WIDTH / 2
             corners = (ahead + aside, ahead - aside, -ahead - aside, -ahead + aside)
             axes.add_patch(Polygon([(x + dx, y + dy) for dx, dy in corners], color=OTHER if number else EGO, zorder=2))
@@ -111,7 +114,9 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         if number >= len(shown):
             axes.set_axis_off()
             continue
-        _draw(axes, take(starts.observed, number), shown[number], windows[number])
+        seen = take(starts.observed, number)
+        vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
+        _draw(axes, NAMES[int(seen[SCENARIO].item())], vehicles, shown[number], windows[number])
         for spine in axes.spines.values():
             spine.set(color="#8a8a8a" if right is None else RIGHT if right[number] else WRONG, linewidth=1.5)
     figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False)
@@ -125,10 +130,10 @@ def _end(observations: Tensor) -> int:
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode, one a decision, until nothing moves any more.
+    """Pictures ``(height, width, 3)`` of an episode, :data:`BETWEEN` a decision, until nothing moves any more.
 
-    What was driven is green; the plan ``(time, 8, 7)`` that decided where to go next is orange. The caption says the scenario, the
-    time, the speed and, in the last picture, how the episode ended.
+    Between decisions vehicles are drawn as if they moved evenly. What was driven is green; the plan ``(time, 8, 7)`` that decided
+    where to go next is orange. The caption says the scenario, the time, the speed and, in the last picture, how the episode ended.
     """
     episode = take(rollout.observed, 0)
     observations = episode[TRAFFIC]
@@ -140,19 +145,29 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     width, height = np.sqrt(1.7 * AREA) * np.sqrt((window[1] - window[0]) / (window[1] - window[0])[::-1])
     name, told = NAMES[int(episode[SCENARIO][0].item())], rollout.infos[0]
     ended = "crashed" if told.get("crashed") else "arrived" if told.get("arrived") else "time is up" if told else "broke off"
+    traffic = observations[:end].unflatten(1, (VEHICLES, -1)).numpy()
+    vehicles = np.stack([traffic[:, 0], *_followed(traffic[:, 1:], decision_seconds(name))], axis=1)
     pictures = []
-    for time in range(end):
+    for moment in np.arange((end - 1) * BETWEEN + 1) / BETWEEN:
+        time = int(moment)
         figure = Figure(figsize=(max(width, 4.0), height + 0.4), dpi=90, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         axes = figure.subplots()
-        _draw(axes, take(episode, time), plans[time].numpy() if time < len(plans) else None, window)
-        axes.plot(*ways[: time + 1].T, color=EGO, linewidth=1.5, zorder=1)
+        seen = _between(vehicles[time], vehicles[min(time + 1, end - 1)], moment - time)
+        _draw(axes, name, seen, plans[time].numpy() if time < len(plans) else None, window)
+        axes.plot(*np.concatenate((ways[: time + 1], seen[:1, 1:3])).T, color=EGO, linewidth=1.5, zorder=1)
         now = f"{name}, {time * decision_seconds(name):g} s, {observations[time, 3:5].norm():.0f} m/s"
-        axes.set_title(f"{now}: {ended}" if time == end - 1 else now, fontsize=9)
+        axes.set_title(f"{now}: {ended}" if moment == end - 1 else now, fontsize=9)
         figure.legend(handles=LEGEND, loc="outside lower center", ncols=len(LEGEND), frameon=False, fontsize=7, columnspacing=1)
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return pictures
+
+
+def _between(before: NDArray[np.float32], after: NDArray[np.float32], part: float) -> NDArray[np.float32]:
+    """Vehicles ``(vehicle, 7)`` a part of the way from one decision to the next; those that are not there then stay."""
+    moved = before + part * (after - before)
+    return np.where((before[:, :1] > 0) & (after[:, :1] > 0), moved, before).astype(np.float32)
 
 
 PLAYED = 2.0

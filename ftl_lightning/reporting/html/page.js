@@ -225,7 +225,7 @@ function growth() {
     const width = 340, height = 210, left = 34, bottom = 34;
     const all = one.lines.flatMap((line) => line.points.map((point) => point[0]));
     const seen = one.log ? Math.log10 : (value) => value;
-    const x = scaled(seen(Math.min(...all)), seen(Math.max(...all)), left + 8, width - 10), y = scaled(0, 1, height - bottom, 10);
+    const x = scaled(seen(Math.min(...all)), seen(Math.max(...all)), left + 8, width - 20), y = scaled(0, 1, height - bottom, 10);
     const svg = drawn("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${one.title}: ${one.axis}` });
     for (const tick of [0, 0.5, 1]) {
       svg.append(drawn("line", { class: "grid", x1: left, x2: width - 6, y1: y(tick), y2: y(tick) }));
@@ -280,7 +280,8 @@ function maps() {
 
 function settings() {
   const here = unique(data.films.filter((one) => one.domain === domain).map((one) => one.setting));
-  if (!here.includes(setting)) setting = here[0] || "";
+  const methods = (name) => unique(data.films.filter((one) => one.domain === domain && one.setting === name).map((one) => one.method)).length;
+  if (!here.includes(setting)) setting = here.reduce((most, name) => methods(name) > methods(most) ? name : most, here[0] || "");
   find("setting").replaceChildren(...here.map((name) => made("option", { textContent: name, selected: name === setting })));
 }
 
@@ -306,7 +307,7 @@ function redraw(all = true) {
 }
 
 function listen() {
-  find("domain").addEventListener("change", (event) => { domain = event.target.value; clock = 0; redraw(); });
+  find("domain").addEventListener("change", (event) => { [domain, setting, clock] = [event.target.value, "", 0]; redraw(); });
   find("setting").addEventListener("change", (event) => { setting = event.target.value; clock = 0; redraw(false); });
   find("task").addEventListener("change", (event) => { task = event.target.value; clock = 0; wall(); });
   find("play").addEventListener("click", () => play(!playing));
