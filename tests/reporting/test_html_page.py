@@ -1,5 +1,6 @@
 """The page to watch: what is in it, and what it does in a browser."""
 
+import itertools
 import json
 import re
 import shutil
@@ -10,8 +11,10 @@ from pathlib import Path
 import pytest
 
 from ftl_lightning.cli import main
+from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.reporting.html.page import FILMS
-from tests.conftest import refused
+from ftl_lightning.reporting.tables import select
+from tests.conftest import ROOT, refused
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
 QUIET = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
@@ -117,3 +120,26 @@ def test_in_a_browser_films_move_and_filters_filter(page: Path, tmp_path: Path, 
     assert told["playing"]
     assert told["marks"] > 0
     assert told["wide"] <= 0
+
+
+FILES = sorted((ROOT / "results" / FILMS).glob("*.json"))
+SAME = ("domain", "setting", "task", "method", "form", "role", "K", "omega", "demonstrations", "seed")
+"""What a film and the row that it belongs to have in common."""
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_films_that_ship_belong_to_rows_of_the_results(path: Path) -> None:
+    rows = read_rows(ROOT / "results")
+    for task in json.loads(path.read_text())["tasks"]:
+        own = select(rows, **{key: task["row"][key] for key in SAME})
+        assert not own.empty, task["row"]
+        for metric, value in task["values"].items():
+            same = select(own, metric=metric, n=task["row"]["n"])
+            # Other processors round otherwise, so that a sample may end otherwise.
+            assert same.empty or (same["value"] - value).abs().min() <= 0.05, (task["row"], metric)
+
+
+def test_every_method_of_every_domain_has_films() -> None:
+    filmed = {(task["row"]["domain"], task["row"]["method"]) for path in FILES for task in json.loads(path.read_text())["tasks"]}
+    methods = {"FTL-IGM", "BC", "CVAE", "language"}
+    assert filmed >= set(itertools.product(("object_rearrangement", "agent", "driving", "mocap", "tabletop"), methods))
