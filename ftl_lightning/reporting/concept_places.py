@@ -48,6 +48,7 @@ def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int =
         (concept.origin.name, name.replace("component ", ""), part.embedding)
         for concept in concepts
         for name, part in concept.parts().items()
+        if part.mode is None  # modes would be five times as many, near one another
     ]
     embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for *_, embedding in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)

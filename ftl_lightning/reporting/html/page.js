@@ -341,5 +341,5 @@ unpacked(find("data").textContent).then((found) => {
   redraw();
   last = performance.now();
   requestAnimationFrame(tick);
-  document.body.dataset.ready = "yes";
+  document.body.dataset.ready = Math.round(performance.now()); // milliseconds until films are drawn
 });
