@@ -15,7 +15,7 @@ from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.domains.paper import OURS, Compared
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.films import FORMAT
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, label, latest, read_rows, read_study
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, REFERENCE, label, latest, read_rows, read_study
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.printing import say
 from ftl_lightning.reporting.colours import COLOURS, colours
@@ -136,12 +136,13 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
                     "task": row["task"],
                     "method": label(row["method"], row["form"]),
                     "ours": row["method"] == OURS,
+                    "reference": row["role"] == REFERENCE,
                     "told": _told(row, task["values"], metric, rows),
                     "films": task["films"],
                 }
             )
     order = {name: place for place, name in enumerate(_ordered(dict.fromkeys(film["method"] for film in found)))}
-    return sorted(found, key=lambda film: (film["domain"], order[film["method"]])), shapes
+    return sorted(found, key=lambda film: (film["domain"], film["reference"], order[film["method"]])), shapes
 
 
 def _told(row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
