@@ -90,9 +90,13 @@ def test_the_same_results_give_the_same_page(page: Path, tmp_path: Path) -> None
 
 
 def test_a_file_of_something_else_is_told(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "results" / FILMS / "other.json").write_text("{}")
     arguments = ["report", "--results", str(tmp_path / "results"), "--html", str(tmp_path / "b.html")]
+    other = tmp_path / "results" / FILMS / "other.json"
+    other.write_text("{}")
     refused(capsys, arguments, "other.json", "format 1")
+    for tasks in ("[{}]", "3", '[{"row": 1, "values": {}, "films": []}]'):
+        other.write_text(f'{{"format": 1, "domain": "object_rearrangement", "shapes": [], "tasks": {tasks}}}')
+        refused(capsys, arguments, "other.json", "as evaluation.films writes them")
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")

@@ -122,27 +122,30 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
         content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise UserError(f"{path}: expected films of format {FORMAT}, found something else; make them with evaluation.films")
-        if (domain := by_name.get(str(content["domain"]))) is None:
-            continue
-        shapes[path.stem] = content["shapes"]
-        for task in content["tasks"]:
-            row, metric = task["row"], decisive(domain, rows[rows["domain"] == domain.name])
-            for film in task["films"]:
-                film |= {"file": path.stem, "decisive": metric.removeprefix(f"{CLOSED} ")}
-            found.append(
-                {
-                    "domain": domain.name,
-                    "setting": row["setting"],
-                    "task": row["task"],
-                    "method": label(row["method"], row["form"]),
-                    "ours": row["method"] == OURS,
-                    "reference": row["role"] == REFERENCE,
-                    "told": _told(row, task["values"], metric, rows),
-                    "films": task["films"],
-                }
-            )
+        try:
+            if (domain := by_name.get(str(content["domain"]))) is not None:
+                shapes[path.stem] = content["shapes"]
+                found += [_task(task, path.stem, domain, rows) for task in content["tasks"]]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            told = f"expected films as evaluation.films writes them, found a file with other keys ({error!r}); make it again"
+            raise UserError(f"{path}: {told}") from error
     order = {name: place for place, name in enumerate(_ordered(dict.fromkeys(film["method"] for film in found)))}
     return sorted(found, key=lambda film: (film["domain"], film["reference"], order[film["method"]])), shapes
+
+
+def _task(task: Mapping[str, Any], file: str, domain: Domain, rows: pd.DataFrame) -> dict[str, Any]:
+    """The films of a method and task."""
+    row, metric = task["row"], decisive(domain, rows[rows["domain"] == domain.name])
+    return {
+        "domain": domain.name,
+        "setting": row["setting"],
+        "task": row["task"],
+        "method": label(row["method"], row["form"]),
+        "ours": row["method"] == OURS,
+        "reference": row["role"] == REFERENCE,
+        "told": _told(row, task["values"], metric, rows),
+        "films": [{**film, "file": file, "decisive": metric.removeprefix(f"{CLOSED} ")} for film in task["films"]],
+    }
 
 
 def _told(row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
