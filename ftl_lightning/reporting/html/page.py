@@ -57,7 +57,8 @@ def write_page(results: Path, path: Path) -> int:
     shown = [domain_of(name, rows) for name in sorted(set(rows["domain"]))]
     films, shapes = _films(results, shown, rows)
     overview = [_line(*line, compared_rows) for line in shown_lines(compared_rows)]
-    measured = dict.fromkeys(Compared(row["method"], row["form"]) for _, row in rows[rows["role"] == METHOD].iterrows())
+    learned = select(rows, role=METHOD)
+    measured = dict.fromkeys(map(Compared, learned["method"], learned["form"]))
     filmed = {film["domain"] for film in films}
     content = {
         "domains": [{"name": domain.name, "title": _title(domain)} for domain in shown if domain.name in filmed or not filmed],
@@ -116,16 +117,18 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
     Raises:
         UserError: for a file that is none of films.
     """
-    by_name = {domain.name: domain for domain in shown}
+    of_domain = {domain.name: select(rows, domain=domain.name) for domain in shown}
+    measured = {domain.name: decisive(domain, of_domain[domain.name]) for domain in shown}
+    decided = {name: select(own, metric=measured[name]) for name, own in of_domain.items()}
     found, shapes = [], {}
     for path in visible(results / FILMS, "*.json"):
         content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise UserError(f"{path}: expected films of format {FORMAT}, found something else; make them with evaluation.films")
         try:
-            if (domain := by_name.get(str(content["domain"]))) is not None:
+            if (name := str(content["domain"])) in decided:
                 shapes[path.stem] = content["shapes"]
-                found += [_task(task, path.stem, domain, rows) for task in content["tasks"]]
+                found += [_task(task, path.stem, name, measured[name], decided[name]) for task in content["tasks"]]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             told = f"expected films as evaluation.films writes them, found a file with other keys ({error!r}); make it again"
             raise UserError(f"{path}: {told}") from error
@@ -133,11 +136,11 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
     return sorted(found, key=lambda film: (film["domain"], film["reference"], order[film["method"]])), shapes
 
 
-def _task(task: Mapping[str, Any], file: str, domain: Domain, rows: pd.DataFrame) -> dict[str, Any]:
-    """The films of a method and task."""
-    row, metric = task["row"], decisive(domain, rows[rows["domain"] == domain.name])
+def _task(task: Mapping[str, Any], file: str, domain: str, metric: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """The films of a method and task, and what the domain's rows of its decisive metric say of them."""
+    row = task["row"]
     return {
-        "domain": domain.name,
+        "domain": domain,
         "setting": row["setting"],
         "task": row["task"],
         "method": label(row["method"], row["form"]),
@@ -150,8 +153,8 @@ def _task(task: Mapping[str, Any], file: str, domain: Domain, rows: pd.DataFrame
 
 def _told(row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
     """The row that films belong to, in words, and the mean over its seeds."""
-    subject = {key: row[key] for key in ("domain", "setting", "task", "method", "form", "variant", "role", "K", "omega")}
-    same = latest(select(rows, **subject, demonstrations=row["demonstrations"], metric=metric))
+    subject = {key: row[key] for key in ("setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations")}
+    same = latest(select(rows, **subject))
     if metric not in values:
         return [f"{row['n']} samples of seed {row['seed']}"]
     if same.empty:
