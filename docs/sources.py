@@ -26,7 +26,8 @@ from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
 from ftl_lightning.reporting.paired import mcnemar, up
 from ftl_lightning.reporting.shown import lookup
-from ftl_lightning.reporting.tables import Number, against, select, summarise
+from ftl_lightning.reporting.table import Number, select, summarise
+from ftl_lightning.reporting.tables import against
 from ftl_lightning.tuned import Tuned
 
 ROOT = Path(__file__).parent.parent

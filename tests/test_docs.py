@@ -13,7 +13,7 @@ import yaml
 
 from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
 from ftl_lightning.domains.registry import domain_of_file
-from ftl_lightning.reporting.tables import paper
+from ftl_lightning.reporting.table import paper
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"

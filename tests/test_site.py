@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from ftl_lightning.reporting.tables import MOST_COLUMNS
+from ftl_lightning.reporting.table import MOST_COLUMNS
 from tests.test_docs import PAGES, README, ROOT, included
 
 SITE = ROOT / "docs" / "_build" / "html"

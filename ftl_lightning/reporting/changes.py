@@ -5,7 +5,7 @@ import pandas as pd
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import METHOD, latest
 from ftl_lightning.reporting.shown import decisive
-from ftl_lightning.reporting.tables import MISSING, Table, select, summarise
+from ftl_lightning.reporting.table import MISSING, Table, select, summarise
 
 
 def changes_table(domain: Domain, results: pd.DataFrame) -> Table:

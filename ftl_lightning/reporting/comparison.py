@@ -20,13 +20,11 @@ from ftl_lightning.reporting.shown import (
     settings,
     training_settings,
 )
-from ftl_lightning.reporting.tables import (
+from ftl_lightning.reporting.table import (
     MISSING,
     MOST_COLUMNS,
     Number,
     Table,
-    against,
-    as_learned_most,
     difference_to,
     make_table,
     of_method,
@@ -34,6 +32,7 @@ from ftl_lightning.reporting.tables import (
     select,
     summarise,
 )
+from ftl_lightning.reporting.tables import against, as_learned_most
 
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
 """The paper's, by their names in tables."""

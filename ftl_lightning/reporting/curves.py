@@ -5,7 +5,8 @@ import pandas as pd
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.results import METHOD, latest
 from ftl_lightning.reporting.shown import decisive, main_omega
-from ftl_lightning.reporting.tables import LEARNED, MISSING, Table, select, summarise
+from ftl_lightning.reporting.table import MISSING, Table, select, summarise
+from ftl_lightning.reporting.tables import LEARNED
 
 AXES = {"demonstrations": "K", "K": "demonstrations"}
 """What grows, and what stays meanwhile."""

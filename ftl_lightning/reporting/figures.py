@@ -24,7 +24,8 @@ from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.frontier import NOISY
 from ftl_lightning.reporting.shown import lookup, main_omega, settings
 from ftl_lightning.reporting.speed import Measured, reached
-from ftl_lightning.reporting.tables import labelled, main_rows, of_method, select, summarise
+from ftl_lightning.reporting.table import of_method, select, summarise
+from ftl_lightning.reporting.tables import labelled, main_rows
 
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
 """Of reference policies."""

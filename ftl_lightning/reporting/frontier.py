@@ -17,7 +17,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import PAPERS_METHOD
 from ftl_lightning.evaluation.results import label, split_forms
 from ftl_lightning.reporting.listed import read_listed
-from ftl_lightning.reporting.tables import MISSING, Table, make_table, of_method, select
+from ftl_lightning.reporting.table import MISSING, Table, make_table, of_method, select
 from ftl_lightning.tensor_file import write_text
 
 FRONTIER = "frontier.json"

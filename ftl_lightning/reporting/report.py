@@ -28,7 +28,8 @@ from ftl_lightning.reporting.figures import accuracy_bars, comparison_bars, fron
 from ftl_lightning.reporting.frontier import FRONTIER, frontier_table, read_frontier
 from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.tables import Table, as_learned_most, of_method, select, tables
+from ftl_lightning.reporting.table import Table, of_method, select
+from ftl_lightning.reporting.tables import as_learned_most, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"

@@ -25,7 +25,8 @@ from ftl_lightning.reporting.comparison import (
 )
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth, overview_dots
-from ftl_lightning.reporting.tables import MOST_COLUMNS, tables
+from ftl_lightning.reporting.table import MOST_COLUMNS
+from ftl_lightning.reporting.tables import tables
 from tests.conftest import ROOT
 
 DOMAIN = load_domain("object_rearrangement")

@@ -13,7 +13,7 @@ import pytest
 from ftl_lightning.cli import main
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.reporting.html.page import FILMS
-from ftl_lightning.reporting.tables import select
+from ftl_lightning.reporting.table import select
 from tests.conftest import ROOT, refused
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)

@@ -9,7 +9,8 @@ from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_s
 from ftl_lightning.reporting.comparison import comparison_table
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END
-from ftl_lightning.reporting.tables import summarise, tables
+from ftl_lightning.reporting.table import summarise
+from ftl_lightning.reporting.tables import tables
 from tests.conftest import ROOT
 
 DOMAIN = load_domain("object_rearrangement")

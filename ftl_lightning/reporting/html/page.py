@@ -24,7 +24,7 @@ from ftl_lightning.reporting.concept_places import concept_places
 from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.shown import decisive, domain_of, lookup, settings
 from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.reporting.tables import of_method, select, summarise
+from ftl_lightning.reporting.table import of_method, select, summarise
 from ftl_lightning.schema import read_json
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import visible, write_text
