@@ -4,7 +4,7 @@ import functools
 import operator
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
@@ -27,11 +27,12 @@ from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
 from ftl_lightning.judging import judged, judging_domain, picture
-from ftl_lightning.learned_concept import LearnedConcept, concept_of
+from ftl_lightning.learned_concept import LearnedConcept, Learning, concept_of
 from ftl_lightning.learning.concept_check import expect_concept, expect_sizes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
 from ftl_lightning.learning.hub import download, save_with_card, upload
+from ftl_lightning.learning.inversion import Watch
 from ftl_lightning.learning.learner import Learner
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.pretrained import load_model
@@ -213,6 +214,7 @@ class FewShot(Shown):
         steps: int | None = None,
         seed: int = 0,
         progress: bool = False,
+        watch: Callable[[Learning], None] | None = None,
         **changes: Any,
     ) -> LearnedConcept:
         """Learn a concept from a few demonstrations, three to five or more: the same numbers as ``invert`` gives.
@@ -222,6 +224,8 @@ class FewShot(Shown):
             steps: of gradient descent; ``None`` for the tuned number.
             seed: decides starts, noise and timesteps.
             progress: show a bar.
+            watch: called after each step of what is learned first, in methods of gradient descent; it may sample the concept so
+                far, which changes nothing, or stop by an exception of its own.
             changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``form="paper"``; see there.
 
         Warns:
@@ -232,18 +236,22 @@ class FewShot(Shown):
         """
         own = of_one_concept(self.demonstrations(states, observed, name))
         expect_whole("seed", seed, 0, None)
-        chosen = changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress"), INVERSION)
+        chosen = changed("learn", self.tuned.inversion, changes, ("steps", "seed", "progress", "watch"), INVERSION)
         settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()) and not {"modes", "adapter"} & {*changes})
-        self.model.method.expect_settings(changes)
+        self.model.method.expect_settings(changes | ({} if watch is None else {"watch": watch}))
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
         for told in filter(None, (longer_than_plans(own, self.model), *warnings_of(self.model, own))):
             warnings.warn(told, stacklevel=2)
         with bar(f"learning {own.concepts[0]!r}", total) if progress else nullcontext(lambda *_: None) as advance:
             learn: Learner = self.model.method.learn()
-            learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"))
+            watched = {} if watch is None else {"watch": self._watched(own.concepts[0], watch)}
+            learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), **watched)
         expect_sizes(self.model, concept := learned[own.concepts[0]])
         self._examples.append(own)
         return replace(self._learned(concept), demonstrations=own, judging=self._judging)
+
+    def _watched(self, name: str, watch: Callable[[Learning], None]) -> Watch:
+        return lambda step, loss, concepts: watch(Learning(step, loss, lambda: self._learned(concepts()[name])))
 
     def check(
         self,

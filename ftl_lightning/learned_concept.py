@@ -1,7 +1,7 @@
 """A learned concept as a user of the Python API holds it."""
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,21 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.quality import Inspection, inspected
+
+
+@dataclass(frozen=True)
+class Learning:
+    """A concept while it is learned.
+
+    Attributes:
+        step: how many were made.
+        loss: mean of the last one.
+        so_far: gives the concept as it is now, of one set of embeddings, whatever form it is to have.
+    """
+
+    step: int
+    loss: float
+    so_far: Callable[[], "LearnedConcept"]
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ from ftl_lightning.concepts.modes import Modes, even_stretch
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.explained_by import relative_losses
-from ftl_lightning.learning.inversion import check_settings, invert, warn_of_loss
+from ftl_lightning.learning.inversion import Watch, check_settings, invert, warn_of_loss
 from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
 from ftl_lightning.learning.left_out import learned_from, quickly
 from ftl_lightning.learning.quality import Quality, measured
@@ -49,11 +49,15 @@ def learn(
     settings: InversionSettings,
     steps: int,
     tell: Tell = lambda loss: None,
+    watch: Watch | None = None,
 ) -> dict[str, Concept]:
-    """:func:`~ftl_lightning.learning.inversion.invert`, with concepts in the form that the settings name."""
+    """:func:`~ftl_lightning.learning.inversion.invert`, with concepts in the form that the settings name.
+
+    Only what is learned first is watched.
+    """
     check_settings(model, settings)
     warn_of_loss(model, settings)
-    first = invert(model, demonstrations, first_settings(settings), steps, tell)
+    first = invert(model, demonstrations, first_settings(settings), steps, tell, watch)
     return formed(model, demonstrations, settings, steps, first, tell)
 
 

@@ -40,6 +40,10 @@ HELD_OUT = 32
 """Noised demonstrations whose loss decides when a run stops."""
 
 
+Watch = Callable[[int, float, Callable[[], dict[str, Concept]]], None]
+"""Called after a step with its number from 1, its mean loss, and what gives the concepts so far by name."""
+
+
 @dataclass(frozen=True)
 class _Run:
     """Embeddings that are learned from some demonstrations.
@@ -355,6 +359,7 @@ def invert(
     settings: InversionSettings,
     steps: int,
     tell: Callable[[float], None] = lambda loss: None,
+    watch: Watch | None = None,
 ) -> dict[str, Concept]:
     """Learn every concept of some demonstrations, without a trainer; the same numbers as with one.
 
@@ -364,6 +369,7 @@ def invert(
         settings: how.
         steps: of gradient descent.
         tell: called with the mean loss after each step.
+        watch: called after each step too; it may look at the concepts so far, which changes nothing.
     """
     inversion = Inversion(model, demonstrations, settings).to(model.device)
     groups = [Group(parameter, rate) for parameter, rate in inversion.rates]
@@ -374,7 +380,10 @@ def invert(
         gradients = torch.autograd.grad(losses.sum(), [group.parameter for group in groups], materialize_grads=True)
         for group, gradient in zip(groups, gradients, strict=True):
             group.step(gradient, None if settings.budget.tolerance is not None else (step, steps))
-        tell(losses.detach().mean().item())
+        loss = losses.detach().mean().item()
+        tell(loss)
+        if watch is not None:
+            watch(step + 1, loss, inversion.learned)
         if not inversion.stepped(step):
             break
     return inversion.learned()
