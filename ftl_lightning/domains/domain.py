@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import gymnasium
     from matplotlib.figure import Figure
 
+    from ftl_lightning.domains.recorder import Recorder
     from ftl_lightning.domains.vector_film import VectorFilm
     from ftl_lightning.domains.wireframe import Wireframe
 
@@ -326,6 +327,8 @@ class Domain(Shown):
         paper: published numbers, if there are any.
         prepare: ``(folder of the user's copy of the data, folder to write or None for the same) -> text to print``, for recordings
             that are read once before they are used; see ``python -m ftl_lightning prepare``.
+        recorder: how a person shows behaviour with a pointer, see :mod:`ftl_lightning.domains.recorder`; ``None`` where nobody can.
+        imports: by the ending of a file of other programs, such as ``'.bvh'``, ``file -> demonstrations`` without a text.
     """
 
     name: str
@@ -345,6 +348,8 @@ class Domain(Shown):
     fresh: bool = True
     paper: Paper | None = None
     prepare: Callable[[Path | None, Path | None], str] | None = None
+    recorder: "Recorder | None" = None
+    imports: Mapping[str, Callable[[Path], Demonstrations]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.show is _UNSAID:

@@ -31,6 +31,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
+from ftl_lightning.domains.hand_drawn import drawn_by_hand
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.errors import UserError
 from ftl_lightning.inputs import MINARI
@@ -114,6 +115,7 @@ def own_domain(
         headline=next(iter(metrics), ""),
         distance=partial(_warped, examples),
         fresh=False,  # there is no more behaviour than the file's
+        recorder=drawn_by_hand(examples, horizon),
     )
 
 

@@ -15,6 +15,7 @@ from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES, holds, parse, sentence
 from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.errors import UserError
 
 NAME = "object_rearrangement"
@@ -54,6 +55,7 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
     return path_distance(states[..., CENTRES], others[..., CENTRES])
 
 
+RECORDING = "ftl_lightning.domains.object_rearrangement.recording"
 RENDERING = "ftl_lightning.domains.object_rearrangement.rendering"
 DOMAIN = Domain(
     name=NAME,
@@ -75,4 +77,10 @@ DOMAIN = Domain(
     },
     distance=distance,
     paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
+    recorder=Recorder(
+        "arrange",
+        "Put the three shapes where they show what you mean; their sizes are new each time.",
+        deferred(f"{RECORDING}:scene"),
+        deferred(f"{RECORDING}:record"),
+    ),
 )

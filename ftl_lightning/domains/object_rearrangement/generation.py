@@ -24,6 +24,8 @@ PROPOSALS = 32_768
 """Scenes proposed at a time."""
 PATIENCE = 200
 """Rounds without reaching the count after which a task is declared infeasible."""
+PLAIN = 256
+"""Scenes proposed at a time where one is wanted that shows nothing."""
 _ALONG = {"diagonal to": (1 + 1j) / abs(1 + 1j), "antidiagonal to": (-1 + 1j) / abs(-1 + 1j)}
 """The way from B to A on the line of a relation, as a complex number x + iy."""
 
@@ -129,6 +131,18 @@ def _uniform_scenes(rng: np.random.Generator, count: int) -> NDArray[np.float32]
 def random_scenes(count: int, seed: int) -> Tensor:
     """The same as states ``(count, 21)``: a reference line, the result of a policy that does not use the task."""
     return _flat(_uniform_scenes(np.random.default_rng(seed), count))
+
+
+def plain_scene(seed: int) -> Tensor:
+    """One scene ``(21,)`` in which no shapes overlap and no training relation holds: it shows nothing yet."""
+    rng = np.random.default_rng(seed)
+    while True:
+        scenes = _flat(_uniform_scenes(rng, PLAIN))
+        plain = ~overlap(scenes)
+        for relation in TRAINING_RELATIONS:
+            plain &= ~holds(relation, scenes, relaxed=False)
+        if plain.any():
+            return scenes[plain][0]
 
 
 def _flat(scenes: NDArray[np.float32]) -> Tensor:
