@@ -24,6 +24,7 @@ TRAINER_VERBS = {
     "test": "evaluate a checkpoint and write the results file",
 }
 COMMANDS = {
+    "play": "show behaviour five times on a page, see it learned, and mix it with other concepts",
     "generate": "draw demonstrations of a task into a file",
     "check": "say whether demonstrations of a concept suffice, and which of them is odd",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
@@ -40,7 +41,11 @@ POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study"}
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
-MODULES = {"check": "ftl_lightning.check_command", "sample": "ftl_lightning.sampling_command"}
+MODULES = {
+    "check": "ftl_lightning.check_command",
+    "play": "ftl_lightning.play_command",
+    "sample": "ftl_lightning.sampling_command",
+}
 """Commands with a module of their own."""
 
 

@@ -14,6 +14,7 @@ EXTRAS: Mapping[str, Mapping[str, str]] = {
     "mocap": {"sklearn": "scikit-learn"},
     "navigation": {"pybullet": "pybullet", "gymnasium": "gymnasium"},
     "notebooks": {"sklearn": "scikit-learn"},
+    "play": {"starlette": "starlette", "uvicorn": "uvicorn"},
     "tabletop": {"pybullet": "pybullet", "gymnasium": "gymnasium"},
 }
 """Modules that are imported late, and the packages that they come with, by extra."""

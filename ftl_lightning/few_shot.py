@@ -248,7 +248,7 @@ class FewShot(Shown):
             learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), **watched)
         expect_sizes(self.model, concept := learned[own.concepts[0]])
         self._examples.append(own)
-        return replace(self._learned(concept), demonstrations=own, judging=self._judging)
+        return replace(self._learned(concept), demonstrations=own, judging=self.judging)
 
     def _watched(self, name: str, watch: Callable[[Learning], None]) -> Watch:
         return lambda step, loss, concepts: watch(Learning(step, loss, lambda: self._learned(concepts()[name])))
@@ -287,7 +287,7 @@ class FewShot(Shown):
         try:
             found = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
         except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
-            self._judging.expect_goal(goal)
+            self.judging.expect_goal(goal)
             raise
         if found is None:
             raise UserError(f"starts: expected a domain with initial states, found {self.domain.name}")
@@ -344,16 +344,17 @@ class FewShot(Shown):
             UserError: for plans of another domain, a goal that the domain cannot judge by, or a domain that judges no plans.
         """
         expect_of_domain("evaluate", plans, self.domain)
-        return judged(self._judging, plans, goal)
+        return judged(self.judging, plans, goal)
 
     @property
-    def _judging(self) -> Domain:
+    def judging(self) -> Domain:
+        """The domain that judges what the model generates: its own, of a user's own data with what concepts were learned from."""
         return judging_domain(self.model, self._examples)
 
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """A picture of plans; with a goal, right ones are framed green and wrong ones red."""
         expect_of_domain("render", plans, self.domain)
-        return picture(self._judging, plans, goal)
+        return picture(self.judging, plans, goal)
 
     def execute(
         self,
@@ -385,7 +386,7 @@ class FewShot(Shown):
             raise UserError(f"environment: expected {' or '.join(loop.others) or 'none'}, found {shown(environment)}")
         loop = loop.inside(environment)
         if goal:
-            self._judging.expect_goal(goal)
+            self.judging.expect_goal(goal)
         every = self.tuned.replan if replan is None else expect_whole("replan", replan, 1)
         concept, sampling = self._own("execute", concept), self._sampling("execute", changes)
         seed = expect_whole("seed", seed, 0, None)

@@ -178,6 +178,19 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
         return tensors, header
 
 
+def kind_of(content: bytes) -> str:
+    """What a safetensors file of this package says it is; empty for anything else. Only its header is read."""
+    length = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or length > min(len(content), raised(MOST_HEADER)):
+        return ""
+    try:
+        header = parse_json(content[8 : 8 + length])
+        own = parse_json(header["__metadata__"][_HEADER])
+        return str(own["kind"])
+    except (UserError, KeyError, TypeError, IndexError):
+        return ""
+
+
 def expect_header(path: Path, kind: str, size: int) -> None:
     """Refuse a safetensors file whose header is longer, or names more tensors, than an honest one: it takes minutes to read.
 

@@ -45,6 +45,20 @@ ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
 }
 """What is posted as JSON: its form, and who answers."""
 
+MISTAKES = (
+    UserError,
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What is told in one line; the server goes on."""
+
 
 class Desk:
     """The workspaces of the models that were opened, the last one of which is worked in, one question at a time.
@@ -163,7 +177,7 @@ def application(desk: Desk, token: str, hosts: Sequence[str], end: Callable[[], 
         Route("/api/learn", learn, methods=["POST"]),
         Route("/api/end", ended, methods=["POST"]),
     ]
-    found = Starlette(routes=routes, exception_handlers={HTTPException: _refused, UserError: _mistaken, Exception: _broken})
+    found = Starlette(routes=routes, exception_handlers={HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)})
     found.add_middleware(Guard, token=token, hosts=frozenset(hosts))
     return found
 
@@ -246,9 +260,5 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 async def _mistaken(request: Request, error: Exception) -> Response:
-    return JSONResponse({"error": _one_line(error)}, 400)
-
-
-async def _broken(request: Request, error: Exception) -> Response:
-    status = 400 if isinstance(error, ClientDisconnect) or mistake_of_machine(error) is not None else 500
-    return JSONResponse({"error": _one_line(error)}, status)
+    own = isinstance(error, UserError | ClientDisconnect) or mistake_of_machine(error) is not None
+    return JSONResponse({"error": _one_line(error)}, 400 if own else 500)

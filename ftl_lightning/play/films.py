@@ -7,13 +7,15 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.domain import Domain, Show
+from ftl_lightning.domains.domain import SUCCESS, Domain, Show
 from ftl_lightning.domains.line_plots import line_film
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import VectorFilm, of_wireframe
-from ftl_lightning.evaluation.films import packed, packed_space
+from ftl_lightning.evaluation.animation import outcome_text
+from ftl_lightning.evaluation.films import packed
+from ftl_lightning.evaluation.films import packed as packed_space
 
-Json = Mapping[str, Any]
+Json = dict[str, Any]
 
 
 def film(drawn: VectorFilm, right: bool | None = None, told: str = "") -> Json:
@@ -74,11 +76,15 @@ def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tenso
         rollout: what happened.
         outcomes: of each episode by name, of bool or numbers ``(episode,)``; empty where nobody judged.
     """
-    loop, found = domain.closed_loop, []
-    draw = None if loop is None else loop.vector_film
-    for number in range(len(rollout.failed) if draw else 0):
-        told = ", ".join(name for name, values in outcomes.items() if values[number].dtype.is_floating_point is False and values[number])
-        right = bool(outcomes["success"][number]) if "success" in outcomes else None
-        assert draw is not None
-        found.append(film(draw(rollout.take(number, number + 1)), right, told))
-    return found
+    draw = None if domain.closed_loop is None else domain.closed_loop.vector_film
+    if draw is None:
+        return []
+    succeeded = outcomes.get(SUCCESS)
+    return [
+        film(
+            draw(rollout.take(number, number + 1)),
+            None if succeeded is None else bool(succeeded[number]),
+            outcome_text(outcomes, number),
+        )
+        for number in range(len(rollout.failed))
+    ]

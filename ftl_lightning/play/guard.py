@@ -28,8 +28,8 @@ HEADERS: Mapping[str, str] = {
 
 
 class Guard:
-    """Turns away what does not come from the page: other hosts' names (which a name server may point here), pages of other origins, and whoever does
-    not know the token.
+    """Turns away what does not come from the page: other hosts' names (which a name server may point here), pages of other
+    origins, and whoever does not know the token.
 
     Args:
         app: that answers the others.

@@ -1,5 +1,6 @@
 """What was done on the page, as Python and as commands that give the same numbers."""
 
+import keyword
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,8 @@ from ftl_lightning.regrouped import INVERSION
 
 FOLDER = "concepts"
 """Where commands write learned concepts."""
+VARIABLES = frozenset({"model", "mixed", "starts", "samples", "episodes", *keyword.kwlist})
+"""Names that a concept's variable may not have."""
 
 
 @dataclass(frozen=True)
@@ -160,4 +163,3 @@ def command(model: str, configuration: str, parts: Sequence[Part], how: Sampled 
         words += ["--execute", "true"] if how.execute else []
         lines.append(shlex.join(words))
     return "\n".join(lines) + "\n"
-

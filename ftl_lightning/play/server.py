@@ -102,7 +102,7 @@ def _names(host: str) -> list[str]:
 
 
 def _own_address() -> str:
-    """This machine's in its network; nothing is sent to find it."""
+    """Address of this machine in its network; nothing is sent to find it."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # an address that belongs to nobody (RFC 5737)

@@ -1,0 +1,53 @@
+"""The verb ``play``: its options, and what it does. Its imports are inside, so that it starts at once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ftl_lightning.ranges import expect_range
+
+if TYPE_CHECKING:
+    from ftl_lightning.play.workspace import Workspace
+
+LARGEST_PORT = 65_535
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Show behaviour five times on a page, see it learned, and mix it with other concepts.
+
+    Attributes:
+        pretrained: the model that is opened first: the name of one that ships, or a folder.
+        root: folder of your copy of recordings, for domains whose demonstrations do not ship.
+        host: address to listen at. With "0.0.0.0" a phone in the same network can open the page, and everybody else there who
+            knows its address.
+        port: of the address; 0 for 8765, or any other if another program has that.
+        browser: open the page in a browser.
+    """
+
+    pretrained: str = "strokes"
+    root: str = ""
+    host: str = "127.0.0.1"
+    port: int = 0
+    browser: bool = True
+
+    def __post_init__(self) -> None:
+        expect_range("port", self.port, 0, LARGEST_PORT)
+
+
+def play(options: PlayOptions) -> None:
+    """Serve the page until Ctrl-C."""
+    from ftl_lightning.extras import expect_extra
+    from ftl_lightning.shipped import shipped_models
+
+    expect_extra("play", "play: its server")
+    from ftl_lightning.play.server import serve
+
+    models = list(dict.fromkeys((options.pretrained, *shipped_models())))
+
+    def workspace(model: str) -> "Workspace":
+        from ftl_lightning.play.workspace import Workspace
+
+        return Workspace(model, Path(options.root) if options.root and model == options.pretrained else None)
+
+    serve(models, workspace, options.host, options.port, options.browser)
