@@ -28,6 +28,7 @@ COMMANDS = {
     "generate": "draw demonstrations of a task into a file",
     "check": "say whether demonstrations of a concept suffice, and which of them is odd",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
+    "view": "watch demonstrations, samples, a concept or results on a page",
     "concepts": "list the training concepts of a model",
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
@@ -37,7 +38,7 @@ COMMANDS = {
     "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study"}
+POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study", "view"}
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
@@ -45,6 +46,7 @@ MODULES = {
     "check": "ftl_lightning.check_command",
     "play": "ftl_lightning.play_command",
     "sample": "ftl_lightning.sampling_command",
+    "view": "ftl_lightning.play_command",
 }
 """Commands with a module of their own."""
 

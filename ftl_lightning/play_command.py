@@ -41,13 +41,51 @@ def play(options: PlayOptions) -> None:
     from ftl_lightning.shipped import shipped_models
 
     expect_extra("play", "play: its server")
-    from ftl_lightning.play.server import serve
-
-    models = list(dict.fromkeys((options.pretrained, *shipped_models())))
+    from ftl_lightning.play.application import Desk, playing
+    from ftl_lightning.play.server import Place, serve
 
     def workspace(model: str) -> "Workspace":
         from ftl_lightning.play.workspace import Workspace
 
         return Workspace(model, Path(options.root) if options.root and model == options.pretrained else None)
 
-    serve(models, workspace, options.host, options.port, options.browser)
+    desk = Desk(list(dict.fromkeys((options.pretrained, *shipped_models()))), workspace)
+    place = Place(options.host, options.port, options.browser)
+    serve(playing(desk), place, lambda: desk.work(desk.state), desk.ended.set)
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Watch a file on a page: demonstrations, samples, a learned concept, or results.
+
+    Attributes:
+        file: of demonstrations or samples (.npz, .safetensors, a Minari or LeRobot data set), of a learned concept, or of results
+            (.csv, or a folder of such).
+        pretrained: model of a learned concept; empty to look for it in pretrained and logs.
+        host: address to listen at, see play.
+        port: of the address, see play.
+        browser: open the page in a browser.
+    """
+
+    file: str
+    pretrained: str = ""
+    host: str = "127.0.0.1"
+    port: int = 0
+    browser: bool = True
+
+    def __post_init__(self) -> None:
+        expect_range("port", self.port, 0, LARGEST_PORT)
+
+
+def view(options: ViewOptions) -> None:
+    """Serve the page until Ctrl-C."""
+    from ftl_lightning.extras import expect_extra
+
+    expect_extra("play", "view: its server")
+    from ftl_lightning.play.application import reading, viewing
+    from ftl_lightning.play.server import Place, serve
+    from ftl_lightning.play.viewer import holds_results, results_page, viewed
+
+    results = holds_results(options.file)
+    routes = reading(results_page(options.file)) if results else viewing(viewed(options.file, options.pretrained))
+    serve(routes, Place(options.host, options.port, options.browser))

@@ -4,7 +4,8 @@ import asyncio
 import json
 import secrets
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
 from typing import Any
 from urllib.parse import quote
 
@@ -116,19 +117,67 @@ def _title(model: str) -> str:
     return model.rpartition("/")[2].replace("_", " ")
 
 
-def application(desk: Desk, token: str, hosts: Sequence[str], end: Callable[[], None]) -> Starlette:
-    """The server's application.
+def guarded(
+    routes: Sequence[Route],
+    token: str,
+    hosts: Sequence[str],
+    end: Callable[[], None],
+    begin: Callable[[], Awaitable[Any]] | None = None,
+) -> Starlette:
+    """An application that answers one page of this machine's own.
 
     Args:
-        desk: what is worked on.
+        routes: what it answers, beside ending.
         token: that questions carry.
         hosts: ``host:port`` by which it may be asked.
         end: ends the program.
+        begin: done at the beginning, while the page may be asked already; ``None`` for nothing.
     """
 
-    async def first(request: Request) -> Response:
-        nonce = secrets.token_urlsafe(16)
-        return HTMLResponse(page(nonce), headers={"content-security-policy": POLICY.format(nonce=nonce)})
+    async def ended(request: Request) -> Response:
+        asyncio.get_running_loop().call_later(WAIT / 2, end)
+        return JSONResponse({"ended": True})
+
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        beginning = asyncio.ensure_future(begin()) if begin is not None else None
+        yield
+        if beginning is not None:
+            beginning.cancel()
+
+    every = [*routes, Route("/api/end", ended, methods=["POST"])]
+    handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
+    found = Starlette(routes=every, exception_handlers=handlers, lifespan=lifespan)
+    found.add_middleware(Guard, token=token, hosts=frozenset(hosts))
+    return found
+
+
+async def first_page(request: Request) -> Response:
+    """The page itself; what it shows it asks for."""
+    nonce = secrets.token_urlsafe(16)
+    return HTMLResponse(page(nonce), headers={"content-security-policy": POLICY.format(nonce=nonce)})
+
+
+def viewing(shown: Mapping[str, Any]) -> list[Route]:
+    """Routes of a page that shows one thing: the answer to ``/api/state``."""
+
+    async def state(request: Request) -> Response:
+        return JSONResponse(shown)
+
+    return [Route("/", first_page), Route("/api/state", state)]
+
+
+def reading(text: str) -> list[Route]:
+    """Routes of a whole page that asks for nothing."""
+
+    async def whole(request: Request) -> Response:
+        return HTMLResponse(text)  # which has a policy of its own
+
+    return [Route("/", whole)]
+
+
+def playing(desk: Desk) -> list[Route]:
+    """Routes of the page on which a person shows, learns and mixes."""
 
     async def state(request: Request) -> Response:
         return JSONResponse(await desk.work(desk.state))
@@ -160,12 +209,8 @@ def application(desk: Desk, token: str, hosts: Sequence[str], end: Callable[[], 
         asked = built(requests.Learn, await _asked(request), "")
         return StreamingResponse(_learned(desk, request, asked), media_type="application/x-ndjson")
 
-    async def ended(request: Request) -> Response:
-        asyncio.get_running_loop().call_later(WAIT / 2, end)
-        return JSONResponse({"ended": True})
-
-    routes = [
-        Route("/", first),
+    return [
+        Route("/", first_page),
         Route("/api/state", state),
         Route("/api/thumbnail", thumbnail),
         Route("/api/concept", concept),
@@ -175,11 +220,7 @@ def application(desk: Desk, token: str, hosts: Sequence[str], end: Callable[[], 
         Route("/api/upload", upload, methods=["POST"]),
         Route("/api/forget", forget, methods=["POST"]),
         Route("/api/learn", learn, methods=["POST"]),
-        Route("/api/end", ended, methods=["POST"]),
     ]
-    found = Starlette(routes=routes, exception_handlers={HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)})
-    found.add_middleware(Guard, token=token, hosts=frozenset(hosts))
-    return found
 
 
 def _answering(desk: Desk, name: str) -> Callable[[Request], Any]:

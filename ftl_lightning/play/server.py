@@ -5,13 +5,15 @@ import ipaddress
 import secrets
 import socket
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import uvicorn
+from starlette.routing import Route
 
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.play.application import Desk, application
-from ftl_lightning.play.workspace import Workspace
+from ftl_lightning.play.application import guarded
 from ftl_lightning.printing import say
 
 LOOPBACK = "127.0.0.1"
@@ -21,54 +23,66 @@ MOST_CONNECTIONS, IDLE = 200, 5
 """Connections at a time, and seconds that an idle one is kept."""
 
 
-def serve(models: Sequence[str], make: Callable[[str], Workspace], host: str, port: int, browser: bool) -> None:
-    """Serve the page until Ctrl-C, or until it is told on the page to end.
+@dataclass(frozen=True)
+class Place:
+    """Where a page is served.
 
-    Args:
-        models: names of those that can be opened, the first one at first.
-        make: makes the workspace of a model.
+    Attributes:
         host: address to listen at; any but the loopback address lets other machines in, which is told.
         port: 0 for :data:`PORT`, or any other if that is taken.
         browser: whether a browser is opened.
+    """
+
+    host: str = LOOPBACK
+    port: int = 0
+    browser: bool = True
+
+
+def serve(
+    routes: Sequence[Route],
+    place: Place,
+    begin: Callable[[], Awaitable[Any]] | None = None,
+    close: Callable[[], None] = lambda: None,
+) -> None:
+    """Serve a page until Ctrl-C, or until it is told on the page to end.
+
+    Args:
+        routes: what is answered.
+        place: where.
+        begin: done at the beginning, while the page may be asked already.
+        close: called when the program ends.
 
     Raises:
         UserError: for an address that cannot be had.
     """
-    listening = _listening(host, port)
-    port = listening.getsockname()[1]
-    token = secrets.token_urlsafe(24)
-    names = _names(host)
-    desk = Desk(models, make)
-    app = application(desk, token, [f"{name}:{port}" for name in names], lambda: setattr(server, "should_exit", True))
+    listening = _listening(place.host, place.port)
+    port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
+    hosts = [f"{name}:{port}" for name in names]
+    app = guarded(routes, token, hosts, lambda: setattr(server, "should_exit", True), begin)
     server = uvicorn.Server(
         uvicorn.Config(
             app,
             log_level="error",
             ws="none",
-            lifespan="off",
             server_header=False,
             limit_concurrency=MOST_CONNECTIONS,
             timeout_keep_alive=IDLE,
             timeout_graceful_shutdown=1,
         )
     )
-    address = f"http://{_bracketed(names[0])}:{port}/?token={token}"
+    address = f"http://{hosts[0]}/?token={token}"
     say(f"open {address}\nCtrl-C ends the program")
-    if host != LOOPBACK:
-        told = f"http://{names[-1]}:{port}/?token={token}"
+    if not ipaddress.ip_address(place.host).is_loopback:
+        told = f"http://{hosts[-1]}/?token={token}"
         say(f"warning: other machines of this network reach it at {told}; whoever has this address can use the program", error=True)
-    if browser:
+    if place.browser:
         webbrowser.open(address)
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
         try:
             server.run(sockets=[listening])
         finally:
-            desk.ended.set()
+            close()
     say("ended")
-
-
-def _bracketed(name: str) -> str:
-    return f"[{name}]" if ":" in name and not name.startswith("[") else name
 
 
 def _listening(host: str, port: int) -> socket.socket:
@@ -94,11 +108,12 @@ def _listening(host: str, port: int) -> socket.socket:
 
 def _names(host: str) -> list[str]:
     """By which the server may be asked, this machine's own first."""
+    bracketed = f"[{host}]" if ":" in host else host
     if ipaddress.ip_address(host).is_unspecified:
         return [LOOPBACK, "localhost", _own_address()]
     if ipaddress.ip_address(host).is_loopback:
-        return [host, "localhost"]
-    return [_bracketed(host)]
+        return [bracketed, "localhost"]
+    return [bracketed]
 
 
 def _own_address() -> str:

@@ -272,12 +272,7 @@ class Workspace:
 
     def _unused(self, name: str) -> str:
         """A name whose files and variable no other concept that was learned here has."""
-        taken = {known.learned.variable for known in self._concepts.values() if known.learned} | {
-            "model",
-            "mixed",
-            "starts",
-            "samples",
-        }
+        taken = VARIABLES | {known.learned.variable for known in self._concepts.values() if known.learned}
         found, number = name, 2
         while Learned(found).variable in taken:
             found, number = f"{name} {number}", number + 1

@@ -1,0 +1,128 @@
+"""What ``view`` shows of a file: films of its demonstrations or samples by concept, with what a check found, or of a concept's samples."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.concepts.concept import KIND, Concept
+from ftl_lightning.demonstrations.check import check
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.mended_file import read_mended
+from ftl_lightning.domains.domain import Domain, Plans, Show, line_drawings
+from ftl_lightning.domains.from_file import OWN, read_own
+from ftl_lightning.domains.registry import domain_names, load_domain
+from ftl_lightning.errors import UserError, about
+from ftl_lightning.limits import expect_readable
+from ftl_lightning.play.films import Json, plan_film
+from ftl_lightning.play.mixing import sampling_of, starts_of
+from ftl_lightning.tensor_file import kind_of, visible
+
+MOST_SHOWN, MOST_CONCEPTS = 60, 100
+"""Films of a concept, and concepts; of more the first."""
+SAMPLES = 16
+"""Of a learned concept."""
+HEADER = 16 * 2**20
+"""Bytes of a file that are read to say of what kind it is."""
+
+
+def holds_results(file: str) -> bool:
+    """Whether a file, or a folder, is one of results."""
+    path = Path(file)
+    return path.suffix == ".csv" or (path.is_dir() and bool(visible(path, "**/*.csv")))
+
+
+def results_page(file: str) -> str:
+    """The page of ``report --html`` of some results.
+
+    Raises:
+        UserError: if there are none.
+    """
+    from ftl_lightning.reporting.html.page import write_page
+
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / "page.html"
+        write_page(Path(file), page)
+        return page.read_text(encoding="utf-8")
+
+
+def viewed(file: str, model: str = "") -> dict[str, Any]:
+    """What the page shows of a file.
+
+    Args:
+        file: of demonstrations, samples or a learned concept; the name or folder of a data set.
+        model: of a learned concept; empty to look for it.
+
+    Raises:
+        UserError: naming the file, if it is none of these.
+    """
+    path = Path(file)
+    if path.suffix == ".safetensors":
+        expect_readable(path, "demonstrations or concept")
+        with path.open("rb") as opened:
+            if kind_of(opened.read(HEADER)) == KIND:
+                return _state(path.name, *_of_concept(file, model))
+    return _state(path.name, *_of_demonstrations(file))
+
+
+def _state(title: str, told: list[str], groups: list[Json]) -> dict[str, Any]:
+    return {"title": title, "viewer": {"title": title, "told": told, "groups": groups}, "offline": None}
+
+
+def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:
+    found, broken = read_mended(file) if Path(file).is_file() else (read_own(file), ())
+    domain = _domain_of(found)
+    with about(file):
+        found = found.fitted(domain.observed) if domain is not None else found
+    show = line_drawings(Plans(found.states.shape[1], found.state_names, found.state_units)) if domain is None else domain.show
+    names = list(dict.fromkeys(found.concepts))
+    told = [str(found)]
+    if len(names) > MOST_CONCEPTS:
+        told.append(f"the first {MOST_CONCEPTS} of {len(names)} concepts are shown")
+    groups = []
+    for name in names[:MOST_CONCEPTS]:
+        rows = [row for row, text in enumerate(found.concepts) if text == name]
+        own = found.rows(rows)
+        findings = [*(one.within(rows) for one in broken if set(one.rows) <= set(rows)), *check(own)]
+        told += [f"{name}: {one.text}" for one in findings if not one.rows and one.severity != "note"]
+        told += [f"{name}: the first {MOST_SHOWN} of {len(rows)} are shown"] if len(rows) > MOST_SHOWN else []
+        flags = [[one.text for one in findings if row in one.rows and one.severity != "note"] for row in range(len(rows))]
+        groups.append({"concept": name, "films": _films(show, own, domain is not None and bool(domain.observed), flags)})
+    return told, groups
+
+
+def _domain_of(found: Demonstrations) -> Domain | None:
+    """The domain that a file says it is of, if an installed package offers it and its states fit."""
+    if found.domain in ("", OWN) or found.domain not in domain_names():
+        return None
+    domain = load_domain(found.domain)
+    return domain if len(domain.plans.columns) == found.states.shape[2] else None
+
+
+def _films(show: Show, own: Demonstrations, observed: bool, flags: list[list[str]]) -> list[Json]:
+    lengths, starts = own.lengths.tolist(), own.initial_states
+    return [
+        {
+            "film": plan_film(show, own.states[row, : lengths[row]], starts.take([row]) if observed else None),
+            "label": str(row + 1),
+            "flags": flags[row],
+        }
+        for row in range(min(len(own), MOST_SHOWN))
+    ]
+
+
+def _of_concept(file: str, model: str) -> tuple[list[str], list[Json]]:
+    from ftl_lightning.few_shot import FewShot
+    from ftl_lightning.learning.pretrained import find_model
+    from ftl_lightning.shipped import MODELS
+
+    concept = Concept.load(file)
+    places = (Path("pretrained"), Path("logs"), MODELS)
+    few = FewShot.from_pretrained(model or find_model(concept.origin.pretrained, places))
+    learned = few.load(file)
+    name = concept.origin.name
+    task, starts = starts_of(few, (name,), SAMPLES, 0)
+    plans = few.sample(learned, SAMPLES, starts, seed=0, **sampling_of(few))
+    told = [str(concept), *str(learned.explain()).splitlines(), *([f"samples start from scenes of {task!r}"] if task else [])]
+    if not plans.states.isfinite().all():
+        raise UserError(f"{file}: expected a concept whose samples are finite, found another")
+    return told, [{"concept": name, "films": _films(few.domain.show, plans, bool(few.domain.observed), [[]] * SAMPLES)}]
