@@ -117,12 +117,15 @@ def _title(model: str) -> str:
     return model.rpartition("/")[2].replace("_", " ")
 
 
+Begin = Callable[[], Awaitable[Any]]
+
+
 def guarded(
     routes: Sequence[Route],
     token: str,
     hosts: Sequence[str],
     end: Callable[[], None],
-    begin: Callable[[], Awaitable[Any]] | None = None,
+    begin: Begin | None = None,
 ) -> Starlette:
     """An application that answers one page of this machine's own.
 

@@ -95,8 +95,10 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
         Films, what is right in words, and how they were made.
 
     Raises:
-        UserError: for what cannot be executed.
+        UserError: for a task that the domain does not read, or what cannot be executed.
     """
+    if asked.task:
+        model.judging.expect_goal(asked.task, "task")
     how = sampling_of(model, asked.temperature)
     task, starts = starts_of(model, (asked.task, *tasks), asked.count, asked.seed)
     goal = goal_of(model, mixture.names, asked.task)

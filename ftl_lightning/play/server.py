@@ -5,15 +5,14 @@ import ipaddress
 import secrets
 import socket
 import webbrowser
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import uvicorn
 from starlette.routing import Route
 
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.play.application import guarded
+from ftl_lightning.play.application import Begin, guarded
 from ftl_lightning.printing import say
 
 LOOPBACK = "127.0.0.1"
@@ -41,7 +40,7 @@ class Place:
 def serve(
     routes: Sequence[Route],
     place: Place,
-    begin: Callable[[], Awaitable[Any]] | None = None,
+    begin: Begin | None = None,
     close: Callable[[], None] = lambda: None,
 ) -> None:
     """Serve a page until Ctrl-C, or until it is told on the page to end.
@@ -97,6 +96,7 @@ def _listening(host: str, port: int) -> socket.socket:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             found.bind((host, wanted))
+            found.listen()  # from when its address is told
         except (OSError, OverflowError) as error:
             found.close()
             last = error if isinstance(error, OSError) else OSError(str(error))

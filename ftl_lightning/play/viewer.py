@@ -1,4 +1,4 @@
-"""What ``view`` shows of a file: films of its demonstrations or samples by concept, with what a check found, or of a concept's samples."""
+"""What ``view`` shows of a file: films of its demonstrations by concept with what a check found, or of a concept's samples."""
 
 import tempfile
 from pathlib import Path

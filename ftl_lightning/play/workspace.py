@@ -19,7 +19,7 @@ from ftl_lightning.learning.quality import GENERATED
 from ftl_lightning.play import requests
 from ftl_lightning.play.demonstrating import Demonstrating, as_npz
 from ftl_lightning.play.films import Json, films
-from ftl_lightning.play.mixing import Mixture, judged, samples, sampling_of, starts_of
+from ftl_lightning.play.mixing import Mixture, goal_of, judged, samples, sampling_of, starts_of
 from ftl_lightning.play.same import VARIABLES, Learned, Part, Sampled, command, python
 from ftl_lightning.tensor_file import kind_of
 
@@ -315,7 +315,7 @@ class Workspace:
         """Of a concept that was just learned, and what share is right."""
         task, starts = starts_of(self._model, (self._shown.task,), count, 0)
         plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
-        return judged(self._model, plans, task or concept.concept.origin.name)
+        return judged(self._model, plans, goal_of(self._model, (concept.concept.origin.name,), task))
 
     def thumbnail(self, key: str) -> Json:
         """A sample of a concept."""
