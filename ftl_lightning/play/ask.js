@@ -64,19 +64,21 @@ async function download(path, name) {
   setTimeout(() => URL.revokeObjectURL(address), 10000);
 }
 
-function tellError(text) {
+function tellError(text, by = "") {
+  find("error").dataset.by = by;
   find("error-text").textContent = text;
   find("error").hidden = !text;
 }
 
-// Whatever a person does: errors are told, and never break the page. What was given up for something newer is none.
-async function attempt(what) {
+// Errors are told, and never break the page; what was given up for something newer is none. What a person does next takes
+// the message away, what the page does `by` itself only its own.
+async function attempt(what, by = "") {
   try {
     const found = await what();
-    tellError("");
+    if (!by || by === find("error").dataset.by) tellError("");
     return found;
   } catch (error) {
-    if (error.name !== "AbortError") tellError(error.message || String(error));
+    if (error.name !== "AbortError") tellError(error.message || String(error), by);
     return undefined;
   }
 }

@@ -8,6 +8,7 @@ const announce = (text) => { find("announced").textContent = text; };
 // Shows demonstrations. Where some were just added and there are enough, learning starts by itself.
 function worked(work, added = false) {
   state.work = work;
+  if (!work.demonstrations.length) learning.task = "";
   slots();
   find("check").replaceChildren(...checks(work).map((text) => made("li", { textContent: text })));
   find("undo").disabled = !work.undo;
@@ -18,7 +19,7 @@ function worked(work, added = false) {
   learnable();
   if (added) {
     announce(`${many(work.demonstrations.length, "demonstration")} of ${work.wanted}.`);
-    if (work.demonstrations.length >= work.wanted) learn();
+    if (work.demonstrations.length >= work.wanted) learnInSight();
   }
 }
 
@@ -74,13 +75,21 @@ function learnable() {
   }
 }
 
+const smooth = () => matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth";
+
+// Learning that starts by itself is brought in sight, as on a phone it is below.
+function learnInSight() {
+  learn();
+  if (find("learning").getBoundingClientRect().top > 0.75 * innerHeight) find("learning").scrollIntoView({ behavior: smooth() });
+}
+
 async function learn() {
   if (learning.stop) learning.stop.abort();
   const stop = learning.stop = new AbortController(), name = find("name").value.trim() || suggested();
-  Object.assign(learning, { concept: null, losses: [], named: learning.named });
+  Object.assign(learning, { concept: null, losses: [] });
   document.body.dataset.learning = "yes";
   find("quality").textContent = "";
-  find("save").hidden = true;
+  find("save").hidden = find("to-mix").hidden = true;
   find("progress").hidden = false;
   find("waiting").textContent = "Learning \u2026";
   announce(`Learning ${name}.`);
@@ -130,7 +139,7 @@ function learned(line) {
   const took = `Learned \u201c${line.concept.name}\u201d in ${line.seconds.toFixed(1)} seconds.`;
   find("waiting").textContent = took;
   find("quality").textContent = line.quality.line;
-  find("save").hidden = false;
+  find("save").hidden = find("to-mix").hidden = false;
   same("work", line.same);
   samplesTold(line.samples, line.concept.name);
   announce(`${took} ${line.quality.line} It is in the mix below.`);
@@ -179,7 +188,7 @@ async function upload(file) {
     const added = JSON.stringify(found.work.demonstrations.map((one) => one.id)) !== before;
     await renew(found);
     announce(`${file.name} is opened.`);
-    if (added && found.work.demonstrations.length >= found.work.wanted) learn();
+    if (added && found.work.demonstrations.length >= found.work.wanted) learnInSight();
   });
 }
 
@@ -187,10 +196,14 @@ const undo = () => attempt(async () => worked(await ask("/api/undo", {})));
 
 function listenToWork() {
   find("undo").addEventListener("click", undo);
-  find("clear").addEventListener("click", () => attempt(async () => { learning.task = ""; worked(await ask("/api/clear", {})); }));
+  find("clear").addEventListener("click", () => attempt(async () => worked(await ask("/api/clear", {}))));
   find("learn").addEventListener("click", learn);
   find("name").addEventListener("input", () => { learning.named = find("name").value.trim() !== ""; });
   find("save").addEventListener("click", () => attempt(() => download(`/api/concept?id=${encodeURIComponent(learning.concept.id)}`, `${learning.concept.name}.safetensors`)));
+  find("to-mix").addEventListener("click", () => {
+    find("mix-title").scrollIntoView({ behavior: smooth() });
+    find("mix-title").focus({ preventScroll: true });
+  });
   find("save-demos").addEventListener("click", () => attempt(() => download("/api/demonstrations", "demonstrations.npz")));
   find("draw").addEventListener("click", () => attempt(async () => {
     find("draw").disabled = true;

@@ -1,8 +1,8 @@
 // Step 3: concepts in a mix, each with its weight, and samples of the mix that follow the sliders.
 const WAIT = 50; // milliseconds between a change and the question for its samples
-const PATIENCE = 400; // milliseconds after which an older question is given up for a newer one
+const SLOW = 400; // milliseconds after which it is told that samples are on their way
 const MANY = 10; // concepts above which they can be searched
-const mix = { parts: [], seed: 0, timer: 0, asking: null, since: 0, again: false, thumbnails: new Map(), waiting: [], fetching: false };
+const mix = { parts: [], seed: 0, timer: 0, asking: null, again: false, view: null, thumbnails: new Map(), waiting: [], fetching: false };
 const conceptOf = (id) => state.concepts.find((one) => one.id === id);
 
 // --- the list of concepts
@@ -170,50 +170,49 @@ function question() {
     execute: state.executes && find("execute").checked, task: state.executes ? find("starts").value : "" };
 }
 
-// Samples follow: never more than one question is open, and an old one that takes long is given up.
+// Samples follow the sliders while these move. Only one question is open at a time, as the program answers one after another;
+// what changes meanwhile is asked for next, so that no question of an older choice ever waits.
 function resample() {
   mix.again = true;
-  if (mix.timer) return;
-  mix.timer = setTimeout(() => {
-    mix.timer = 0;
-    if (!mix.again) return;
-    if (mix.asking && performance.now() - mix.since < PATIENCE) { resample(); return; }
-    if (mix.asking) mix.asking.abort();
-    sample();
-  }, WAIT);
+  if (!mix.timer && !mix.asking) mix.timer = setTimeout(sample, WAIT);
 }
 
 async function sample() {
   const stop = mix.asking = new AbortController();
   mix.again = false;
-  mix.since = performance.now();
+  mix.timer = 0;
+  const slow = setTimeout(() => { find("took").textContent = "sampling \u2026"; }, SLOW);
   find("mixed").setAttribute("aria-busy", "true");
   if (mix.parts.length) {
     const asked = question(), name = mixName();
     await attempt(async () => {
       const found = await ask("/api/sample", asked, stop.signal);
       if (stop.signal.aborted) return;
-      fill(find("mixed"), found.samples, viewOf(found.samples), (number) => `Sample ${number + 1} of ${name}`);
+      mix.view = steadyView(mix.view, found.samples);
+      fill(find("mixed"), found.samples, mix.view, (number) => `Sample ${number + 1} of ${name}`);
       find("told").textContent = found.told;
       find("mix-name").textContent = name;
       find("took").textContent = answers ? "" : `${found.seconds.toFixed(1)} s`;
       same("mix", found.same);
       newSamples();
       thumbnails();
-    });
+    }, "mix");
   } else {
     fill(find("mixed"), [], null, () => "");
     find("told").textContent = find("took").textContent = find("mix-name").textContent = "";
   }
-  if (mix.asking !== stop) return;
+  clearTimeout(slow);
+  if (find("took").textContent.startsWith("sampling")) find("took").textContent = "";
   mix.asking = null;
+  if (mix.again) resample();
   find("mixed").setAttribute("aria-busy", "false");
 }
 
 const mixName = () => mix.parts.map((one) => (one.weight === 1 ? "" : `${Number(one.weight.toFixed(2))} \u00d7 `) + conceptOf(one.id).name).join(" + ");
 
 function setMix() {
-  mix.seed = 0;
+  if (mix.asking) mix.asking.abort();
+  Object.assign(mix, { seed: 0, view: null, parts: [] });
   find("seed").textContent = "noise 0";
   find("temperature").value = state.temperature;
   find("temperature-value").textContent = Number(find("temperature").value).toFixed(2);

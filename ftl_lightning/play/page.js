@@ -7,7 +7,8 @@ async function renew(found) {
   state = found;
   document.title = find("title").textContent = state.title;
   find("models").replaceChildren(...state.models.map((one) => made("option", { value: one.name, textContent: one.title, selected: one.name === state.model.name })));
-  find("models-label").hidden = state.models.length < 2 || Boolean(state.offline);
+  find("models-label").hidden = state.models.length < 2 || Boolean(state.offline || state.viewer);
+  find("loading").hidden = true;
   find("viewer").hidden = !state.viewer;
   find("play-page").hidden = Boolean(state.viewer);
   if (state.viewer) { setViewer(state.viewer); return; }
@@ -21,7 +22,7 @@ async function renew(found) {
 
 function setOffline() {
   const before = Boolean(state.offline), some = state.work.demonstrations.length > 0;
-  for (const id of ["canvas", "editing", "ways", "learning"]) find(id).hidden = before;
+  for (const id of ["hint", "canvas", "ways", "learning"]) find(id).hidden = before;
   find("made-before").hidden = !before;
   find("showing").hidden = before && !some;
   if (before) {
@@ -35,12 +36,13 @@ async function open(name) {
   if (learning.stop) learning.stop.abort();
   await attempt(async () => {
     document.body.setAttribute("aria-busy", "true");
+    announce("The model is being loaded.");
     try {
       const found = await ask("/api/open", { model: name });
       Object.assign(learning, { concept: null, task: "", named: false });
       fill(find("samples"), [], null, () => "");
       find("quality").textContent = "";
-      find("progress").hidden = find("save").hidden = true;
+      find("progress").hidden = find("save").hidden = find("to-mix").hidden = true;
       await renew(found);
       announce(`${state.model.title} is opened.`);
     } finally { document.body.removeAttribute("aria-busy"); }
@@ -67,6 +69,7 @@ async function start() {
     if (packed) answers = await unpacked(packed);
     await renew(await ask("/api/state"));
   });
+  find("loading").hidden = true;
   paint();
   document.body.dataset.ready = Math.round(performance.now()); // milliseconds until the first state is drawn
 }

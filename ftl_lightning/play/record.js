@@ -124,7 +124,7 @@ const NOUNS = { draw: "Stroke", arrange: "Arrangement", steer: "Trip" };
 
 function told() {
   const count = state.work.demonstrations.length, scene = recorder.scene;
-  const which = `${NOUNS[recorder.kind]} ${count + 1}` + (count < state.work.wanted ? ` of ${state.work.wanted}` : "");
+  const which = count < state.work.wanted ? `${NOUNS[recorder.kind]} ${count + 1} of ${state.work.wanted}` : `${count} are there; more are welcome`;
   const limit = scene && scene.seconds ? ` of ${scene.seconds.toFixed(1)}` : "";
   const clock = recorder.kind === "steer" && recorder.passed ? ` \u00b7 ${recorder.passed.toFixed(1)}${limit} s` : "";
   find("next").textContent = recorder.busy ? "One moment\u2026" : which + clock;
@@ -144,14 +144,18 @@ function keep(path, times, line = null) {
   if (recorder.kind === "draw") redraw();
   told();
   recorder.queue = recorder.queue.then(() => attempt(async () => {
-    const { scene: number } = await scene;
-    worked(await ask("/api/record", { scene: number, path, seconds: times }), true);
-  })).then(async () => {
+    try {
+      const { scene: number } = await scene;
+      worked(await ask("/api/record", { scene: number, path, seconds: times }), true);
+    } finally {
+      recorder.shown.shift();
+      if (recorder.kind !== "draw" || recorder.busy === 1) await newScene();
+    }
+  })).then(() => {
     recorder.busy -= 1;
-    recorder.shown.shift();
-    if (recorder.kind !== "draw" || !recorder.busy) await attempt(newScene);
     told();
     redraw();
+    if (recorder.kind === "steer" && recorder.keys.size) steering();
   });
   return recorder.queue;
 }
@@ -193,8 +197,6 @@ function pointerDown(event) {
     recorder.pointer = place;
     steering();
   }
-  event.preventDefault();
-  board().focus({ preventScroll: true });
   board().setPointerCapture(event.pointerId);
   redraw();
 }
@@ -327,7 +329,7 @@ function steering() {
 
 function oneStep(speed, limited) {
   let [x, y] = recorder.at[0];
-  const most = speed * STEP;
+  const most = 0.999 * speed * STEP; // rounding makes it no faster than it can
   if (recorder.pointer) {
     const [right, up] = [recorder.pointer[0] - x, recorder.pointer[1] - y], far = Math.hypot(right, up);
     const by = limited ? Math.min(1, most / (far || 1)) : 1;
@@ -375,13 +377,14 @@ function handleKey(event, number) {
 // --- the beginning
 
 const KEYS = {
-  draw: "Or press \u201cdraw with keys\u201d.",
+  draw: "",
   arrange: "Or Tab to a piece, move it with the arrow keys (Shift: faster), and press Enter.",
   steer: "Drag, or steer with the arrow keys or W A S D. Time runs only while you steer. Enter finishes.",
 };
 
 async function setRecorder(found) {
-  find("stage").hidden = find("hand").hidden = !found;
+  find("stage").hidden = find("hand").hidden = find("next").hidden = !found;
+  find("ways").open = !found;
   recorder.kind = found ? found.kind : "";
   recorder.scene = null;
   recorder.penKeys = false;

@@ -91,6 +91,21 @@ function drawBody(canvas, film, seconds, room, how = {}) {
   pen.globalAlpha = 1;
 }
 
-// Either kind of film.
-const viewOf = (films) => films.some((film) => film.space) ? roomAround(films.filter((film) => film.space)) : around(films);
+// What is in sight in all of some films of either kind: a square, unless all have the same window.
+function viewOf(films) {
+  if (films.some((film) => film.space)) return roomAround(films);
+  const [left, lower, width, height] = around(films), side = Math.max(width, height);
+  if (films.every((film) => film.window.every((edge, number) => edge === films[0].window[number]))) return films[0].window;
+  return [left + (width - side) / 2, lower + (height - side) / 2, side, side];
+}
+
+// The view that there was, if it does for other films too: samples that follow a slider keep their scale.
+function steadyView(before, films) {
+  const now = viewOf(films);
+  if (!before || Array.isArray(before) !== Array.isArray(now)) return now;
+  if (!Array.isArray(now)) return now.radius <= before.radius && now.height <= before.height && now.side > 0.6 * before.side ? before : now;
+  const within = [0, 1].every((axis) => now[axis] >= before[axis] && now[axis] + now[axis + 2] <= before[axis] + before[axis + 2]);
+  return within && now[2] > 0.6 * before[2] ? before : now;
+}
+
 const drawFilm = (canvas, film, at, view, how) => film.space ? drawBody(canvas, film, at, view, how) : draw(canvas, film, at, view, how);
