@@ -1,99 +1,11 @@
-"use strict";
-// Draws everything from the page's own data; nothing is loaded.
-const SVG = "http://www.w3.org/2000/svg";
-const ABSENT = -32768, PAUSE = 1.5;
-const find = (id) => document.getElementById(id);
-const made = (name, of = {}, ...inside) => {
-  const one = document.createElement(name);
-  Object.assign(one, of);
-  one.append(...inside);
-  return one;
-};
-const drawn = (name, of = {}, text) => {
-  const one = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(of)) one.setAttribute(key, value);
-  if (text !== undefined) one.textContent = text;
-  return one;
-};
+// Draws everything from the page's own data, with film.js; nothing is loaded.
+const PAUSE = 1.5;
 const two = (value) => value.toFixed(2);
 const unique = (values) => [...new Set(values)];
 let data, domain = "", setting = "", task = "", hidden = new Set();
 let films = [], clock = 0, length = 1, playing = true, last = 0, alone = null;
 
-async function unpacked(text) {
-  const bytes = Uint8Array.from(atob(text.trim()), (one) => one.charCodeAt(0));
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).json();
-}
-
 // --- films
-
-function points(shape) {
-  if (!shape.at) {
-    const bytes = Uint8Array.from(atob(shape.points), (one) => one.charCodeAt(0));
-    shape.at = new Int16Array(bytes.buffer);
-  }
-  return shape.at;
-}
-
-// Where a shape's points are at a time between frames, in the film's unit; null where it is not there.
-function placed(shape, film, frame) {
-  const at = points(shape), size = 2 * shape.count, frames = at.length / size;
-  const before = Math.min(Math.floor(frame), frames - 1), after = Math.min(before + 1, frames - 1);
-  const part = frames > 1 ? Math.min(frame - before, 1) : 0, found = [];
-  const [left, lower, width] = film.window;
-  for (let index = 0; index < size; index += 2) {
-    const one = [at[before * size + index], at[before * size + index + 1]];
-    let other = [at[after * size + index], at[after * size + index + 1]];
-    if (one[0] === ABSENT) return null;
-    if (other[0] === ABSENT) other = one;
-    found.push([left + (one[0] + part * (other[0] - one[0])) * width / 10000, lower + (one[1] + part * (other[1] - one[1])) * width / 10000]);
-  }
-  return found;
-}
-
-function draw(canvas, film, seconds, view) {
-  const [left, lower, width, height] = view;
-  const ratio = Math.min(window.devicePixelRatio || 1, 2);
-  const across = Math.round((canvas.clientWidth || 240) * ratio), down = Math.round(across * height / width);
-  if (canvas.width !== across || canvas.height !== down) [canvas.width, canvas.height] = [across, down];
-  const pen = canvas.getContext("2d"), scale = across / width;
-  const frame = Math.min(seconds * film.rate, film.frames - 1);
-  pen.clearRect(0, 0, across, down);
-  pen.lineCap = pen.lineJoin = "round";
-  const x = (place) => (place[0] - left) * scale, y = (place) => down - (place[1] - lower) * scale;
-  for (const index of film.shapes) {
-    const shape = data.shapes[film.file][index];
-    let places = placed(shape, film, frame);
-    if (!places) continue;
-    if (shape.kind === "way") {
-      const way = [];
-      for (let step = 0; step <= Math.floor(frame); step++) way.push(...(placed(shape, film, step) || []));
-      places = [...way, ...places];
-    }
-    pen.fillStyle = pen.strokeStyle = shape.colour;
-    pen.lineWidth = Math.max((shape.size || 0) * scale, 1);
-    if (shape.kind === "dots") {
-      for (const place of places) {
-        pen.beginPath();
-        pen.arc(x(place), y(place), Math.max(shape.size * scale, 1), 0, 2 * Math.PI);
-        if (shape.hollow) { pen.lineWidth = Math.max(2, 0.3 * shape.size * scale); pen.stroke(); } else pen.fill();
-      }
-      continue;
-    }
-    pen.beginPath();
-    places.forEach((place, number) => number ? pen.lineTo(x(place), y(place)) : pen.moveTo(x(place), y(place)));
-    if (shape.kind === "area") { pen.closePath(); shape.hollow ? pen.stroke() : pen.fill(); } else pen.stroke();
-  }
-}
-
-const seconds = (film) => Math.max(film.frames - 1, 0) / film.rate;
-
-function around(some) {
-  const left = Math.min(...some.map((film) => film.window[0])), lower = Math.min(...some.map((film) => film.window[1]));
-  const right = Math.max(...some.map((film) => film.window[0] + film.window[2]));
-  const upper = Math.max(...some.map((film) => film.window[1] + film.window[3]));
-  return [left, lower, right - left, upper - lower];
-}
 
 // How an episode ended: null where nothing decides.
 function decided(film) {
@@ -332,6 +244,7 @@ function listen() {
 
 unpacked(find("data").textContent).then((found) => {
   data = found;
+  for (const task of data.films) for (const film of task.films) film.shapes = film.shapes.map((index) => data.shapes[film.file][index]);
   document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
   const moving = data.films.find((one) => one.films.some((film) => film.frames > 1));
   domain = moving ? moving.domain : data.domains[0].name;

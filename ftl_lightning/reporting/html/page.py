@@ -29,6 +29,7 @@ from ftl_lightning.schema import read_json
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import visible, write_text
 from ftl_lightning.version import __version__
+from ftl_lightning.web import FILM
 
 HERE = Path(__file__).parent
 FILMS, CONCEPTS = "films", "concepts"
@@ -227,7 +228,7 @@ def _html(content: Mapping[str, Any]) -> str:
     raw = json.dumps(content, separators=(",", ":")).encode()
     parts = {
         "STYLE": (HERE / "page.css").read_text(encoding="utf-8"),
-        "SCRIPT": (HERE / "page.js").read_text(encoding="utf-8"),
+        "SCRIPT": FILM.read_text(encoding="utf-8") + (HERE / "page.js").read_text(encoding="utf-8"),
         "DATA": base64.b64encode(gzip.compress(raw, mtime=0)).decode(),  # letters that end no script
     }
     template = (HERE / "page.html").read_text(encoding="utf-8")
