@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, of_wireframe
+from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.judged import Judged
 from ftl_lightning.evaluation.results import METHOD, Row
 from ftl_lightning.tensor_file import write_text
@@ -106,10 +108,39 @@ def packed(film: VectorFilm) -> list[dict[str, Any]]:
 def _packed(shape: Shape, window: tuple[float, float, float, float]) -> dict[str, Any]:
     left, lower, width, _ = window
     steps = (np.asarray(shape.points, dtype=np.float64) - (left, lower)) / width * STEPS
-    there = np.isfinite(steps)
-    whole = np.where(there, np.clip(np.rint(np.where(there, steps, 0)), ABSENT + 1, -ABSENT - 1), ABSENT).astype("<i2")
+    whole = _whole(steps)
     whole = whole[:1] if (whole == whole[:1]).all() else whole  # most things on a table do not move
     told: dict[str, Any] = {"kind": shape.kind, "colour": shape.colour, "count": shape.points.shape[1]}
     told |= {"size": round(shape.size, 4)} if shape.size else {}
     told |= {} if shape.filled else {"hollow": True}
     return told | {"points": base64.b64encode(whole.tobytes()).decode()}
+
+
+MILLIMETRES = 1000
+"""In a metre; coordinates of what moves in space are whole ones."""
+
+
+def packed_space(motion: Wireframe) -> dict[str, Any]:
+    """A motion in space as JSON, which a page can turn: x and y along the floor, z upwards.
+
+    Returns:
+        ``points``, base64 of little-endian int16 ``(frame, point, 3)`` in millimetres, within 32 metres, :data:`ABSENT` where they
+        are not finite; ``count``, how many points there are; ``lines``, pairs of points, with their ``colours``; ``heads``, a
+        point, a radius in metres and a colour each; ``rate``, frames a second; ``room``, radius of the floor and height in metres.
+    """
+    steps = motion.points.astype(np.float64) * MILLIMETRES
+    return {
+        "points": base64.b64encode(_whole(steps).tobytes()).decode(),
+        "count": motion.points.shape[1],
+        "lines": [list(pair) for pair in motion.lines],
+        "colours": list(motion.colours),
+        "heads": [list(head) for head in motion.heads],
+        "rate": motion.rate,
+        "room": list(motion.room),
+    }
+
+
+def _whole(steps: NDArray[np.float64]) -> NDArray[np.int16]:
+    """Numbers of steps as 16-bit numbers; those that are not finite are :data:`ABSENT`."""
+    there = np.isfinite(steps)
+    return np.where(there, np.clip(np.rint(np.where(there, steps, 0)), ABSENT + 1, -ABSENT - 1), ABSENT).astype("<i2")

@@ -12,8 +12,7 @@ from ftl_lightning.domains.line_plots import line_film
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import VectorFilm, of_wireframe
 from ftl_lightning.evaluation.animation import outcome_text
-from ftl_lightning.evaluation.films import packed
-from ftl_lightning.evaluation.films import packed as packed_space
+from ftl_lightning.evaluation.films import packed, packed_space
 
 Json = dict[str, Any]
 

@@ -358,12 +358,6 @@ def bvh(frames: int, after: str = "0 0 0") -> str:
 
 
 class TestBvh:
-    """Only where its reader is installed."""
-
-    @pytest.fixture(autouse=True)
-    def _reader(self) -> None:
-        pytest.importorskip("pybvh", reason="the extra mocap")
-
     def test_the_thorax_is_put_back_and_the_first_frame_left_out(self, tmp_path: Path) -> None:
         (tmp_path / "02.asf").write_text(asf())
         (tmp_path / "02_01.bvh").write_text(bvh(5))
@@ -395,13 +389,6 @@ class TestBvh:
         assert "02_01.bvh: expected the MotionBuilder-friendly conversion of the database, found a skeleton without" in told(folder)
         (folder / "02_01.bvh").write_text(bvh(161)[:-40])
         assert "02_01.bvh: expected a BVH file, found a damaged one" in told(folder)
-
-
-def test_bvh_files_without_their_reader_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pybvh", None)
-    folder = database(tmp_path, WALK)
-    (folder / "02_01.amc").rename(folder / "02_01.bvh")
-    assert "BVH files need the extra 'mocap'" in told(folder)
 
 
 @pytest.mark.parametrize(
@@ -437,7 +424,6 @@ def test_recorded_motion_is_read_as_it_was_before(tmp_path: Path) -> None:
         shutil.copytree(Path(named) / "raw_samples", folder)
         folder.chmod(0o755)
         if not amc_too:
-            pytest.importorskip("pybvh", reason="the extra mocap")
             for path in folder.glob("*.amc"):
                 path.unlink()
             (folder / "09_06.daz.bvh").unlink()

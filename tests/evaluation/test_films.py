@@ -10,10 +10,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
+from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
-from ftl_lightning.evaluation.films import ABSENT, STEPS, packed
+from ftl_lightning.evaluation.films import ABSENT, STEPS, packed, packed_space
 from ftl_lightning.evaluation.results import read_rows
 
 
@@ -103,3 +106,87 @@ def test_own_behaviour_is_filmed_by_its_columns(columns: int) -> None:
         assert (shape.points >= (left, lower)).all()
         assert (shape.points <= (left + width, lower + height)).all()
     assert film.frames == 12
+
+
+def test_points_in_space_are_within_a_millimetre() -> None:
+    points = np.random.default_rng(0).uniform(-2, 2, (5, 3, 3)).astype(np.float32)
+    points[2, 1] = np.inf
+    motion = Wireframe(points, ((0, 1), (1, 2)), ("#ff0000", "#00ff00"), ((2, 0.11, "#0000ff"),), 30.0, (0.75, 2.1))
+    found = json.loads(json.dumps(packed_space(motion)))
+    at = np.frombuffer(base64.b64decode(found.pop("points")), dtype="<i2").reshape(5, 3, 3)
+    assert (at[2, 1] == ABSENT).all()
+    finite = np.isfinite(points)
+    assert np.abs(at[finite] / 1000 - points[finite]).max() <= 0.00051
+    assert found == {
+        "count": 3,
+        "lines": [[0, 1], [1, 2]],
+        "colours": ["#ff0000", "#00ff00"],
+        "heads": [[2, 0.11, "#0000ff"]],
+        "rate": 30.0,
+        "room": [0.75, 2.1],
+    }
+
+
+@pytest.mark.parametrize("name", [name for name in domain_names() if not name.startswith("ftl_")])
+def test_plans_of_every_domain_that_ships_can_be_drawn(name: str) -> None:
+    show = load_domain(name).show
+    assert show.vector_film is not None or show.wireframe is not None
+
+
+def middle(film: VectorFilm) -> NDArray[np.float32]:
+    """Where the film's last shape is ``(frame, 2)``."""
+    return np.asarray(film.shapes[-1].points.mean(axis=1), dtype=np.float32)
+
+
+@pytest.mark.parametrize("length", [1, 2, 30])
+def test_a_plan_of_the_agent_is_a_way_in_its_scene(length: int) -> None:
+    domain = load_domain("agent")
+    starts = domain.source(None).starts("go to red bowl", 1, 0)
+    states = domain.references["nearest object"]("go to red bowl", 1, starts, 0)[0, :length]
+    assert domain.show.vector_film is not None
+    film = domain.show.vector_film(states, starts)
+    assert film.frames == length
+    assert np.allclose(middle(film), states[:, [0, 2]].numpy(), atol=1e-5)
+    assert film.frames / film.rate == pytest.approx(length / 30)  # seconds, for the shorter and the longer ones
+    assert sum(len(shape.points) == 1 for shape in film.shapes) >= 4  # two objects, each in its ring
+
+
+def test_a_demonstration_of_driving_is_drawn_on_its_road_among_the_others_at_its_start() -> None:
+    domain = load_domain("driving")
+    assert domain.show.vector_film is not None
+    shipped = Demonstrations.load(SHIPPED / "merge.safetensors").rows([3])
+    length = int(shipped.lengths[0])
+    for states in (shipped.states[0, :length], shipped.states[0, :8] * 1.01):  # a plan's headings and presence are about 1
+        film = domain.show.vector_film(states, shipped.initial_states)
+        assert film.frames == len(states)
+        assert np.allclose(middle(film), states[:, 1:3].numpy() * (1, -1), atol=1e-2)
+        sides = np.linalg.norm(np.diff(film.shapes[-1].points, axis=1), axis=-1)
+        assert np.allclose(sides, (2, 5, 2), atol=1e-2)  # a vehicle, whatever the heading's length
+        others = [shape for shape in film.shapes[:-1] if shape.kind == "area"]
+        seen = shipped.observed["traffic"][0, 0].reshape(5, 7)[1:].numpy()
+        present = seen[seen[:, 0] > 0]
+        assert len(others) == len(present) > 0
+        assert np.allclose(np.stack([one.points[0].mean(axis=0) for one in others]), present[:, 1:3] * (1, -1), atol=1e-3)
+        assert any(shape.kind == "line" for shape in film.shapes)
+
+
+def test_a_demonstration_on_the_table_is_the_hands_way_among_objects_that_stay() -> None:
+    domain = load_domain("tabletop")
+    assert domain.show.vector_film is not None
+    shown = domain.source(None).draw("pick green circle to book", 1, 1)
+    states = shown.states[0, : int(shown.lengths[0])]
+    film = domain.show.vector_film(states, shown.initial_states)
+    way = next(shape for shape in film.shapes if shape.kind == "way")
+    left, lower, width, height = film.window
+    inside = (way.points >= (left, lower)) & (way.points <= (left + width, lower + height))
+    assert inside.all()
+    # Where the hand closes, it is at the circle: seen from the front, in the middle of the circle's layers.
+    circle = [shape for shape in film.shapes if shape.kind == "area" and shape.colour in ("#13731a", "#1a9933", "#137326")]
+    assert len(circle) == 4
+    heart = np.concatenate([layer.points[0] for layer in circle]).mean(axis=0)
+    closed = int((states[:, 3] < 0.06).nonzero()[0])
+    assert np.linalg.norm(way.points[round(closed / len(states) * film.frames), 0] - heart) < 0.05
+    assert all(len(shape.points) == 1 for shape in film.shapes if shape.kind == "area")
+    bare = domain.show.vector_film(states, None)
+    assert sum(shape.kind == "area" for shape in bare.shapes) == 1  # the table
+    assert film.frames / film.rate == pytest.approx(len(states) / 20)  # twice as fast as it was

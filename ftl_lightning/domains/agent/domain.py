@@ -1,8 +1,8 @@
 """The domain object: what the rest of the package knows about navigation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
 from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import VALIDATION_SEED
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 NAME = "agent"
 HORIZON = 128
-RENDERING = "ftl_lightning.domains.agent.rendering"
+RENDERING, STEERING = "ftl_lightning.domains.agent.rendering", "ftl_lightning.domains.agent.steering"
 STATE_NAMES = tuple(
     f"agent.{column}"
     for column in ("x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "angular vx", "angular vy", "angular vz")
@@ -58,19 +59,28 @@ def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrati
 
 
 def _drive(tasks: tuple[str, ...], count: int, seed: int, progress: Callable[[], None]) -> Demonstrations:
-    drives = [expert.demonstrations(task, count, seed, progress) for task in tasks]
-    observations = torch.cat([seen for seen, _ in drives])
+    found = [expert.demonstrations(task, count, seed, progress) for task in tasks]
+    return drives(
+        torch.cat([seen for seen, _ in found]),
+        torch.cat([lengths for _, lengths in found]),
+        tuple(task for task in tasks for _ in range(count)),
+        {"generator": NAME, "seed": seed, "count_per_task": count},
+    )
+
+
+def drives(observations: Tensor, lengths: Tensor, concepts: tuple[str, ...], provenance: Mapping[str, Any]) -> Demonstrations:
+    """Drives ``(demo, time, 52)`` as demonstrations."""
     return Demonstrations(
         states=observations[..., :STATE].contiguous(),
-        lengths=torch.cat([lengths for _, lengths in drives]),
+        lengths=lengths,
         domain=NAME,
         state_names=STATE_NAMES,
         state_units=STATE_UNITS,
-        concepts=tuple(task for task in tasks for _ in range(count)),
+        concepts=concepts,
         observed={OBSERVED: observations},
         per_step=(OBSERVED,),
         scenes=observations[:, 0].contiguous(),
-        provenance={"generator": NAME, "seed": seed, "count_per_task": count},
+        provenance=provenance,
     )
 
 
@@ -187,7 +197,7 @@ DOMAIN = Domain(
     observed={OBSERVED: FEATURE},
     metrics={ACCURACY: Metric(progressed)},
     headline="closed loop success",
-    show=Show(deferred(f"{RENDERING}:render")),
+    show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
     views=VIEWS,
     closed_loop=ClosedLoop(
@@ -201,4 +211,11 @@ DOMAIN = Domain(
     ),
     distance=distance,
     paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
+    recorder=Recorder(
+        "steer",
+        "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
+        deferred(f"{STEERING}:scene"),
+        deferred(f"{STEERING}:record"),
+        tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
+    ),
 )

@@ -64,7 +64,17 @@ def demonstrate(environment: "AgentEnvironment", initial: NDArray[np.float32], c
     """
     objects = object_positions(torch.from_numpy(initial)[None])[0].double().numpy()[:, PLANE]
     place = initial[list(PLANE)].astype(np.float64)
-    corners = route(place, objects[chosen], objects[1 - chosen])
+    return follow(environment, initial, route(place, objects[chosen], objects[1 - chosen]))
+
+
+def follow(environment: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane) -> NDArray[np.float32]:
+    """Observations ``(time, 52)`` of a drive along a way, at the expert's speed until it rests at the way's end.
+
+    Args:
+        environment: any; it is reset.
+        initial: ``(52,)``.
+        corners: ``(2 or more, 2)`` of the way, in x and z. What :data:`LENGTH` states are too few for is left out.
+    """
     observation = environment.reset(options={"scene": initial})[0][OBSERVED]
     seen = [observation]
     for step in range(LENGTH - 1):

@@ -64,7 +64,7 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
 
 
 def _end(observations: Tensor) -> int:
-    """After how many of the steps ``(step, 52)`` nothing moves any more."""
+    """After how many of the steps ``(step, 3 or more)`` nothing moves any more."""
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     return int(moving.nonzero().max()) + 2 if moving.any() else 1
 
@@ -92,15 +92,32 @@ SIZE = 0.1
 """Half the width of a body in metres."""
 AGENT = "#c79a2b"
 STEPS_A_SECOND = 30.0
+"""Of the simulation in films of shapes: half as fast again as it was."""
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:
-    """An episode from above, until nothing moves any more, four times as fast as it was."""
+    """An episode from above, until nothing moves any more."""
     observations = rollout.observed[OBSERVED][0]
-    times = some(_end(observations), FRAMES)
-    agent = observations[times][:, list(PLANE)].numpy()[:, None]
+    return from_above(observations[0], observations)
+
+
+def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
+    """A plan or a demonstration ``(time, 13)`` from above, in its scene, until nothing moves any more."""
+    return from_above(expect_starts(starts).observed[OBSERVED][0], states)
+
+
+def from_above(world: Tensor, states: Tensor) -> VectorFilm:
+    """A scene and the agent's way in it; the agent is the last shape.
+
+    Args:
+        world: ``(52,)``.
+        states: ``(time, 3 or more)``, of which the first three are where the agent is.
+    """
+    end = _end(states)
+    times = some(end, FRAMES)
+    agent = states[times][:, list(PLANE)].numpy()[:, None]
     shapes = []
-    for (colour, shape), at in zip(looks(observations[0].tolist()), object_positions(observations[:1])[0].numpy(), strict=True):
+    for (colour, shape), at in zip(looks(world.tolist()), object_positions(world[None])[0].numpy(), strict=True):
         place, shade = at[list(PLANE)], "#{:02x}{:02x}{:02x}".format(*COLOURS[colour])
         shapes.append(still("line", regular(48, REACH)[[*range(48), 0]] + place, "#a8adb3", 0.01))
         if shape in CORNERS:
@@ -110,4 +127,4 @@ def vector_film(rollout: Rollout) -> VectorFilm:
             shapes.append(Shape("dots", place[None, None].astype(np.float32), shade, SIZE, filled=shape == "sphere"))
     shapes += [Shape("way", agent, AGENT, 0.025), Shape("dots", agent, AGENT, 0.07)]
     (left, right), (low, high) = SEEN
-    return VectorFilm(shapes, (left, low, right - left, high - low), STEPS_A_SECOND * len(times) / max(_end(observations), 1))
+    return VectorFilm(shapes, (left, low, right - left, high - low), STEPS_A_SECOND * len(times) / end)

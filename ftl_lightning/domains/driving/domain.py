@@ -148,7 +148,7 @@ DOMAIN = Domain(
     source=Expert,
     observed=FEATURES_SEEN,
     headline="closed loop strict success",
-    show=Show(deferred(f"{RENDERING}:render")),
+    show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     views=VIEWS,
     closed_loop=ClosedLoop(
         environment=environment,

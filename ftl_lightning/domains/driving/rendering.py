@@ -185,15 +185,35 @@ def vector_film(rollout: Rollout) -> VectorFilm:
     episode = take(rollout.observed, 0)
     name = NAMES[int(episode[SCENARIO][0].item())]
     traffic = episode[TRAFFIC][: _end(episode[TRAFFIC])].unflatten(1, (VEHICLES, -1)).numpy()
-    low, high = _window(traffic[:, 0, 1:3])
+    others = [Shape("area", _corners(seen), OTHER) for seen in _followed(traffic[:, 1:], decision_seconds(name))]
+    return _from_above(name, others, traffic[:, 0])
+
+
+def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
+    """A plan or a demonstration ``(time, 7)`` from above, a frame a state; the other vehicles stay where they are first.
+
+    Raises:
+        UserError: without the simulator, which knows the roads.
+    """
+    seen = take(expect_starts(starts).observed, 0)
+    vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
+    ego = states.numpy().copy()
+    ego[:, 0] = 1
+    ego[:, 5:] /= np.maximum(np.linalg.norm(ego[:, 5:], axis=1, keepdims=True), 1e-6)  # a generated heading has any length
+    others = [Shape("area", _corners(vehicle[None]), OTHER) for vehicle in vehicles[1:] if vehicle[0] > 0]
+    planned = Shape("dots", (ego[None, :, 1:3] * (1, -1)).astype(np.float32), PLAN, 0.9)
+    return _from_above(NAMES[int(seen[SCENARIO].item())], [planned, *others], ego)
+
+
+def _from_above(name: str, others: Sequence[Shape], ego: NDArray[np.float32]) -> VectorFilm:
+    """A scenario's roads, what else is on them, and the controlled vehicle's way ``(time, 7)``, with itself as the last shape."""
+    low, high = _window(ego[:, 1:3])
     near = [lane[((lane > low - FAR) & (lane < high + FAR)).all(axis=1)] for lane in _lanes(name)]
     lanes = [lane * (1, -1) for lane in near if len(lane) > 1]
     roads = [still("line", lane, colour, size) for colour, size in ((ROAD, LANE), (MARK, 0.3)) for lane in lanes]
-    others = [Shape("area", _corners(seen), OTHER) for seen in _followed(traffic[:, 1:], decision_seconds(name))]
-    way = Shape("way", (traffic[:, :1, 1:3] * (1, -1)).astype(np.float32), EGO, 0.6)
+    way = Shape("way", (ego[:, None, 1:3] * (1, -1)).astype(np.float32), EGO, 0.6)
     window = (float(low[0]), float(-high[1]), float(high[0] - low[0]), float(high[1] - low[1]))
-    shapes = (*roads, way, *others, Shape("area", _corners(traffic[:, 0]), EGO))
-    return VectorFilm(shapes, window, PLAYED / decision_seconds(name))
+    return VectorFilm((*roads, way, *others, Shape("area", _corners(ego), EGO)), window, PLAYED / decision_seconds(name))
 
 
 def _corners(seen: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,20 +1,22 @@
-"""Motion in the BVH files of B. Hahne's MotionBuilder-friendly conversion of the database (cgspeed), read by pybvh.
+"""Motion in BVH files: those of B. Hahne's MotionBuilder-friendly conversion of the database (cgspeed), and our own.
 
 The conversion leaves the thorax out: neck and collars hang where it starts. It is put back from the subject's ASF where there is
 one, else the bone below it stands for it. Its first frame is a T-pose, which is no motion.
 """
 
-import contextlib
-import io
-import warnings
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ftl_lightning.demonstrations.container import Demonstrations, padded
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
+from ftl_lightning.domains.mocap.bvh_file import Motion, read_motion
+from ftl_lightning.domains.mocap.export import NODES as EXPORTED
+from ftl_lightning.domains.mocap.normalise import normalised, z_up
+from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON
+from ftl_lightning.domains.mocap.source import NAME, POSE, pieces
 from ftl_lightning.errors import UserError
-from ftl_lightning.limits import MOST_TEXT, expect_readable
 
 METRES = INCH / 0.45
 """Of a unit of the conversion, which is that of the ASF files."""
@@ -25,6 +27,9 @@ NODES = (
 """Whose places are the joints, in their order."""
 _AFTER_THORAX = ("Neck", "LeftShoulder", "RightShoulder")
 _BELOW = "Spine1"
+_CONVERTED = (*NODES, *_AFTER_THORAX, _BELOW)
+SAME_RATE = 0.01
+"""Relative difference of frame rates that is rounding."""
 
 
 def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64], int]:
@@ -35,29 +40,71 @@ def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64]
         skeleton: of the subject, if there is one.
 
     Raises:
-        UserError: naming the file, if it is damaged or of another conversion, or pybvh is not installed.
+        UserError: naming the file, if it is damaged or of another conversion.
     """
-    try:
-        import pybvh
-    except ImportError:
-        raise UserError(f"{path}: BVH files need the extra 'mocap'; run: pip install 'ftl-lightning[mocap]'") from None
-    expect_readable(path, "BVH", MOST_TEXT)
-    try:
-        # What it guesses of facing and handedness does not matter here.
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            motion = pybvh.read_bvh_file(path, world_up="+y")
-    except Exception as error:  # whatever a reader raises at what it cannot read
-        raise UserError(f"{path}: expected a BVH file, found a damaged one ({' '.join(str(error).split())})") from error
-    places = {node.name: node for node in motion.nodes}
-    if missing := [name for name in (*NODES, *_AFTER_THORAX, _BELOW) if name not in motion.node_index]:
+    motion = read_motion(path)
+    if missing := [name for name in _CONVERTED if name not in motion.names]:
         raise UserError(
             f"{path}: expected the MotionBuilder-friendly conversion of the database, found a skeleton without {missing[0]!r}"
         )
-    for name in _AFTER_THORAX:
-        if not np.any(places[name].offset):
-            places[name].offset = places[_BELOW].offset.copy() if skeleton is None else skeleton.bones[THORAX].reach.copy()
-    found = motion.node_positions()[:, [motion.node_index[name] for name in NODES]]
-    if not np.isfinite(found).all():
-        raise UserError(f"{path}: expected finite numbers, found others")
-    return found[1:] * METRES, round(1 / motion.frame_time)
+    return _converted(motion, skeleton), round(1 / motion.seconds)
+
+
+def _converted(motion: Motion, skeleton: Skeleton | None) -> NDArray[np.float64]:
+    """Joints ``(frame, 14, 3)`` of the conversion, without its first frame."""
+    offsets = {node.name: node.offset for node in motion.nodes}
+    thorax = offsets[_BELOW] if skeleton is None else skeleton.bones[THORAX].reach
+    put_back = {name: np.asarray(thorax, dtype=np.float64) for name in _AFTER_THORAX if not np.any(offsets[name])}
+    return motion.places(NODES, put_back)[1:] * METRES
+
+
+def demonstrated(path: Path) -> Demonstrations:
+    """Motion of one file as demonstrations without a text: one for each stretch without glitches, as of recordings.
+
+    Args:
+        path: of a file that ``sample --export`` wrote, at any frame rate, or of the conversion.
+
+    Raises:
+        UserError: naming the file, if it is damaged, of another skeleton, or shorter than a plan.
+    """
+    motion = read_motion(path)
+    if motion.names.issuperset(_CONVERTED):
+        joints = _converted(motion, None)
+    elif motion.names.issuperset(EXPORTED):
+        joints = motion.places(EXPORTED)
+    else:
+        missing = next(name for name in EXPORTED if name not in motion.names)
+        raise UserError(
+            f"{path}: expected a body as 'sample --export' writes it, or of the MotionBuilder-friendly conversion of the CMU "
+            f"database, found one without {missing!r}"
+        )
+    poses = normalised(z_up(_at_rate(joints, motion.seconds))).positions.astype(np.float32).reshape(-1, len(COLUMNS))
+    found = pieces(poses)
+    if not found:
+        raise UserError(
+            f"{path}: expected a motion of {HORIZON} frames or more at {FPS} a second, without jumps, found {len(poses)} frames"
+        )
+    states, lengths = padded(found)
+    return Demonstrations(
+        states=states,
+        lengths=lengths,
+        domain=NAME,
+        state_names=COLUMNS,
+        state_units=("m",) * len(COLUMNS),
+        concepts=("",) * len(found),
+        observed={POSE: states},
+        per_step=(POSE,),
+        provenance={"generator": "BVH file", "file": path.name},
+    )
+
+
+def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """Joints ``(frame, 14, 3)`` at :data:`FPS`, in between as if they moved evenly."""
+    step = 1 / FPS / seconds
+    whole = max(round(step), 1)
+    step = whole if abs(step - whole) < SAME_RATE * whole else step
+    times = np.arange(0, len(joints) - 1 + 1e-9, step)
+    before = np.minimum(times.astype(int), max(len(joints) - 2, 0))
+    after = np.minimum(before + 1, len(joints) - 1)
+    part = (times - before)[:, None, None]
+    return joints[before] * (1 - part) + joints[after] * part

@@ -55,6 +55,7 @@ DOMAIN = Domain(
         deferred(f"{_DRAWING}:wireframe"),
         exports={".bvh": deferred("ftl_lightning.domains.mocap.export:bvh")},
     ),
+    imports={".bvh": deferred("ftl_lightning.domains.mocap.bvh:demonstrated")},
     prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
     fresh=False,  # there is no more behaviour than what was recorded
 )

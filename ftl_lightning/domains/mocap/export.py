@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
+from ftl_lightning.domains.mocap.bvh_file import END
 from ftl_lightning.domains.mocap.skeleton import FPS, as_joints
 from ftl_lightning.domains.mocap.standing import standing_poses
 from ftl_lightning.errors import UserError
@@ -61,6 +62,11 @@ TREE = (
     Joint("LeftForeArm", 10, skeleton.L_ELBOW, skeleton.L_WRIST, end=True),
 )
 """Parents before their children, and each followed by all that hangs on it."""
+_NAMES = {joint.place: joint.name for joint in TREE if joint.place != HIPS} | {
+    joint.tip: f"{END}{joint.name}" for joint in TREE if joint.end and joint.tip is not None
+}
+NODES = tuple(_NAMES[number] for number in range(len(skeleton.JOINTS)))
+"""Joints and end sites of the file whose places are the body's joints, in their order."""
 _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Yrotation Xrotation"
 
 

@@ -125,7 +125,7 @@ DOMAIN = Domain(
     privileged={PLACES: Privileged(SEEN, misplaced, told)},
     views=VIEWS,
     headline=EXECUTED,
-    show=Show(deferred(f"{RENDERING}:render")),
+    show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
     paper=Paper(PUBLISHED, omega="learned", ours="learned", comparable=False),
     fresh=False,  # an expert takes about half a second for an episode

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.physics import Simulator, pybullet
-from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
+from ftl_lightning.domains.tabletop.interface import ACTION, FEATURES, HERTZ, IMAGE, MAX_STEPS, OPEN, POSE, THRESHOLD
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     CIRCLE,
@@ -26,7 +26,6 @@ from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
 from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.errors import UserError
 
-HERTZ = 10
 TARGETS, SUBSTEPS = 3, 8
 """In a step the arm is given so many targets in a row, for so many steps of the simulation each."""
 ITERATIONS = 20

@@ -17,6 +17,8 @@ SEEN = Feature((5, 4))
 """Privileged: of each object whether the camera sees it, and its centre (m). Only the pictures of a training set come with it."""
 ACTION = 4
 """Place of the hand (m) and opening of the gripper (m): what plans consist of."""
+HERTZ = 10
+"""Actions a second."""
 MAX_STEPS = 160
 """The paper's number: 16 seconds."""
 OPEN, THRESHOLD = 0.08, 0.06

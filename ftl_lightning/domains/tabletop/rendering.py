@@ -1,6 +1,6 @@
 """Pictures: plans from above, and films of episodes with the plans in them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop.interface import POSE, THRESHOLD, expect_simulator
-from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines
+from ftl_lightning.domains.tabletop.interface import HERTZ, POSE, THRESHOLD, expect_simulator
+from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
 from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, FRONT, TABLE_COLOUR
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
 from ftl_lightning.escape import figure_text
@@ -102,37 +102,66 @@ LAYERS = 4
 """Outlines above one another that an object is drawn by."""
 SHAPE_FRAMES, SPEED = 50, 2.0
 """At most, of films of shapes, and how many times as fast as it was they play."""
-HAND = "#5a5f66"
+HAND, WAY = "#5a5f66", "#d0006f"
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:
     """An episode from the front, objects as layers above one another, the gripper as its two fingers."""
-    from ftl_lightning.domains.tabletop.environment import HERTZ
-
     trace = np.stack(rollout.infos[0]["trace"]) if rollout.infos[0].get("trace") else np.zeros((1, 0))
     scene = rollout.starts.require_scenes()[0].numpy()
     times = some(len(trace), SHAPE_FRAMES)
     hand = rollout.observed[POSE][0].numpy()[times]
-    (low, high), (left, right) = SIGHT  # y grows to the right from the front
-    table = [(low, right), (low, left), (high, left), (high, right)]
-    shapes = [still("area", _front(np.array([(*corner, 0.0) for corner in table])), _hex(TABLE_COLOUR, 1.25))]
     present = [name for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5]
     poses = dict(zip(present, np.split(trace[times, len(ARM) + len(FINGERS) :], max(len(present), 1), axis=1), strict=False))
-    for name in sorted(poses, key=(BOOK, WHITE).__contains__, reverse=True):  # what lies on the book is drawn after it
-        turned = [outline(name, x, y, _yaw(turn)) for (x, y, _, *turn) in poses[name]]
-        foot = poses[name][:, 2] - HEIGHT[name] / 2
-        for layer in range(LAYERS):
-            height = foot + HEIGHT[name] * layer / (LAYERS - 1)
-            corners = [np.column_stack((edge, np.full(len(edge), z))) for edge, z in zip(turned, height, strict=True)]
-            points = np.stack([_front(each) for each in corners]).astype(np.float32)
-            shapes.append(Shape("area", points, _hex(COLOUR[name], 0.75 if layer < LAYERS - 1 else 1.0)))
-    shapes.append(Shape("dots", _front(hand[:, :3] * (1, 1, 0))[:, None].astype(np.float32), _hex(TABLE_COLOUR, 0.8), 0.008))
-    for side in (-0.5, 0.5):
-        tip = hand[:, :3] + np.outer(hand[:, 7] + 0.012, (0, side, 0))
-        finger = np.stack((_front(tip), _front(tip + np.array((0, 0, 0.06)))), axis=1)
-        shapes.append(Shape("line", finger.astype(np.float32), HAND, 0.01))
+    placed = {
+        name: np.array([(x, y, z - HEIGHT[name] / 2, _yaw(turn)) for x, y, z, *turn in found]) for name, found in poses.items()
+    }
+    return _from_front([*_objects(placed), *_hand(hand[:, :3], hand[:, 7])], len(times), len(trace))
+
+
+def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
+    """The hand's way of a plan or a demonstration ``(time, 4)`` from the front; objects, where they are known, as they lie first.
+
+    Nothing tells of a plan what becomes of the objects: they stay.
+    """
+    times = some(len(states), SHAPE_FRAMES)
+    hand = states.numpy()[times]
+    placed = {}
+    if starts is not None and starts.scenes is not None:
+        scene = starts.scenes[0].numpy()
+        for name in outlines(scene):
+            _, x, y, yaw = scene[COLUMNS[name]]
+            placed[name] = np.array([(x, y, support(scene, name), yaw)])
+    way = Shape("way", _front(hand[:, :3])[:, None].astype(np.float32), WAY, 0.004)
+    return _from_front([*_objects(placed), way, *_hand(hand[:, :3], hand[:, 3])], len(times), len(states))
+
+
+def _from_front(shapes: Sequence[Shape], frames: int, steps: int) -> VectorFilm:
+    """Shapes on the table: frames that were chosen of so many steps."""
+    (low, high), (left, right) = SIGHT  # y grows to the right from the front
+    table = [(low, right), (low, left), (high, left), (high, right)]
+    top = still("area", _front(np.array([(*corner, 0.0) for corner in table])), _hex(TABLE_COLOUR, 1.25))
     window = (left, DEPTH * (FAR - high), right - left, DEPTH * (high - low) + 0.2)
-    return VectorFilm(shapes, window, SPEED * HERTZ * len(times) / max(len(trace), 1))
+    return VectorFilm((top, *shapes), window, SPEED * HERTZ * frames / max(steps, 1))
+
+
+def _objects(placed: Mapping[str, NDArray[np.floating]]) -> Iterator[Shape]:
+    """Objects at places ``(frame, 4)``: x, y, the height of what they stand on, and yaw."""
+    for name in sorted(placed, key=(BOOK, WHITE).__contains__, reverse=True):  # what lies on the book is drawn after it
+        for layer in range(LAYERS):
+            above = HEIGHT[name] * layer / (LAYERS - 1)
+            edges = [(outline(name, x, y, yaw), foot + above) for x, y, foot, yaw in placed[name].tolist()]
+            points = np.stack([_front(np.column_stack((edge, np.full(len(edge), z)))) for edge, z in edges]).astype(np.float32)
+            yield Shape("area", points, _hex(COLOUR[name], 0.75 if layer < LAYERS - 1 else 1.0))
+
+
+def _hand(places: NDArray[np.floating], opening: NDArray[np.floating]) -> Iterator[Shape]:
+    """The gripper's two fingers so far apart ``(frame,)`` around places ``(frame, 3)``, and a dot on the table below it."""
+    yield Shape("dots", _front(places * (1, 1, 0))[:, None].astype(np.float32), _hex(TABLE_COLOUR, 0.8), 0.008)
+    for side in (-0.5, 0.5):
+        tip = places + np.outer(opening + 0.012, (0, side, 0))
+        finger = np.stack((_front(tip), _front(tip + np.array((0, 0, 0.06)))), axis=1)
+        yield Shape("line", finger.astype(np.float32), HAND, 0.01)
 
 
 FAR = 0.78
