@@ -27,7 +27,7 @@ COMMANDS = {
     "generate": "draw demonstrations of a task into a file",
     "check": "say whether demonstrations of a concept suffice, and which of them is odd",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
-    "concepts": "list the training concepts of a model",
+    "concepts": "list the concepts of a model: training concepts and learned ones",
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
@@ -40,6 +40,8 @@ POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study"}
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
+REPEATED = {"concepts": "folder"}
+"""Commands with an option that may be given several times."""
 MODULES = {"check": "ftl_lightning.check_command", "sample": "ftl_lightning.sampling_command"}
 """Commands with a module of their own."""
 
@@ -104,6 +106,7 @@ def _dispatch(arguments: list[str]) -> None:
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
         given = _gathered(arguments[1:], SEVERAL[verb]) if verb in SEVERAL else arguments[1:]
+        given = _repeated(given, REPEATED[verb]) if verb in REPEATED else given
         found = auto_cli(kind or function, args=expanded(given, verb), exit_on_error=False, **options)
         if kind:  # options in a class of their own
             function(found)
@@ -120,6 +123,20 @@ def _gathered(arguments: list[str], option: str) -> list[str]:
     """The arguments with those at the front that belong to no option as a list in one."""
     count = next((index for index, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
     return [f"--{option}={json.dumps(arguments[:count])}", *arguments[count:]] if count else arguments
+
+
+def _repeated(arguments: list[str], option: str) -> list[str]:
+    """The arguments with all values of an option as a list in one."""
+    values, rest, left = [], [], iter(arguments)
+    for argument in left:
+        name, equals, value = argument.partition("=")
+        if name != f"--{option}":
+            rest.append(argument)
+            continue
+        if not (value := value if equals else next(left, "")):
+            raise UserError(f"{option}: expected a value, found none")
+        values.append(value)
+    return [*rest, f"--{option}={json.dumps(values)}"] if values else rest
 
 
 def _overview() -> str:

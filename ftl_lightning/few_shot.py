@@ -23,7 +23,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain, closed_loop_of
-from ftl_lightning.errors import UserError, shown
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
 from ftl_lightning.judging import judged, judging_domain, picture
@@ -33,6 +33,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
 from ftl_lightning.learning.hub import download, save_with_card, upload
 from ftl_lightning.learning.learner import Learner
+from ftl_lightning.learning.library import Library, library
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -64,11 +65,13 @@ class FewShot(Shown):
 
     Attributes:
         settings: the configuration file that they were read from; empty if none was.
+        folder: that the model was read from; ``None`` if it was made in another way.
     """
 
     def __init__(self, model: ConceptModel, tuned: Tuned) -> None:
         self.model, self.tuned = model, tuned
         self.settings = ""
+        self.folder: Path | None = None
         self._examples: list[Demonstrations] = [] if model.examples is None else [model.examples]
 
     @classmethod
@@ -100,7 +103,7 @@ class FewShot(Shown):
         if settings is None:
             settings = settings_of(model.config.domain, model.method.configurations)
         found = cls(model, Tuned.read(settings))
-        found.settings = str(settings)
+        found.settings, found.folder = str(settings), folder
         return found
 
     def _words(self) -> Iterator[str]:
@@ -146,6 +149,17 @@ class FewShot(Shown):
         """
         return Composition(self.model.concept(text)[None, None], torch.ones(1, device=self.device), space=self._space)
 
+    def library(self, folders: Sequence[str | Path] = ()) -> Library:
+        """The concepts of this model by name: training concepts, learned ones in its own folder, and saved ones.
+
+        Args:
+            folders: with saved concepts, besides your own library (:func:`~ftl_lightning.learning.library.concepts_folder`).
+
+        Raises:
+            UserError: for a folder that is none.
+        """
+        return library(self.model.hash, self.training_concepts, self.folder, folders)
+
     def load(self, path: str | Path) -> LearnedConcept:
         """A learned concept from its file.
 
@@ -158,12 +172,13 @@ class FewShot(Shown):
         return self._learned(concept)
 
     def compose(self, text: str) -> Composition:
-        """``'go to red object:1.2 + other.safetensors:0.9'``: training concepts and files of learned concepts, with weights.
+        """``'go to red object:1.2 + other.safetensors:0.9'``: training concepts and learned ones, with weights.
 
-        After an ``@`` the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
+        A learned concept is named by its file, or by its name in the :meth:`library`; training concepts go first. After an ``@``
+        the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
 
         Raises:
-            UserError: for a part that is neither, or nothing at all.
+            UserError: for a part that is neither, a name of several concepts, or nothing at all.
         """
         expect_text("compose", text, f"{self.training_concepts[0]}:1.2 + learned.safetensors")
         parts = [self._part(part) for part in parse_composition(text)]
@@ -172,8 +187,25 @@ class FewShot(Shown):
         return functools.reduce(operator.add, parts)
 
     def _part(self, part: Part) -> Composition:
-        found = part.weight * (self.load(part.concept) if part.concept.endswith(".safetensors") else self[part.concept])
+        found = part.weight * self._named(part.concept)
         return found.on(self.domain.plans.grouped(part.groups), self.model.config.state_dim) if part.groups else found
+
+    def _named(self, name: str) -> Composition:
+        """A training concept by its text, or a learned one by its file or its name in the library."""
+        if name in self.training_concepts:
+            return self[name]
+        if name.endswith(".safetensors"):
+            return self.load(name)
+        known = self.library()
+        if (entry := known.learned_as(name)) is not None and entry.path is not None:
+            return self.load(entry.path)
+        if not known.learned:
+            return self[name]  # which tells the nearest
+        near = "; ".join(short(one, 40) for one in known.nearest(name))
+        raise UserError(
+            f"concept {shown(name)}: expected a training concept or one of the model's library: {near} are the nearest of "
+            f"{len(known)}; list all: python -m ftl_lightning concepts MODEL"
+        )
 
     def _learned(self, concept: Concept) -> LearnedConcept:
         own = concept.composition.to(self.device)
