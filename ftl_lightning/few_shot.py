@@ -2,6 +2,7 @@
 
 import functools
 import operator
+import os
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,7 +32,7 @@ from ftl_lightning.learned_concept import LearnedConcept, concept_of
 from ftl_lightning.learning.concept_check import expect_concept, expect_sizes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
-from ftl_lightning.learning.hub import download, save_with_card, upload
+from ftl_lightning.learning.hub import CONCEPT_FILES, download, expect_repository, is_repository, save_with_card, upload
 from ftl_lightning.learning.learner import Learner
 from ftl_lightning.learning.library import Library, library
 from ftl_lightning.learning.longer import longer_than_plans
@@ -41,7 +42,8 @@ from ftl_lightning.ranges import LARGEST_STEP
 from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED
-from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped_models
+from ftl_lightning.shared_concept import read_folder
+from ftl_lightning.shipped import pretrained_folder, shipped_models, shipped_name
 from ftl_lightning.trust import vouching
 from ftl_lightning.tuned import Tuned, settings_of
 
@@ -66,12 +68,14 @@ class FewShot(Shown):
     Attributes:
         settings: the configuration file that they were read from; empty if none was.
         folder: that the model was read from; ``None`` if it was made in another way.
+        known_as: under which name others find the model: one that ships or ``'owner/name'`` on the Hub; empty where there is none.
     """
 
     def __init__(self, model: ConceptModel, tuned: Tuned) -> None:
         self.model, self.tuned = model, tuned
         self.settings = ""
         self.folder: Path | None = None
+        self.known_as = ""
         self._examples: list[Demonstrations] = [] if model.examples is None else [model.examples]
 
     @classmethod
@@ -95,15 +99,15 @@ class FewShot(Shown):
         if settings is not None:
             expect_path("settings", settings, "a configuration file of invert")
         folder, place = pretrained_folder(name), device_named(device)
-        owner, slash, own = str(name).partition("/")
-        if not folder.is_dir() and slash and "/" not in own and owner not in FOLDERS and not owner.startswith((".", "~")):
-            folder = download(str(name))
+        known_as = ""
+        if not folder.is_dir() and is_repository(str(name)):
+            folder, known_as = download(str(name)), str(name)
         with vouching([] if settings is None else Tuned.domains(settings)):
             model = load_model(folder, domain).to(place)
         if settings is None:
             settings = settings_of(model.config.domain, model.method.configurations)
         found = cls(model, Tuned.read(settings))
-        found.settings, found.folder = str(settings), folder
+        found.settings, found.folder, found.known_as = str(settings), folder, known_as or shipped_name(folder)
         return found
 
     def _words(self) -> Iterator[str]:
@@ -161,13 +165,20 @@ class FewShot(Shown):
         return library(self.model.hash, self.training_concepts, self.folder, folders)
 
     def load(self, path: str | Path) -> LearnedConcept:
-        """A learned concept from its file.
+        """A learned concept from its file, a folder of ``save_pretrained``, or ``'owner/name'`` on the Hugging Face Hub.
+
+        Only ``concept.safetensors`` is read of a folder, as numbers and texts. The Hub is asked where nothing of the name is here,
+        and needs a network.
 
         Raises:
             UserError: naming the file, if it is none or belongs to another model.
         """
-        expect_path("path", path, "the file of a learned concept")
-        concept = Concept.load(path)
+        expect_path("path", path, "the file or folder of a learned concept, or 'owner/name' on the Hub")
+        name, file = str(path), Path(path)
+        if not os.path.lexists(file) and is_repository(name) and not name.endswith(".safetensors"):
+            file = download(name, CONCEPT_FILES, "a concept's file, its folder or one on the Hub")
+        whole = os.path.isdir(file)  # noqa: PTH112 (a name that is too long is none)
+        concept = read_folder(file, name, self._space) if whole else Concept.load(file)
         expect_concept(self.model, concept, path)
         return self._learned(concept)
 
@@ -210,7 +221,9 @@ class FewShot(Shown):
     def _learned(self, concept: Concept) -> LearnedConcept:
         own = concept.composition.to(self.device)
         parts = {field.name: getattr(own, field.name) for field in fields(Composition)}
-        return LearnedConcept(**parts | {"space": self._space}, concept=concept, model=self.model)
+        return LearnedConcept(
+            **parts | {"space": self._space}, concept=concept, model=self.model, tuned=self.tuned, known_as=self.known_as
+        )
 
     def _own(self, call: str, concept: object) -> Composition:
         """A concept of this model, on its device."""
@@ -426,7 +439,11 @@ class FewShot(Shown):
 
         Returns:
             Where it is.
+
+        Raises:
+            UserError: for a name that is none, or a place that cannot be written to.
         """
+        expect_repository(repository)
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder)
             return upload(folder, repository, private)

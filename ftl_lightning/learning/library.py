@@ -5,12 +5,14 @@ Files are read as data, and no more than what they say of themselves. Only conce
 
 import collections
 import difflib
+import itertools
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from ftl_lightning.concepts.concept import file_name
 from ftl_lightning.concepts.summary import summary
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.printing import line
@@ -25,6 +27,8 @@ NEAREST = 3
 """Names that are told in place of one that is unknown."""
 MOST_LETTERS = 60
 """Of a name in the table."""
+LONGEST_STEM = 60
+"""Letters of a concept's name that its file's takes over."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,22 @@ def table(entries: Sequence[Entry]) -> str:
 def concepts_folder() -> Path:
     """Where a user's own concepts are kept: ``concepts`` in :func:`~ftl_lightning.tensor_file.data_folder`."""
     return data_folder() / "concepts"
+
+
+def kept_file(model: str, name: str) -> Path:
+    """Where a concept of a model is kept in :func:`concepts_folder`: that of the same name, or a new file."""
+    folder, stem = concepts_folder() / model, file_name(name)[:LONGEST_STEM].strip(".") or "concept"
+    paths = (folder / f"{stem}{f'_{number}' if number else ''}.safetensors" for number in itertools.count())
+    return next(path for path in paths if not path.exists() or _name_in(path) == name)
+
+
+def _name_in(path: Path) -> str:
+    """The name of the concept in a file; empty where none can be read."""
+    try:
+        told = summary(path)
+    except (UserError, OSError):
+        return ""
+    return "" if told is None else told.origin.name
 
 
 def library(model: str, training: Sequence[str], own: Path | None = None, folders: Iterable[str | Path] = ()) -> Library:
