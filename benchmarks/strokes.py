@@ -19,8 +19,8 @@ import numpy as np
 from forms import compared
 
 from ftl_lightning.cli import main as ftl_lightning
+from ftl_lightning.concepts.concept import file_name
 from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.adaptation import file_name
 from ftl_lightning.tensor_file import write_text
 from ftl_lightning.testing.strokes import NEW, TRAINING, recognised, strokes
 

@@ -29,7 +29,7 @@ COMMANDS = {
     "check": "say whether demonstrations of a concept suffice, and which of them is odd",
     "sample": "generate behaviour from a learned concept, composed with training concepts",
     "view": "watch demonstrations, samples, a concept or results on a page",
-    "concepts": "list the training concepts of a model",
+    "concepts": "list the concepts of a model: training concepts and learned ones",
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
     "report": "tables and figures from results, beside the paper's numbers",
@@ -42,6 +42,8 @@ POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study", "vi
 """Commands whose required arguments are given by position."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
+REPEATED = {"concepts": "folder"}
+"""Commands with an option that may be given several times."""
 MODULES = {
     "check": "ftl_lightning.check_command",
     "play": "ftl_lightning.play_command",
@@ -111,6 +113,7 @@ def _dispatch(arguments: list[str]) -> None:
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
         given = _gathered(arguments[1:], SEVERAL[verb]) if verb in SEVERAL else arguments[1:]
+        given = _repeated(given, REPEATED[verb]) if verb in REPEATED else given
         found = auto_cli(kind or function, args=expanded(given, verb), exit_on_error=False, **options)
         if kind:  # options in a class of their own
             function(found)
@@ -127,6 +130,20 @@ def _gathered(arguments: list[str], option: str) -> list[str]:
     """The arguments with those at the front that belong to no option as a list in one."""
     count = next((index for index, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
     return [f"--{option}={json.dumps(arguments[:count])}", *arguments[count:]] if count else arguments
+
+
+def _repeated(arguments: list[str], option: str) -> list[str]:
+    """The arguments with all values of an option as a list in one."""
+    values, rest, left = [], [], iter(arguments)
+    for argument in left:
+        name, equals, value = argument.partition("=")
+        if name != f"--{option}":
+            rest.append(argument)
+            continue
+        if not (value := value if equals else next(left, "")):
+            raise UserError(f"{option}: expected a value, found none")
+        values.append(value)
+    return [*rest, f"--{option}={json.dumps(values)}"] if values else rest
 
 
 def _overview() -> str:

@@ -98,23 +98,38 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
     say(found.prepare(Path(root) if root else None, Path(out) if out else None))
 
 
-def concepts(pretrained: str) -> None:
-    """List the training concepts of a model, one in a line.
+def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> None:  # noqa: B006 (never changed)
+    """List the concepts of a model: training concepts, one in a line, then after an empty line a table of learned ones.
+
+    The table holds the concepts of this model in its own folder and in your library, ~/.local/share/ftl-lightning/concepts. What
+    cannot be listed is told on standard error.
 
     Args:
         pretrained: folder of the pretrained model, or the name of one that ships.
+        folder: more folders with learned concepts; may be given several times.
+        plain: list the training concepts alone.
     """
     from ftl_lightning.errors import about
     from ftl_lightning.learning.model_config import CONFIG, read_config
     from ftl_lightning.schema import expect_type
     from ftl_lightning.shipped import pretrained_folder
 
-    folder = pretrained_folder(pretrained)
-    found = read_config(folder).get("training_concepts")
-    with about(folder / CONFIG):
-        texts = expect_type(found, Sequence[str], "training_concepts")
+    place = pretrained_folder(pretrained)
+    content = read_config(place)
+    with about(place / CONFIG):
+        texts = expect_type(content.get("training_concepts"), Sequence[str], "training_concepts")
+    if not plain:
+        from ftl_lightning.learning.library import library, table
+
+        found = library(content["hash"], texts, place, folder)
     for text in texts:
         say(line(text))
+    if plain:
+        return
+    if found.learned:
+        say(f"\n{table(found.learned)}")
+    for note in found.notes:
+        say(line(note), error=True)
 
 
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:

@@ -2,6 +2,7 @@
 
 import functools
 import operator
+import os
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.domain import Domain, closed_loop_of
-from ftl_lightning.errors import UserError, shown
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
 from ftl_lightning.judging import judged, judging_domain, picture
@@ -31,9 +32,10 @@ from ftl_lightning.learned_concept import LearnedConcept, Learning, concept_of
 from ftl_lightning.learning.concept_check import expect_concept, expect_sizes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
-from ftl_lightning.learning.hub import download, save_with_card, upload
+from ftl_lightning.learning.hub import CONCEPT_FILES, download, expect_repository, is_repository, save_with_card, upload
 from ftl_lightning.learning.inversion import Watch
 from ftl_lightning.learning.learner import Learner
+from ftl_lightning.learning.library import Library, library
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
@@ -41,7 +43,8 @@ from ftl_lightning.ranges import LARGEST_STEP
 from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED
-from ftl_lightning.shipped import FOLDERS, pretrained_folder, shipped_models
+from ftl_lightning.shared_concept import read_folder
+from ftl_lightning.shipped import pretrained_folder, shipped_models, shipped_name
 from ftl_lightning.trust import vouching
 from ftl_lightning.tuned import Tuned, settings_of
 
@@ -65,11 +68,15 @@ class FewShot(Shown):
 
     Attributes:
         settings: the configuration file that they were read from; empty if none was.
+        folder: that the model was read from; ``None`` if it was made in another way.
+        known_as: under which name others find the model: one that ships or ``'owner/name'`` on the Hub; empty where there is none.
     """
 
     def __init__(self, model: ConceptModel, tuned: Tuned) -> None:
         self.model, self.tuned = model, tuned
         self.settings = ""
+        self.folder: Path | None = None
+        self.known_as = ""
         self._examples: list[Demonstrations] = [] if model.examples is None else [model.examples]
 
     @classmethod
@@ -93,15 +100,15 @@ class FewShot(Shown):
         if settings is not None:
             expect_path("settings", settings, "a configuration file of invert")
         folder, place = pretrained_folder(name), device_named(device)
-        owner, slash, own = str(name).partition("/")
-        if not folder.is_dir() and slash and "/" not in own and owner not in FOLDERS and not owner.startswith((".", "~")):
-            folder = download(str(name))
+        known_as = ""
+        if not folder.is_dir() and is_repository(str(name)):
+            folder, known_as = download(str(name)), str(name)
         with vouching([] if settings is None else Tuned.domains(settings)):
             model = load_model(folder, domain).to(place)
         if settings is None:
             settings = settings_of(model.config.domain, model.method.configurations)
         found = cls(model, Tuned.read(settings))
-        found.settings = str(settings)
+        found.settings, found.folder, found.known_as = str(settings), folder, known_as or shipped_name(folder)
         return found
 
     def _words(self) -> Iterator[str]:
@@ -147,24 +154,43 @@ class FewShot(Shown):
         """
         return Composition(self.model.concept(text)[None, None], torch.ones(1, device=self.device), space=self._space)
 
+    def library(self, folders: Sequence[str | Path] = ()) -> Library:
+        """The concepts of this model by name: training concepts, learned ones in its own folder, and saved ones.
+
+        Args:
+            folders: with saved concepts, besides your own library (:func:`~ftl_lightning.learning.library.concepts_folder`).
+
+        Raises:
+            UserError: for a folder that is none.
+        """
+        return library(self.model.hash, self.training_concepts, self.folder, folders)
+
     def load(self, path: str | Path) -> LearnedConcept:
-        """A learned concept from its file.
+        """A learned concept from its file, a folder of ``save_pretrained``, or ``'owner/name'`` on the Hugging Face Hub.
+
+        Only ``concept.safetensors`` is read of a folder, as numbers and texts. The Hub is asked where nothing of the name is here,
+        and needs a network.
 
         Raises:
             UserError: naming the file, if it is none or belongs to another model.
         """
-        expect_path("path", path, "the file of a learned concept")
-        concept = Concept.load(path)
+        expect_path("path", path, "the file or folder of a learned concept, or 'owner/name' on the Hub")
+        name, file = str(path), Path(path)
+        if not os.path.lexists(file) and is_repository(name) and not name.endswith(".safetensors"):
+            file = download(name, CONCEPT_FILES, "a concept's file, its folder or one on the Hub")
+        whole = os.path.isdir(file)  # noqa: PTH112 (a name that is too long is none)
+        concept = read_folder(file, name, self._space) if whole else Concept.load(file)
         expect_concept(self.model, concept, path)
         return self._learned(concept)
 
     def compose(self, text: str) -> Composition:
-        """``'go to red object:1.2 + other.safetensors:0.9'``: training concepts and files of learned concepts, with weights.
+        """``'go to red object:1.2 + other.safetensors:0.9'``: training concepts and learned ones, with weights.
 
-        After an ``@`` the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
+        A learned concept is named by its file, or by its name in the :meth:`library`; training concepts go first. After an ``@``
+        the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
 
         Raises:
-            UserError: for a part that is neither, or nothing at all.
+            UserError: for a part that is neither, a name of several concepts, or nothing at all.
         """
         expect_text("compose", text, f"{self.training_concepts[0]}:1.2 + learned.safetensors")
         parts = [self._part(part) for part in parse_composition(text)]
@@ -173,13 +199,32 @@ class FewShot(Shown):
         return functools.reduce(operator.add, parts)
 
     def _part(self, part: Part) -> Composition:
-        found = part.weight * (self.load(part.concept) if part.concept.endswith(".safetensors") else self[part.concept])
+        found = part.weight * self._named(part.concept)
         return found.on(self.domain.plans.grouped(part.groups), self.model.config.state_dim) if part.groups else found
+
+    def _named(self, name: str) -> Composition:
+        """A training concept by its text, or a learned one by its file or its name in the library."""
+        if name in self.training_concepts:
+            return self[name]
+        if name.endswith(".safetensors"):
+            return self.load(name)
+        known = self.library()
+        if (entry := known.learned_as(name)) is not None and entry.path is not None:
+            return self.load(entry.path)
+        if not known.learned:
+            return self[name]  # which tells the nearest
+        near = "; ".join(short(one, 40) for one in known.nearest(name))
+        raise UserError(
+            f"concept {shown(name)}: expected a training concept or one of the model's library: {near} are the nearest of "
+            f"{len(known)}; list all: python -m ftl_lightning concepts MODEL"
+        )
 
     def _learned(self, concept: Concept) -> LearnedConcept:
         own = concept.composition.to(self.device)
         parts = {field.name: getattr(own, field.name) for field in fields(Composition)}
-        return LearnedConcept(**parts | {"space": self._space}, concept=concept, model=self.model)
+        return LearnedConcept(
+            **parts | {"space": self._space}, concept=concept, model=self.model, tuned=self.tuned, known_as=self.known_as
+        )
 
     def _own(self, call: str, concept: object) -> Composition:
         """A concept of this model, on its device."""
@@ -403,7 +448,11 @@ class FewShot(Shown):
 
         Returns:
             Where it is.
+
+        Raises:
+            UserError: for a name that is none, or a place that cannot be written to.
         """
+        expect_repository(repository)
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder)
             return upload(folder, repository, private)

@@ -1,8 +1,9 @@
 """A learned concept as a user of the Python API holds it."""
 
 import functools
+import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ftl_lightning.arguments import expect_whole
@@ -13,7 +14,11 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.hub import expect_repository, upload
+from ftl_lightning.learning.library import kept_file
 from ftl_lightning.learning.quality import Inspection, inspected
+from ftl_lightning.shared_concept import write_folder
+from ftl_lightning.tuned import Tuned
 
 
 @dataclass(frozen=True)
@@ -38,12 +43,16 @@ class LearnedConcept(Composition):
     Attributes:
         concept: embeddings, weights and where they come from.
         model: it was learned through.
+        tuned: settings that go with the model, which its film is sampled with.
+        known_as: under which name others find the model: one that ships or ``'owner/name'`` on the Hub; empty where there is none.
         demonstrations: that it was learned from, where this happened here.
         judging: the domain that judges its samples, then.
     """
 
     concept: Concept
     model: ConceptModel
+    tuned: Tuned
+    known_as: str = ""
     demonstrations: Demonstrations | None = None
     judging: Domain | None = None
 
@@ -67,9 +76,72 @@ class LearnedConcept(Composition):
         embedding = self.concept.weighted_sum.mean(dim=0)
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
 
-    def save(self, path: str | Path) -> None:
-        """Write it to a file that every command reads."""
-        self.concept.save(path)
+    def save(self, path: str | Path, quality: bool = False) -> None:
+        """Write it to a file that every command reads.
+
+        Args:
+            path: of the file.
+            quality: also write what :attr:`quality` measures, with the share of right samples, so that a library can tell it. It is
+                one more key of the file's header: versions that do not know it read the file all the same, and without it a file
+                has the bytes that ``invert`` writes.
+
+        Raises:
+            UserError: where ``quality`` is asked for and cannot be measured.
+        """
+        (replace(self.concept, quality=self.quality.record) if quality else self.concept).save(path)
+
+    def keep(self) -> Path:
+        """Write it to your own library, with its quality where that can be measured, so that compositions know it by its name.
+
+        A concept of the same name and model that was kept before is replaced.
+
+        Returns:
+            Its file.
+        """
+        path = kept_file(self.model.hash, self.concept.origin.name)
+        self._judged.save(path)
+        return path
+
+    @property
+    def _judged(self) -> Concept:
+        """With its quality, where it can be measured here."""
+        measurable = self.demonstrations is not None and self.judging is not None and len(self.demonstrations) > 1
+        return replace(self.concept, quality=self.quality.record) if measurable else self.concept
+
+    def save_pretrained(self, folder: str | Path, demonstrations: bool = False) -> None:
+        """Write a folder that others can load: ``concept.safetensors`` with its quality, a film or picture of new samples, and, if
+        there is none yet, a ``README.md``.
+
+        Args:
+            folder: to write.
+            demonstrations: also write what it was learned from, ``demonstrations.safetensors``; otherwise nothing shows them.
+
+        Raises:
+            UserError: where demonstrations are asked for of a concept that was not learned here.
+        """
+        if demonstrations and self.demonstrations is None:
+            raise UserError("demonstrations: expected a concept that was learned here, found one from a file; leave them out")
+        shared = self.demonstrations if demonstrations else None
+        write_folder(Path(folder), self.model, self._judged, self.tuned, self.known_as, shared)
+
+    def push_to_hub(self, repository: str, private: bool = False, demonstrations: bool = False) -> str:
+        """Upload the folder of :meth:`save_pretrained` to the Hugging Face Hub as ``owner/name``; needs a network and a login.
+
+        Args:
+            repository: its name.
+            private: whether only you see it, if it is new.
+            demonstrations: also upload what it was learned from.
+
+        Returns:
+            Where it is.
+
+        Raises:
+            UserError: for a name that is none, or a place that cannot be written to.
+        """
+        expect_repository(repository)
+        with tempfile.TemporaryDirectory() as folder:
+            self.save_pretrained(folder, demonstrations)
+            return upload(folder, repository, private)
 
 
 def concept_of(model: ConceptModel, space: str, call: str, concept: object) -> Composition:

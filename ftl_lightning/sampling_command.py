@@ -23,8 +23,9 @@ class SampleOptions:
         pretrained: folder of the pretrained model, or the name of one that ships.
         concept: file of a learned concept; empty for training concepts alone.
         compose: what is composed with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9". Training
-            concepts, or files of learned concepts, whose own weights are multiplied. A weight may be left out and is 1 then.
-            With "walk@legs:1" a concept is composed on some groups of a state's columns alone, in domains that name such.
+            concepts, or learned ones, whose own weights are multiplied, by their files or by their names in what the verb concepts
+            lists. A weight may be left out and is 1 then. With "walk@legs:1" a concept is composed on some groups of a state's
+            columns alone, in domains that name such.
         count: samples.
         seed: of the samples.
         sampler: see ftl_lightning.diffusion.samplers; empty for the one that the settings name.

@@ -68,3 +68,9 @@ def pretrained_folder(name: str | Path) -> Path:
         if (path / "config.json").is_file():
             return path
     return Path(name)
+
+
+def shipped_name(folder: Path) -> str:
+    """The name of a model that ships, such as ``agent``, by its folder; empty for another one."""
+    place, models = folder.resolve(), MODELS.resolve()
+    return place.relative_to(models).as_posix() if place.is_relative_to(models) and place != models else ""

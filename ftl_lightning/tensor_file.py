@@ -30,6 +30,11 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ftl-lightning"
 
 
+def data_folder() -> Path:
+    """``$XDG_DATA_HOME/ftl-lightning``, or ``~/.local/share/ftl-lightning``: what a user keeps."""
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "ftl-lightning"
+
+
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name in the same folder, renamed to ``path`` when the block ends well and removed when it does not.
@@ -157,25 +162,57 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
     Raises:
         UserError: for a file that is missing, damaged, or of another kind.
     """
-    path = Path(path)
+    with _opened(Path(path), kind) as (file, text):
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
+    with about(path):
+        return tensors, expect_kind(parse_json(text), kind, versions)
+
+
+def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]], Any]:
+    """What a file of tensors says of itself; the tensors are not read, and nothing is checked that :func:`expect_kind` checks.
+
+    Args:
+        path: the file.
+        kind: what it is expected to be, for messages.
+
+    Returns:
+        Shapes of its tensors by name, and its header as JSON has it.
+
+    Raises:
+        UserError: for a file that is missing or damaged.
+    """
+    with _opened(Path(path), kind) as (file, text):
+        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
+    with about(path):
+        return shapes, parse_json(text)
+
+
+@contextmanager
+def _opened(path: Path, kind: str) -> Iterator[tuple[Any, str]]:
+    """A file of tensors, and the text of its header."""
     expect_header(path, kind, expect_readable(path, kind))
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(_HEADER, "{}")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
+            yield file, (file.metadata() or {}).get(_HEADER, "{}")
     except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({short(str(error), 100)})") from error
-    with about(path):
-        header = parse_json(text)
-        found = header.get("kind") if isinstance(header, dict) else None
-        if found != kind:
-            told = f"a {short(str(found))} file" if found else "a file of other software"
-            raise UserError(f"expected a {kind} file, found {told}")
-        version = header.get("format")
-        if type(version) is not int or version not in versions:
-            expected = " or ".join(map(str, versions))
-            raise UserError(f"key 'format': expected {expected}, found {shown(version)}; it is of another version")
-        return tensors, header
+
+
+def expect_kind(header: object, kind: str, versions: Sequence[int] = (FORMAT,)) -> dict[str, Any]:
+    """Refuse the header of a file of another kind or version.
+
+    Raises:
+        UserError: saying what it is.
+    """
+    found = header.get("kind") if isinstance(header, dict) else None
+    if not isinstance(header, dict) or found != kind:
+        told = f"a {short(str(found))} file" if found else "a file of other software"
+        raise UserError(f"expected a {kind} file, found {told}")
+    version = header.get("format")
+    if type(version) is not int or version not in versions:
+        expected = " or ".join(map(str, versions))
+        raise UserError(f"key 'format': expected {expected}, found {shown(version)}; it is of another version")
+    return header
 
 
 def kind_of(content: bytes) -> str:

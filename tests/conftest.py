@@ -60,6 +60,7 @@ def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
 def _in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # logs and outputs of a test stay its own
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))  # no concepts of the person who runs the tests
     torch.set_num_threads(1)
 
 

@@ -166,7 +166,8 @@ def test_a_callback_that_watches_nothing(watches: str, capsys: Told) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["sample", "--pretrained=mocap", "--compose=jumping jakcs:1.2"], "are the nearest of 82"),
+        (["sample", "--pretrained=mocap", "--compose=jumping jakcs:1.2"], "jumping_jacks; jumping_jacks_adapter; "),
+        (["sample", "--pretrained=agent", "--compose=go to bowls:1.2"], "are the nearest of 4"),
         (["sample", "--pretrained=mocap", "--compose=jumping jakcs:1.2"], "python -m ftl_lightning concepts"),
         (["sample", "--pretrained=objectrearrangement", "--compose=x"], "did you mean object_rearrangement"),
         ([*SAMPLE, "--compose="], "goal, initial: expected"),

@@ -13,7 +13,7 @@ from ftl_lightning.concepts.composition import Composition, space_of
 from ftl_lightning.concepts.modes import STRETCH, Modes
 from ftl_lightning.concepts.point import Part
 from ftl_lightning.errors import UserError, about, short, shown
-from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor
+from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor, expect_range
 from ftl_lightning.representation import Shown, counted, numbers
 from ftl_lightning.schema import built, expect_type
 from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
@@ -75,6 +75,34 @@ class Choice:
         return f"{self.form}: {self.because}"
 
 
+@dataclass(frozen=True)
+class QualityRecord:
+    """What samples of a concept were like when somebody looked, see :mod:`ftl_lightning.learning.quality`.
+
+    Attributes:
+        samples: how many were looked at.
+        novelty, spread, roughness: beside the demonstrations, as shares, 0 or more.
+        metric: name of the domain's metric that tells how many are right; empty where none can.
+        right: share of right samples by that metric, 0 to 1; ``None`` where none can tell.
+
+    Raises:
+        UserError: at construction, for a number out of its range.
+    """
+
+    samples: int
+    novelty: float
+    spread: float
+    roughness: float
+    metric: str = ""
+    right: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("novelty", "spread", "roughness"):
+            expect_range(f"key 'quality.{name}'", getattr(self, name), 0)
+        if self.right is not None:
+            expect_range("key 'quality.right'", self.right, 0, 1)
+
+
 @dataclass(frozen=True, repr=False)
 class Concept(Shown):
     """K embeddings and their guidance weights.
@@ -90,6 +118,8 @@ class Concept(Shown):
         choice: how its form was chosen; ``None`` where it was told.
         composing: embeddings ``(K, knots, n)`` and weights ``(K,)`` that take the place of all others, and of the adapter, where
             the concept is composed; ``None`` for the same as alone.
+        quality: what its samples were like; ``None`` where nobody looked. It is a key of the file's header that is written only
+            where it is there, and that readers who do not know it pass by.
 
     Raises:
         UserError: at construction, for tensors of other shapes or types.
@@ -102,6 +132,7 @@ class Concept(Shown):
     adapter: LowRank | None = None
     choice: Choice | None = None
     composing: tuple[Tensor, Tensor] | None = None
+    quality: QualityRecord | None = None
 
     def __post_init__(self) -> None:
         _expect_shapes(self._sets, ("K", "knots", "n"))
@@ -206,6 +237,8 @@ class Concept(Shown):
             header |= {} if self.modes.stretch == STRETCH else {"stretch": self.modes.stretch}
         if self.choice is not None:
             header |= {"choice": asdict(self.choice)}
+        if self.quality is not None:
+            header |= {"quality": asdict(self.quality)}
         if self.adapter is not None and self.adapter.everywhere:
             header |= {"everywhere": True}
         if form in AXES:
@@ -250,11 +283,17 @@ class Concept(Shown):
             origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
             choice = built(Choice, header["choice"], "choice") if header.get("choice") else None
             composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if form == 4 else None
-            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing)
+            quality = built(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
+            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
             concept.expect_finite("content")
             return concept
+
+
+def file_name(concept: str) -> str:
+    """A concept's name as a file name: letters, digits and dots kept, the rest underscores."""
+    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
 
 
 def _expect_shapes(tensors: Mapping[str, Tensor], axes: Sequence[str]) -> None:

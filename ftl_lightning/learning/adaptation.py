@@ -10,7 +10,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning import log_folder
 from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.concept import Concept, file_name
 from ftl_lightning.concepts.point import NEW_COMPONENT, Point
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.data import InversionData
@@ -212,8 +212,3 @@ class Adaptation(pl.LightningModule, ABC):
             for part in concept.parts().values()
         ]
         return self.model.points() + learned
-
-
-def file_name(concept: str) -> str:
-    """A concept's name as a file name: letters, digits and dots kept, the rest underscores."""
-    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)

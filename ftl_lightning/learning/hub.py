@@ -1,16 +1,50 @@
-"""Models on the Hugging Face Hub; all that is done there needs a network."""
+"""Models and concepts on the Hugging Face Hub; all that is done there needs a network."""
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.library import CONCEPT
 from ftl_lightning.learning.model_config import CONFIG
 from ftl_lightning.learning.model_folder import save_model
+from ftl_lightning.shipped import FOLDERS
 from ftl_lightning.tensor_file import atomic
 
+MODEL_FILES = ("*.json", "*.safetensors", "*.md")
+"""Of a repository with a model, what is downloaded."""
+CONCEPT_FILES = (CONCEPT, "README.md")
+"""Of one with a concept."""
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
 
-def download(repository: str) -> Path:
-    """The folder of the model ``owner/name``, downloaded now or before.
+
+def is_repository(name: str) -> bool:
+    """Whether a name where no file is may be ``'owner/name'`` on the Hub; paths such as ``'./a'`` and ``'conf/a'`` never are."""
+    owner, slash, own = name.partition("/")
+    return bool(slash) and "/" not in own and owner not in FOLDERS and not owner.startswith((".", "~"))
+
+
+def expect_repository(repository: object) -> str:
+    """Refuse what is no name of a repository to upload to.
+
+    Raises:
+        UserError: with an example of one.
+    """
+    if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
+        raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
+    return repository
+
+
+def download(
+    repository: str, files: Sequence[str] = MODEL_FILES, expected: str = "a folder, a model that ships or one on the Hub"
+) -> Path:
+    """The folder of the model or concept ``owner/name``, downloaded now or before.
+
+    Args:
+        repository: its name.
+        files: patterns of what is downloaded; nothing else is.
+        expected: what could have been named, for messages.
 
     Raises:
         UserError: if it cannot be had.
@@ -18,23 +52,33 @@ def download(repository: str) -> Path:
     from huggingface_hub import snapshot_download
 
     try:
-        return Path(snapshot_download(repository, allow_patterns=["*.json", "*.safetensors", "*.md"]))
+        return Path(snapshot_download(repository, allow_patterns=[*files]))
     except Exception as error:  # the Hub, the network and the cache raise kinds of their own
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{repository}: expected a folder, a model that ships or one on the Hub, found none ({reason})") from error
+        raise UserError(f"{repository}: expected {expected}, found none ({_reason(error)})") from error
 
 
 def upload(folder: str | Path, repository: str, private: bool = False) -> str:
-    """Upload a model's folder as ``owner/name``; needs a login.
+    """Upload a folder as ``owner/name``; needs a login.
 
     Returns:
         Where it is.
+
+    Raises:
+        UserError: if it cannot be uploaded.
     """
     from huggingface_hub import HfApi
 
     hub = HfApi()
-    hub.create_repo(repository, private=private, exist_ok=True)
-    return str(hub.upload_folder(repo_id=repository, folder_path=folder))
+    try:
+        hub.create_repo(repository, private=private, exist_ok=True)
+        return str(hub.upload_folder(repo_id=repository, folder_path=folder))
+    except Exception as error:
+        told = f"{repository}: expected a place on the Hub that you may write to, found none ({_reason(error)})"
+        raise UserError(f"{told}; log in first: hf auth login") from error
+
+
+def _reason(error: Exception) -> str:
+    return short(str(error).splitlines()[0] if str(error) else type(error).__name__, 100)
 
 
 def card(model: ConceptModel) -> str:

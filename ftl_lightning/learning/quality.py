@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.concept import Concept, QualityRecord
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates, moved
 from ftl_lightning.diffusion.samplers import Sampling
@@ -189,6 +189,12 @@ class Inspection:
     def __str__(self) -> str:
         told = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}, "
         return f"{told}{self.quality.words} ({len(self.samples)} samples)"
+
+    @property
+    def record(self) -> QualityRecord:
+        """What a concept's file keeps of it."""
+        metric, right = ("", None) if self.right is None else self.right
+        return QualityRecord(len(self.samples), **self.quality.numbers, metric=metric, right=right)
 
     def figure(self) -> "Figure":
         """Demonstrations above some of the samples."""

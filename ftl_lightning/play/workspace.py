@@ -92,7 +92,7 @@ class Workspace:
         self._concepts = {
             f"t{number}": Known(text, "training", self._model[text]) for number, text in enumerate(self._model.training_concepts)
         }
-        for number, entry in enumerate([]):
+        for number, entry in enumerate(self._model.library()):
             if entry.path is not None:
                 found = self._model.load(entry.path)
                 known = Known(entry.name, entry.kind, found, found.concept, str(entry.path), accuracy=entry.accuracy)

@@ -1,0 +1,211 @@
+"""The folder in which a learned concept is shared: its file, a card, and a film or picture of what it generates.
+
+Whoever reads such a folder reads the concept's file alone, as numbers and texts. The card is for people; of a concept that belongs
+to another model, the name that its card gives this model is told as text.
+"""
+
+import io
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ftl_lightning.concepts.composition import Composition, space_of
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.concepts.summary import summary
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.features import InitialStates, moved
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.errors import UserError, short
+from ftl_lightning.escape import markdown
+from ftl_lightning.evaluation.animation import captioned, gif
+from ftl_lightning.evaluation.execution import episodes
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.library import CONCEPT
+from ftl_lightning.limits import read_text
+from ftl_lightning.printing import line
+from ftl_lightning.representation import counted
+from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import atomic, write_text
+from ftl_lightning.tuned import Tuned
+
+CARD, FILM, PICTURE, DEMONSTRATIONS = "README.md", "film.gif", "picture.png", "demonstrations.safetensors"
+MOST_BYTES = 1_000_000
+"""Of a film or picture."""
+MOST_CARD = 64 * 2**10
+"""Bytes of a card that is looked at for the model's name."""
+SAMPLES = 8
+"""That a picture shows."""
+_MODEL = re.compile(r'^  model: "([^"\n]{1,200})"$', re.MULTILINE)
+
+
+def write_folder(
+    folder: Path,
+    model: ConceptModel,
+    concept: Concept,
+    tuned: Tuned,
+    known_as: str = "",
+    demonstrations: Demonstrations | None = None,
+) -> None:
+    """Write the folder of a concept; a card that is there already stays.
+
+    Args:
+        folder: to write.
+        model: that the concept belongs to.
+        concept: the learned one.
+        tuned: settings to sample with.
+        known_as: under which name others find the model; empty where there is none.
+        demonstrations: to write too; ``None`` for none.
+    """
+    concept.save(folder / CONCEPT)
+    shown = _film(model, concept, tuned)
+    if shown is not None:
+        name, content = shown
+        with atomic(folder / name) as temporary:
+            temporary.write_bytes(content)
+    if demonstrations is not None:
+        demonstrations.save(folder / DEMONSTRATIONS)
+    if not (folder / CARD).is_file():
+        write_text(folder / CARD, card(folder / CONCEPT, known_as, shown[0] if shown else "", demonstrations is not None))
+
+
+def read_folder(folder: Path, name: str, space: str) -> Concept:
+    """The concept of such a folder.
+
+    Args:
+        folder: here, or downloaded.
+        name: that a person gave, for messages.
+        space: whose concepts the model's are that is to use it, see :func:`~ftl_lightning.concepts.composition.space_of`.
+
+    Raises:
+        UserError: if there is none, or it belongs to another model, which is named.
+    """
+    concept = Concept.load(folder / CONCEPT)
+    if (found := space_of(concept.origin.domain, concept.origin.pretrained)) != space:
+        called = _model_of(folder / CARD)
+        told = f", which its card calls {called!r}" if called else ""
+        raise UserError(
+            f"{short(name, 80)}: expected a concept of this model, {space}, found one of {short(found, 60)}{told}; load that model"
+        )
+    return concept
+
+
+def _model_of(path: Path) -> str:
+    """What a card calls the concept's model, as text; empty where it is no honest card."""
+    try:
+        found = _MODEL.search(read_text(path, "Markdown", MOST_CARD).partition("\n---")[0])
+    except UserError:
+        return ""
+    return "" if found is None else short(line(found[1]), 60)
+
+
+def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> str:
+    """A short card with the Hub's metadata.
+
+    Args:
+        path: of the concept's file.
+        known_as: under which name others find its model; empty where there is none.
+        shown: name of the film or picture beside it; empty for none.
+        with_demonstrations: whether the demonstrations are beside it.
+
+    Raises:
+        UserError: for a file that is no concept.
+    """
+    told = summary(path)
+    if told is None:
+        raise UserError(f"{path}: expected a concept file, found another one")
+    origin, quality, model = told.origin, told.quality, known_as or "FOLDER OR NAME OF THE MODEL"
+    keys = {"concept": origin.name, **({"model": known_as} if known_as else {}), "hash": origin.pretrained, "domain": origin.domain}
+    # JSON's texts are YAML's, too; what is not printable, which YAML refuses, is a question mark by then.
+    told_keys = {key: json.dumps(line(value), ensure_ascii=False) for key, value in keys.items()}
+    metadata = "".join(f"  {key}: {value}\n" for key, value in told_keys.items())
+    base = f"base_model: {told_keys['model']}\n" if known_as.count("/") == 1 else ""  # on the Hub, which refuses other names
+    rows = {
+        "model": f"{f'{known_as}, ' if known_as else ''}domain {origin.domain}, hash {origin.pretrained}; it works with no other",
+        "learned from": f"{counted(origin.count, 'demonstration')} (hash {origin.demonstrations})",
+        "form": f"{told.form}; {origin.weights} guidance weights; loss {origin.loss:.4f}",
+        "quality": "not measured",
+    }
+    if quality is not None:
+        right = "" if quality.right is None else f"{quality.metric} {quality.right:.2f}, "
+        numbers = ", ".join(f"{name} {getattr(quality, name):.2f}" for name in ("spread", "novelty", "roughness"))
+        rows["quality"] = f"{right}{numbers} ({counted(quality.samples, 'sample')}, started like the demonstrations)"
+    files = {CONCEPT: "the concept, numbers and texts alone", shown: "what it generates"}
+    files |= {DEMONSTRATIONS: "what it was learned from"} if with_demonstrations else {}
+    listed = "\n".join(f"- `{name}`: {what}" for name, what in files.items() if name)
+    table = "\n".join(f"| {key} | {markdown(value)} |" for key, value in rows.items())
+    return (
+        "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning, learned-concept]\n"
+        f"{base}ftl_lightning:\n{metadata}---\n# {markdown(origin.name)}\n\n"
+        "A concept that was learned from a few demonstrations through a generative model.\n\n"
+        f"{f'![what it generates]({shown})' if shown else ''}\n\n| | |\n|---|---|\n{table}\n\n"
+        "    from ftl_lightning import FewShot\n"
+        f"    model = FewShot.from_pretrained({json.dumps(line(model))})\n"
+        '    concept = model.load("FOLDER OR NAME")\n\n'
+        f"{listed}\n"
+    )
+
+
+def _film(model: ConceptModel, concept: Concept, tuned: Tuned) -> tuple[str, bytes] | None:
+    """A film of what a concept generates, or a picture, with the name of its file; ``None`` where nothing can be sampled from.
+
+    It starts from new initial states of the task, so that it shows no demonstration.
+    """
+    domain, name = model.domain, concept.origin.name
+    starts = _starts(domain, name, SAMPLES)
+    if domain.observed and starts is None:
+        return None
+    own = concept.composition.to(model.device)
+    if (frames := _frames(model, own, tuned, starts)) and (content := small(captioned(frames, name))):
+        return FILM, content
+    plans = _plans(model, own, tuned, starts, SAMPLES)
+    figure = domain.show.picture(plans, None, name, starts if domain.observed else None)
+    for dpi in (110, 80, 50):
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=dpi)
+        if len(file.getvalue()) <= MOST_BYTES:
+            return PICTURE, file.getvalue()
+    return None
+
+
+def _frames(model: ConceptModel, own: Composition, tuned: Tuned, starts: InitialStates | None) -> list[NDArray[np.uint8]]:
+    """Of a plan, or of an episode where only those are filmed; empty where neither is or the simulator is not installed."""
+    domain, loop = model.domain, model.domain.closed_loop
+    if domain.show.film is not None:
+        return domain.show.film(_plans(model, own, tuned, starts, 1)[0])
+    if loop is None or loop.film is None or starts is None or starts.scenes is None:
+        return []
+    try:
+        loop.expect()
+        rollout, followed = episodes(model, loop, own, starts.take([0]), tuned.sampling, tuned.replan, 0)
+        return loop.film(rollout, torch.stack(list(followed[0]))) if followed.get(0) else []
+    except UserError:  # a picture needs no simulator
+        return []
+
+
+def _plans(model: ConceptModel, own: Composition, tuned: Tuned, starts: InitialStates | None, count: int) -> torch.Tensor:
+    seen = {} if starts is None else moved(starts.take(slice(0, count)).observed, model.device)
+    return model.sample([own], count, tuned.sampling, [generator("cpu", 0)], seen)[0].cpu()
+
+
+def _starts(domain: Domain, name: str, count: int) -> InitialStates | None:
+    """New initial states of a task, or of the first training concept where the domain cannot read its name."""
+    if not domain.observed:
+        return None
+    task = next((text for text in (name, *domain.concepts.training) if domain.concepts.reads(text)), "")
+    try:
+        return domain.source(None).starts(task, count, 0)
+    except (UserError, KeyError, ValueError, IndexError):  # a source of somebody else's
+        return None
+
+
+def small(frames: Sequence[NDArray[np.uint8]]) -> bytes:
+    """An animation of at most :data:`MOST_BYTES`, of fewer frames and colours where all are too many; empty if there is none."""
+    for each, colours in ((1, 64), (2, 64), (4, 32), (8, 16)):
+        if len(content := gif(frames[::each], colours=colours)) <= MOST_BYTES:
+            return content
+    return b""
