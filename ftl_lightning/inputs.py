@@ -83,6 +83,7 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},
+    "play": {"demonstrations": _file("demonstrations"), "static": _written("static", expect_writable_folder)},
     "prepare": _FOLDER,
     "study": {**_FOLDER, "consent": _file("text", MOST_TEXT)},
 }

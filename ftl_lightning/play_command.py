@@ -18,7 +18,10 @@ class PlayOptions:
 
     Attributes:
         pretrained: the model that is opened first: the name of one that ships, or a folder.
+        demonstrations: file of demonstrations that are there at first.
         root: folder of your copy of recordings, for domains whose demonstrations do not ship.
+        static: folder to write a page to that needs no program, in place of serving one: the demonstrations, what is learned from
+            them, and samples for a grid of weights.
         host: address to listen at. With "0.0.0.0" a phone in the same network can open the page, and everybody else there who
             knows its address.
         port: of the address; 0 for 8765, or any other if another program has that.
@@ -26,7 +29,9 @@ class PlayOptions:
     """
 
     pretrained: str = "strokes"
+    demonstrations: str = ""
     root: str = ""
+    static: str = ""
     host: str = "127.0.0.1"
     port: int = 0
     browser: bool = True
@@ -47,11 +52,31 @@ def play(options: PlayOptions) -> None:
     def workspace(model: str) -> "Workspace":
         from ftl_lightning.play.workspace import Workspace
 
-        return Workspace(model, Path(options.root) if options.root and model == options.pretrained else None)
+        own = model == options.pretrained
+        found = Workspace(model, Path(options.root) if options.root and own else None)
+        if options.demonstrations and own:
+            found.upload(options.demonstrations, Path(options.demonstrations).read_bytes())
+        return found
 
+    if options.static:
+        _write_static(workspace(options.pretrained), Path(options.static) / f"{Path(options.pretrained).name}.html")
+        return
     desk = Desk(list(dict.fromkeys((options.pretrained, *shipped_models()))), workspace)
     place = Place(options.host, options.port, options.browser)
     serve(playing(desk), place, lambda: desk.work(desk.state), desk.ended.set)
+
+
+def _write_static(workspace: "Workspace", path: Path) -> None:
+    from ftl_lightning.play.offline import PAIRS, WEIGHTS, write_offline
+    from ftl_lightning.play.requests import Learn
+    from ftl_lightning.printing import say
+    from ftl_lightning.progress import bar
+
+    if workspace.work()["demonstrations"]:
+        workspace.learn(Learn(workspace.suggestion), lambda told: None, lambda: False)
+    with bar(f"{path.name}: mixes", PAIRS * len(WEIGHTS) ** 2) as advance:
+        size = write_offline(workspace, path, lambda: advance(1, ""))
+    say(f"{path}: {size / 1e6:.1f} MB")
 
 
 @dataclass(frozen=True)

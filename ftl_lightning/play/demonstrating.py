@@ -44,6 +44,11 @@ class Demonstrating:
         self.task = ""
 
     @property
+    def name(self) -> str:
+        """What the first one is called, where it came with a name; else empty."""
+        return next((own.concepts[0] for _, own in self._own if own.concepts[0]), "")
+
+    @property
     def library(self) -> Json:
         """Tasks of which demonstrations can be drawn, or why there are none."""
         if self._library is None:

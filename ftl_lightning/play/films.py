@@ -10,7 +10,7 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import SUCCESS, Domain, Show
 from ftl_lightning.domains.line_plots import line_film
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.vector_film import VectorFilm, of_wireframe
+from ftl_lightning.domains.vector_film import VectorFilm
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.films import packed, packed_space
 
@@ -47,8 +47,7 @@ def plan_film(show: Show, states: Tensor, starts: InitialStates | None, right: b
     """
     if show.wireframe is not None:
         body = show.wireframe(states)
-        flat = of_wireframe(body)  # for those who draw no space
-        return film(flat, right) | {"space": packed_space(body)}
+        return {"space": packed_space(body), "frames": len(body.points), "rate": body.rate, "right": right, "told": ""}
     return film((show.vector_film or line_film)(states, starts), right)
 
 

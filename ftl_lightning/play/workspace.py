@@ -95,7 +95,9 @@ class Workspace:
         for number, entry in enumerate(self._model.library()):
             if entry.path is not None:
                 found = self._model.load(entry.path)
-                known = Known(entry.name, entry.kind, found, found.concept, str(entry.path), accuracy=entry.accuracy)
+                several = sum(other.name == entry.name for other in self._model.library().learned) > 1
+                name = entry.stem if several else entry.name
+                known = Known(name, entry.kind, found, found.concept, str(entry.path), accuracy=entry.accuracy)
                 self._concepts[f"s{number}"] = known
 
     def state(self) -> dict[str, Any]:
@@ -119,6 +121,11 @@ class Workspace:
     def work(self) -> dict[str, Any]:
         """The demonstrations that are there, and what a check says of them."""
         return self._shown.told() | {"same": self._same()}
+
+    @property
+    def suggestion(self) -> str:
+        """A name for what is to be learned: that of the demonstrations, where a file or the library said one."""
+        return self._shown.name or "new concept"
 
     # Demonstrations.
 
