@@ -16,6 +16,8 @@ from time import monotonic
 from typing import Any
 from urllib.parse import urlsplit
 
+from tests.conftest import ROOT
+
 
 @dataclass
 class Served:
@@ -88,7 +90,7 @@ class Served:
 def served(folder: Path, arguments: Sequence[str], verb: str = "play") -> Iterator[Served]:
     """Run the program in a folder until the block ends."""
     begin = monotonic()
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "XDG_DATA_HOME": str(folder / "share")}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "XDG_DATA_HOME": str(folder / "share"), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "ftl_lightning", verb, *arguments, "--browser", "false", "--port", "0"]
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
