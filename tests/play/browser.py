@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from selenium import webdriver
+from selenium.webdriver import ActionChains
 from selenium.webdriver.common.actions.action_builder import ActionBuilder
 from selenium.webdriver.common.actions.interaction import POINTER_MOUSE, POINTER_TOUCH
 from selenium.webdriver.common.actions.pointer_input import PointerInput
+from selenium.webdriver.common.keys import Keys
 
 OPTIONS = (
     "--headless=new",
@@ -125,10 +127,12 @@ class Browser:
 
     def press(self, *keys: str) -> None:
         """Keys, wherever the focus is."""
-        from selenium.webdriver import ActionChains
-
         for key in keys:
             ActionChains(self.driver).send_keys(key).perform()
+
+    def undo(self) -> None:
+        """The keys that undo something."""
+        ActionChains(self.driver).key_down(Keys.CONTROL).send_keys("z").key_up(Keys.CONTROL).perform()
 
     def errors(self) -> list[str]:
         """What the browser complains of."""

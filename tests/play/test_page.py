@@ -80,7 +80,7 @@ def test_a_slider_changes_the_samples(page: Browser) -> None:
     page.until(lambda: page.js("document.querySelector('#mixed canvas').toDataURL()") != picture)
     assert page.js("document.querySelector('#mix input[type=range]').value") == "0.7"
     assert waited < 5  # of which seconds are told in results/play.json; this machine may be busy
-    assert "0.7" in page.text("python")
+    page.until(lambda: "0.7" in page.text("python"))
 
 
 def test_what_was_done_is_undone_by_keys(page: Browser) -> None:
@@ -88,7 +88,7 @@ def test_what_was_done_is_undone_by_keys(page: Browser) -> None:
     page.click("clear")
     page.until(lambda: page.count("#slots canvas") == 0)
     page.js("document.activeElement.blur()")
-    page.press(Keys.CONTROL + "z")
+    page.undo()
     page.until(lambda: page.count("#slots canvas") == before)
 
 
