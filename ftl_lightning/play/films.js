@@ -2,7 +2,7 @@
 const PAUSE = 1.5; // seconds that films rest at their end
 const PER_SECOND = 30; // pictures: more would take time from learning, which runs on the same machine
 const films = new Set();
-const player = { clock: 0, length: 0, playing: true, resting: false, last: 0, shown: 0, large: null };
+const player = { clock: 0, length: 0, playing: true, resting: false, changed: true, last: 0, shown: 0, large: null };
 
 const near = new IntersectionObserver((changes) => {
   for (const change of changes) if (change.target.film) change.target.film.near = change.isIntersecting;
@@ -22,13 +22,13 @@ function addCanvas() {
 function setCanvas(one, shown, view, label) {
   Object.assign(one, { films: shown, view: view || viewOf(shown), key: "" });
   one.canvas.setAttribute("aria-label", label);
-  measure();
+  player.changed = true;
 }
 
 function dropCanvas(one) {
   near.unobserve(one.canvas);
   films.delete(one);
-  measure();
+  player.changed = true;
 }
 
 // A figure with a film that can be made large, what is said of it beneath.
@@ -98,14 +98,18 @@ function turnable(element, one) {
   });
 }
 
+// How long films are, once some have changed.
 function measure() {
-  player.length = Math.max(0, ...[...films].flatMap((one) => one.films.map(seconds)));
+  player.changed = false;
+  player.length = 0;
+  for (const one of films) for (const film of one.films) player.length = Math.max(player.length, seconds(film));
   if (player.resting) player.clock = player.length;
   player.clock = Math.min(player.clock, player.length + PAUSE);
   find("player").hidden = player.length < 0.05;
 }
 
 function paint() {
+  if (player.changed) measure();
   for (const one of films) {
     if (!one.films.length || (!one.near && one !== player.large) || !one.canvas.isConnected) continue;
     const until = Math.max(...one.films.map(seconds)), at = Math.min(player.clock, until);

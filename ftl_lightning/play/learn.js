@@ -89,7 +89,7 @@ async function learn() {
   Object.assign(learning, { concept: null, losses: [] });
   document.body.dataset.learning = "yes";
   find("quality").textContent = "";
-  find("save").hidden = find("to-mix").hidden = true;
+  find("learned").hidden = true;
   find("progress").hidden = false;
   find("waiting").textContent = "Learning \u2026";
   announce(`Learning ${name}.`);
@@ -125,11 +125,19 @@ function newSamples() {
 
 function lossTold(line) {
   learning.losses.push([line.step, line.loss]);
-  const wide = 300, tall = 70, most = Math.max(...learning.losses.map((one) => one[1])) || 1, last = line.steps || line.step;
-  const svg = find("loss");
-  svg.querySelector("polyline").setAttribute("points", learning.losses.map(([step, loss]) => `${(step / last * wide).toFixed(1)},${(tall - 4 - loss / most * (tall - 8)).toFixed(1)}`).join(" "));
-  svg.setAttribute("aria-label", `Loss over ${line.step} of ${last} steps, now ${line.loss.toFixed(3)}`);
-  find("step").textContent = `step ${line.step} of ${last}, loss ${line.loss.toFixed(3)}`;
+  lossCurve(line.steps || line.step);
+  find("loss").setAttribute("aria-label", `Loss over ${line.step} of ${line.steps} steps, now ${line.loss.toFixed(3)}`);
+  find("step").textContent = `step ${line.step} of ${line.steps}, loss ${line.loss.toFixed(3)}`;
+}
+
+// The loss over so many steps, and its moving mean.
+function lossCurve(steps) {
+  const wide = 300, tall = 70, most = Math.max(...learning.losses.map((one) => one[1])) || 1;
+  const line = (losses) => losses.map(([step, loss]) => `${(step / steps * wide).toFixed(1)},${(tall - 4 - loss / most * (tall - 8)).toFixed(1)}`).join(" ");
+  let mean = learning.losses[0][1];
+  const smoothed = learning.losses.map(([step, loss]) => [step, mean += 0.15 * (loss - mean)]);
+  find("loss-each").setAttribute("points", line(learning.losses));
+  find("loss-mean").setAttribute("points", line(smoothed));
 }
 
 function learned(line) {
@@ -139,9 +147,14 @@ function learned(line) {
   const took = `Learned \u201c${line.concept.name}\u201d in ${line.seconds.toFixed(1)} seconds.`;
   find("waiting").textContent = took;
   find("quality").textContent = line.quality.line;
-  find("save").hidden = find("to-mix").hidden = false;
+  find("learned").hidden = false;
   same("work", line.same);
   samplesTold(line.samples, line.concept.name);
+  if (learning.losses.length) {
+    const [last] = learning.losses.at(-1);
+    lossCurve(last); // learning stops where little changes
+    find("step").textContent = `${last} steps, loss ${learning.losses.at(-1)[1].toFixed(3)}`;
+  }
   announce(`${took} ${line.quality.line} It is in the mix below.`);
   mixLearned(line.concept);
 }
@@ -171,8 +184,9 @@ async function copy(button) {
 // --- other ways to get demonstrations
 
 function setWays() {
-  const { library, uploads } = state;
-  find("library").replaceChildren(...library.tasks.map((task) => made("option", { value: task, textContent: task })));
+  const { library, uploads } = state, known = state.concepts.filter((one) => one.kind === "training").map((one) => one.name);
+  const first = library.tasks.find((task) => !known.includes(task)); // something new
+  find("library").replaceChildren(...library.tasks.map((task) => made("option", { value: task, textContent: task, selected: task === first })));
   find("library").disabled = find("draw").disabled = !library.tasks.length;
   find("library-why").textContent = library.why;
   find("upload").accept = uploads.join(",");
@@ -200,6 +214,7 @@ function listenToWork() {
   find("learn").addEventListener("click", learn);
   find("name").addEventListener("input", () => { learning.named = find("name").value.trim() !== ""; });
   find("save").addEventListener("click", () => attempt(() => download(`/api/concept?id=${encodeURIComponent(learning.concept.id)}`, `${learning.concept.name}.safetensors`)));
+  find("save-its").addEventListener("click", () => attempt(() => download(`/api/demonstrations?id=${encodeURIComponent(learning.concept.id)}`, "demonstrations.npz")));
   find("to-mix").addEventListener("click", () => {
     find("mix-title").scrollIntoView({ behavior: smooth() });
     find("mix-title").focus({ preventScroll: true });

@@ -7,7 +7,7 @@ const conceptOf = (id) => state.concepts.find((one) => one.id === id);
 
 // --- the list of concepts
 
-const HEADINGS = { learned: "Yours", training: "Known from training", shipped: "Learned before", saved: "From files" };
+const HEADINGS = { learned: "Yours", opened: "From files", training: "Known from training", shipped: "Learned before", saved: "Saved" };
 
 function conceptList() {
   const sought = find("sought").value.trim().toLowerCase();
@@ -46,7 +46,7 @@ function newCard(concept) {
     made("span", { className: "name" }), made("span", { className: "about" }));
   one.pick.addEventListener("click", () => pick(concept.id));
   one.append(one.pick);
-  if (["learned", "saved"].includes(concept.kind) && !answers) {
+  if (["learned", "opened"].includes(concept.kind) && !answers) {
     const save = made("button", { type: "button", className: "plain", textContent: "Save", ariaLabel: `Save ${concept.name} as a file` });
     save.addEventListener("click", () => attempt(() => download(`/api/concept?id=${encodeURIComponent(concept.id)}`, `${concept.name}.safetensors`)));
     const forget = made("button", { type: "button", className: "plain", textContent: "Forget", ariaLabel: `Forget ${concept.name}` });
@@ -109,8 +109,9 @@ function firstMix() {
 }
 
 function mixLearned(concept) {
-  const first = mix.parts.find((one) => one.automatic && (conceptOf(one.id) || {}).kind !== "learned");
-  mix.parts = [...(first ? [first] : []), ...mix.parts.filter((one) => !one.automatic && one.id !== concept.id), part(concept.id, true)];
+  const chosen = mix.parts.filter((one) => !one.automatic && one.id !== concept.id);
+  const other = state.concepts.find((one) => one.kind === "training" && one.name !== concept.name);
+  mix.parts = [...(chosen.length || !other ? chosen : [part(other.id, true)]), part(concept.id, true)];
   mixed();
 }
 
@@ -192,7 +193,7 @@ async function sample() {
       fill(find("mixed"), found.samples, mix.view, (number) => `Sample ${number + 1} of ${name}`);
       find("told").textContent = found.told;
       find("mix-name").textContent = name;
-      find("took").textContent = answers ? "" : `${found.seconds.toFixed(1)} s`;
+      find("took").textContent = answers ? "" : found.seconds < 0.95 ? `${Math.round(1000 * found.seconds)} ms` : `${found.seconds.toFixed(1)} s`;
       same("mix", found.same);
       newSamples();
       thumbnails();

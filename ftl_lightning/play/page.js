@@ -5,9 +5,11 @@ let state = null;
 async function renew(found) {
   const other = !state || state.model.hash !== found.model.hash;
   state = found;
-  document.title = find("title").textContent = state.title;
+  document.title = `${state.title}: ftl-lightning play`;
+  find("subject").textContent = state.title;
   find("models").replaceChildren(...state.models.map((one) => made("option", { value: one.name, textContent: one.title, selected: one.name === state.model.name })));
   find("models-label").hidden = state.models.length < 2 || Boolean(state.offline || state.viewer);
+  find("subject").hidden = !find("models-label").hidden;
   find("loading").hidden = true;
   find("viewer").hidden = !state.viewer;
   find("play-page").hidden = Boolean(state.viewer);
@@ -42,7 +44,7 @@ async function open(name) {
       Object.assign(learning, { concept: null, task: "", named: false });
       fill(find("samples"), [], null, () => "");
       find("quality").textContent = "";
-      find("progress").hidden = find("save").hidden = find("to-mix").hidden = true;
+      find("progress").hidden = find("learned").hidden = true;
       await renew(found);
       announce(`${state.model.title} is opened.`);
     } finally { document.body.removeAttribute("aria-busy"); }
@@ -60,6 +62,10 @@ async function start() {
   find("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme !== "dark"));
   find("models").addEventListener("change", () => open(find("models").value));
   find("error-close").addEventListener("click", () => tellError(""));
+  find("end").addEventListener("click", () => attempt(async () => {
+    await ask("/api/end", {});
+    find("end").replaceWith("The program has ended; you can close this page.");
+  }));
   startPlayer();
   listenToHand();
   listenToWork();
@@ -70,6 +76,7 @@ async function start() {
     await renew(await ask("/api/state"));
   });
   find("loading").hidden = true;
+  find("end").hidden = Boolean(answers);
   paint();
   document.body.dataset.ready = Math.round(performance.now()); // milliseconds until the first state is drawn
 }

@@ -23,8 +23,7 @@ def page(nonce: str, offline: bytes | None = None) -> str:
     Args:
         nonce: of its style and program; letters and digits. Whoever serves the page sends a content security policy with it.
         offline: gzip of a JSON object of answers by :func:`request_key`, for a page that asks no program: ``/api/state``,
-            thumbnails and samples. Such a page has
-            its :data:`POLICY` in itself.
+            thumbnails and samples. Such a page has its :data:`POLICY` in itself.
     """
     meta = f'<meta http-equiv="Content-Security-Policy" content="{POLICY.format(nonce=nonce)}">\n'
     parts = {

@@ -1,0 +1,253 @@
+"""The page of play without a program behind it: what is in it, and what it does in a browser with answers made before."""
+
+import base64
+import gzip
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ftl_lightning.domains.line_plots import path_film
+from ftl_lightning.evaluation.films import packed
+from ftl_lightning.play.page import page, request_key
+from ftl_lightning.testing.strokes import strokes
+
+BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+QUIET = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+QUIET += ["--disable-component-update", "--disable-sync", "--enable-logging=stderr", "--virtual-time-budget=8000", "--dump-dom"]
+NONCE = "abc123"
+WEIGHTS = [0, 0.5, 1, 1.5]
+TEMPERATURE = 0.5
+
+Json = dict[str, Any]
+
+
+def line(points: np.ndarray, right: bool | None = None) -> Json:
+    drawn = path_film(torch.as_tensor(points, dtype=torch.float32), None)
+    window = [float(edge) for edge in drawn.window]
+    return {"frames": drawn.frames, "rate": drawn.rate, "window": window, "shapes": packed(drawn), "right": right, "told": "ended"}
+
+
+def body(height: float) -> Json:
+    """A pole that sways, with a head."""
+    sway = 0.3 * np.sin(np.linspace(0, 3, 30))
+    at = np.stack([np.zeros((30, 3)), np.stack([sway, 0 * sway, 0 * sway + height], axis=-1)], axis=1)
+    told = {"points": base64.b64encode((1000 * at).astype("<i2").tobytes()).decode(), "count": 2, "lines": [[0, 1]]}
+    space = told | {"colours": ["#3f6fb5"], "heads": [[1, 0.1, "#444444"]], "rate": 30, "room": [0.75, 2.1]}
+    return {"space": space, "frames": 30, "rate": 30, "right": None, "told": ""}
+
+
+def state(**other: Any) -> Json:
+    about = {"kind": "training", "count": None, "form": "", "accuracy": None, "hash": "0" * 16}
+    shown = [
+        {"id": number, "film": line(stroke), "flags": ["It is short."]} for number, stroke in enumerate(strokes("heart", 5, 0))
+    ]
+    same = {"python": "", "command": ""}
+    return {
+        "title": "strokes",
+        "model": {"name": "strokes", "title": "strokes", "hash": "0" * 16},
+        "models": [{"name": "strokes", "title": "strokes"}],
+        "recorder": None,
+        "library": {"tasks": [], "why": ""},
+        "uploads": [".npz"],
+        "executes": False,
+        "groups": [],
+        "temperature": TEMPERATURE,
+        "concepts": [{"id": f"c{number}", "name": name, **about} for number, name in enumerate(("line", "arc", "circle"))],
+        "work": {"demonstrations": shown, "check": ["They are much alike."], "undo": False, "same": same, "wanted": 5},
+        "viewer": None,
+        "offline": {"weights": WEIGHTS, "pairs": [["c0", "c1"]]},
+        **other,
+    }
+
+
+def made_before() -> Json:
+    """Answers: a state, thumbnails, and samples of one pair with all weights."""
+    one, other = (strokes(kind, 8, 0) for kind in ("line", "arc"))
+    answers: Json = {"/api/state": state()} | {f"/api/thumbnail?id=c{number}": {"film": line(one[number])} for number in range(3)}
+    for a in WEIGHTS:
+        for b in WEIGHTS:
+            parts = [{"id": name, "weight": float(weight), "groups": []} for name, weight in (("c0", a), ("c1", b))]
+            asked = {"parts": parts, "count": 8, "seed": 0, "temperature": TEMPERATURE, "execute": False, "task": ""}
+            films = [
+                line(a * first + b * second + 0.01, right=number % 2 == 0)
+                for number, (first, second) in enumerate(zip(one, other, strict=True))
+            ]
+            told = {
+                "samples": films,
+                "told": f"{a} and {b}",
+                "seconds": 0.0,
+                "same": {"python": f"{a} * line", "command": "sample"},
+            }
+            answers[request_key("/api/sample", asked)] = told
+    return answers
+
+
+def packed_page(answers: Json) -> str:
+    return page(NONCE, gzip.compress(json.dumps(answers).encode(), mtime=0))
+
+
+def in_browser(text: str, folder: Path, script: str, width: int = 1280) -> Json:
+    """What a script tells that runs in the page 1.5 s after its beginning, and where the page goes wrong."""
+    ask = f"""<script nonce="{NONCE}">{{
+    const told = {{ errors: [] }};
+    addEventListener("error", (event) => told.errors.push(String(event.message)));
+    addEventListener("unhandledrejection", (event) => told.errors.push(String(event.reason)));
+    const pause = (time) => new Promise((done) => setTimeout(done, time));
+    const texts = (where) => [...document.querySelectorAll(where)].map((one) => one.textContent);
+    const pictures = (where) => [...document.querySelectorAll(where)].map((one) => one.toDataURL()).join();
+    const put = (where, value) => {{ where.value = value; where.dispatchEvent(new Event("input")); }};
+    setTimeout(async () => {{
+      {script}
+      told.wide = document.documentElement.scrollWidth - innerWidth;
+      told.loaded = performance.getEntriesByType("resource").map((one) => one.name);
+      told.told = find("error-text").textContent;
+      document.body.dataset.answer = JSON.stringify(told);
+    }}, 1500);
+    }}</script>"""
+    asking = folder / "asking.html"
+    asking.write_text(text.replace("</body>", f"{ask}</body>"))
+    command = [str(BROWSER), *QUIET, f"--user-data-dir={folder / 'browser'}", f"--window-size={width},900", asking.as_uri()]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert "CONSOLE" not in ran.stderr, ran.stderr
+    found = re.search(r'data-answer="([^"]*)"', ran.stdout)
+    assert found, ran.stdout[-2000:]
+    told: Json = json.loads(found[1].replace("&quot;", '"').replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+    assert told["errors"] == []
+    assert told["wide"] <= 0
+    assert [name for name in told["loaded"] if not name.startswith("data:")] == []
+    return told
+
+
+def test_the_page_is_whole_and_names_no_address() -> None:
+    for text in (page(NONCE), packed_page(made_before())):
+        assert not re.search(r"%[A-Z]+%", text)
+        assert set(re.findall(r"\w+://[\w./]+", text)) == {"http://www.w3.org/2000/svg"}  # a name, which nothing asks for
+        assert not re.search(r"<(script|style)(?![^>]*(nonce=\"abc123\"|text/plain))", text)
+        assert " style=" not in text  # which the policy forbids
+    assert "Content-Security-Policy" not in page(NONCE)
+    assert "default-src 'none'; script-src 'nonce-abc123'" in packed_page({})
+
+
+def test_what_is_put_into_the_page_is_not_looked_at_again() -> None:
+    assert '<style nonce="%SCRIPT%">' in page("%SCRIPT%")
+
+
+def test_the_name_of_a_request_is_that_of_the_page() -> None:
+    assert request_key("/api/state") == "/api/state"
+    body = {"parts": [{"id": "c0", "weight": 1.0, "groups": ["arms"]}], "temperature": 0.5, "execute": False, "task": "ü"}
+    assert request_key("/api/sample", body) == (
+        '/api/sample {"parts":[{"id":"c0","weight":1,"groups":["arms"]}],"temperature":0.5,"execute":false,"task":"ü"}'
+    )
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_page_made_before_shows_samples_of_pairs(tmp_path: Path, width: int) -> None:
+    script = """
+      told.samples = Number(document.body.dataset.samples);
+      told.ready = Number(document.body.dataset.ready);
+      told.hidden = ["canvas", "learning", "ways", "sampling"].filter((id) => !find(id).offsetParent);
+      told.slots = document.querySelectorAll("#slots figure:not([hidden])").length;
+      told.check = texts("#check li");
+      told.mix = texts("#mix .name");
+      told.marks = texts("#mixed .mark");
+      find("mixed").scrollIntoView();  // films are drawn where they are in sight
+      await pause(300);
+      const before = pictures("#mixed canvas"), canvas = document.querySelector("#mixed canvas");
+      put(document.querySelector("#mix input"), 1.3);
+      await pause(300);
+      told.weights = texts("#mix output");
+      told.said = find("told").textContent;
+      told.python = find("python").textContent;
+      told.other = pictures("#mixed canvas") !== before;
+      told.same = canvas.isConnected;
+      told.later = Number(document.body.dataset.samples);
+      put(find("time"), 100);
+      const early = pictures("#mixed canvas");
+      put(find("time"), 900);
+      told.moved = pictures("#mixed canvas") !== early;
+      told.playing = player.playing;
+      told.alone = [...document.querySelectorAll("#concepts .pick")].map((one) => one.disabled);
+      told.thumbnails = document.querySelectorAll("#concepts .filmed").length;
+      document.querySelector("#mixed button").click();
+      told.large = find("large").open;
+      find("large-close").click();
+    """
+    told = in_browser(packed_page(made_before()), tmp_path, script, width)
+    assert told["told"] == ""
+    assert told["samples"] == 1
+    assert told["ready"] > 0
+    assert told["hidden"] == ["canvas", "learning", "ways", "sampling"]
+    assert told["slots"] == 5
+    assert told["check"][0] == "⚠ Demonstration 1: It is short."
+    assert told["check"][-1] == "They are much alike."
+    assert told["mix"] == ["line", "arc"]
+    assert told["marks"] == ["✓ right", "✗ wrong"] * 4
+    assert told["weights"] == ["1.50", "1.00"]  # the nearest of those that there are
+    assert told["said"] == "1.5 and 1"
+    assert told["python"] == "1.5 * line"
+    assert told["other"]
+    assert told["same"]  # exchanged in place, so that nothing flickers
+    assert told["later"] == 2
+    assert told["moved"]
+    assert not told["playing"]
+    assert told["alone"] == [False, False, True]
+    assert width < 1000 or told["thumbnails"] == 3
+    assert told["large"]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+def test_a_request_that_has_no_answer_is_told_and_breaks_nothing(tmp_path: Path) -> None:
+    answers = made_before()
+    script = "put(document.querySelector('#mix input'), 0.5); await pause(300); told.films = texts('#mixed figure').length;"
+    told = in_browser(packed_page({name: one for name, one in answers.items() if '"weight":0.5' not in name}), tmp_path, script)
+    assert "no samples of this choice" in told["told"]
+    assert told["films"] == 8
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(tmp_path: Path) -> None:
+    hearts = [
+        {"film": line(stroke), "label": str(number), "flags": ["It is short."]}
+        for number, stroke in enumerate(strokes("heart", 3, 0))
+    ]
+    poles = [{"film": body(1 + 0.2 * number), "label": str(number), "flags": []} for number in range(2)]
+    groups = [{"concept": "heart", "films": hearts}, {"concept": "pole", "films": poles}]
+    viewer = {"title": "five.npz", "told": ["Two concepts."], "groups": groups}
+    script = """
+      const concepts = () => texts("#view-films h3");
+      told.play = Boolean(find("play-page").offsetParent);
+      told.concepts = concepts();
+      told.flags = texts("#view-films .flags li");
+      told.canvases = document.querySelectorAll("#view-films canvas").length;
+      find("view-over").click();
+      told.over = document.querySelectorAll("#view-films canvas").length;
+      find("view-over").click();
+      put(find("time"), 500);
+      const button = [...document.querySelectorAll("#view-films button")].at(-1);
+      const before = button.querySelector("canvas").toDataURL();
+      button.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true, cancelable: true }));
+      told.turned = button.querySelector("canvas").toDataURL() !== before;
+      document.querySelector("#view-concepts input").click();
+      told.fewer = concepts();
+      put(find("view-text"), "pole 1");
+      told.one = concepts();
+      told.left = films.size;
+    """
+    told = in_browser(packed_page({"/api/state": state(viewer=viewer, offline=None)}), tmp_path, script)
+    assert told["told"] == ""
+    assert not told["play"]
+    assert told["concepts"] == ["heart, 3 films", "pole, 2 films"]
+    assert told["flags"] == [f"⚠ {number}: It is short." for number in range(3)]
+    assert (told["canvases"], told["over"]) == (5, 2)
+    assert told["turned"]
+    assert told["fewer"] == ["pole, 2 films"]
+    assert told["one"] == ["pole, 1 film"]
+    assert told["left"] == 1  # films that are not shown are not kept
