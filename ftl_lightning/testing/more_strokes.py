@@ -1,7 +1,7 @@
 """Many kinds of strokes as a hand draws them: what the model that ships, ``pretrained/strokes``, was pretrained and judged on.
 
-Kinds of :mod:`ftl_lightning.testing.strokes` are among them. The hand differs: corners are rounded, lines bend, closed strokes do not
-quite close, and how much strokes of a kind differ in place, size and slant can be chosen, as one person draws more alike than many.
+Kinds of :mod:`ftl_lightning.testing.strokes` are among them. The hand differs: corners are rounded, lines bend, closed strokes do
+not quite close. How much strokes of a kind differ in place, size and slant can be chosen, as one person draws more alike than many.
 """
 
 from collections.abc import Callable
@@ -66,12 +66,16 @@ _OPEN: dict[str, Callable[[Points], Points]] = {
     "letter N": corners((-0.6, -0.9), (-0.6, 0.9), (0.6, -0.9), (0.6, 0.9)),
     "letter Z": corners((-0.7, 0.9), (0.7, 0.9), (-0.7, -0.9), (0.7, -0.9)),
     "letter P": _joined((1.8, corners((0, -1), (0, 0.9))), (1.7, _turning(0.5, -0.5, 0.8, 0.5))),
-    "loop": _joined((1, corners((-1, -0.6), (0.1, -0.5))), (2.6, _turning(-0.5, 1.5, 0.45, 0.7)), (1, corners((0, 0), (1.1, -0.1)))),
+    "loop": _joined(
+        (1, corners((-1, -0.6), (0.1, -0.5))), (2.6, _turning(-0.5, 1.5, 0.45, 0.7)), (1, corners((0, 0), (1.1, -0.1)))
+    ),
     "coil": _loops(3, 1.0),
     "stairs": corners((-1, -0.9), (-1, -0.3), (-0.33, -0.3), (-0.33, 0.3), (0.33, 0.3), (0.33, 0.9), (1, 0.9)),
     "pulse": corners((-1, -0.5), (-0.4, -0.5), (-0.4, 0.6), (0.4, 0.6), (0.4, -0.5), (1, -0.5)),
     "bump": lambda s: _x_y(2 * s - 1, 1.4 * np.exp(-(((2 * s - 1) / 0.3) ** 2)) - 0.5),
-    "number 2": _joined((2.2, _turning(0.9, -0.2, 0.6, 0.5)), (1.6, corners((0.5, 0.2), (-0.6, -0.9))), (1.3, corners((0, 0), (1.2, 0)))),
+    "number 2": _joined(
+        (2.2, _turning(0.9, -0.2, 0.6, 0.5)), (1.6, corners((0.5, 0.2), (-0.6, -0.9))), (1.3, corners((0, 0), (1.2, 0)))
+    ),
     "number 6": _joined((2.0, _turning(0.4, 1.0, 0.9, 1.4)), (3.0, _turning(1, 2.9, 0.55, 0.5))),
     "number 7": corners((-0.7, 0.9), (0.7, 0.9), (-0.2, -0.9)),
     "arrow": corners((-1, 0), (1, 0), (0.45, 0.5), (1, 0), (0.45, -0.5)),
@@ -87,9 +91,13 @@ _CLOSED: dict[str, Callable[[Points], Points]] = {
 _VALIDATION: dict[str, Callable[[Points], Points]] = {
     "letter W": corners((-1, 0.7), (-0.5, -0.7), (0, 0.5), (0.5, -0.7), (1, 0.7)),
     "number 3": _joined((2.2, _turning(0.8, -0.5, 0.6, 0.5)), (2.6, _turning(0.5, -0.85, 0.65, 0.55))),
-    "question mark": _joined((2.6, _turning(1, -0.35, 0.55, 0.5)), (0.6, corners((0.3, 0.2), (0, -0.2))), (0.8, corners((0, 0), (0, -0.7)))),
+    "question mark": _joined(
+        (2.6, _turning(1, -0.35, 0.55, 0.5)), (0.6, corners((0.3, 0.2), (0, -0.2))), (0.8, corners((0, 0), (0, -0.7)))
+    ),
     "diamond": corners((0, 1), (0.75, 0), (0, -1), (-0.75, 0), (0, 1)),
-    "drop": _joined((1.3, corners((0, 1), (-0.6, -0.35))), (2.4, _turning(0.85, 2.15, 0.67, 0.67)), (1.3, corners((0.6, -0.35), (0, 1)))),
+    "drop": _joined(
+        (1.3, corners((0, 1), (-0.6, -0.35))), (2.4, _turning(0.85, 2.15, 0.67, 0.67)), (1.3, corners((0.6, -0.35), (0, 1)))
+    ),
     "hourglass": corners((-0.7, 0.9), (0.7, 0.9), (-0.7, -0.9), (0.7, -0.9), (-0.7, 0.9)),
 }
 _TEST: dict[str, Callable[[Points], Points]] = {
