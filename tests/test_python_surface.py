@@ -277,7 +277,7 @@ WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
     ),
     "a model's name like none": (
         lambda of: FewShot.from_pretrained("chess"),
-        "agent, driving, mocap, object_rearrangement, tabletop, tabletop_wide ship",
+        "agent, driving, mocap, object_rearrangement, strokes, tabletop, tabletop_wide ship",
     ),
     "no model's name": (lambda of: FewShot.from_pretrained(3), "name: expected the name of a model, such as agent, driving"),
     "no settings": (

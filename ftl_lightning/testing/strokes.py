@@ -22,14 +22,15 @@ Points = NDArray[np.float64]
 """``(..., 2)``."""
 
 
-def _corners(*points: tuple[float, float]) -> Callable[[Points], Points]:
-    """The way through some points, at an even pace."""
+def corners(*points: tuple[float, float]) -> Callable[[Points], Points]:
+    """The way through some points, at an even pace: a function of how much of it is done ``(...,)``, from 0 to 1."""
     corner = np.array(points)
     reached = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(corner, axis=0), axis=1))))
     return lambda s: np.stack([np.interp(s * reached[-1], reached, corner[:, axis]) for axis in (0, 1)], axis=-1)
 
 
-def _polar(radius: Points, angle: Points) -> Points:
+def polar(radius: Points, angle: Points) -> Points:
+    """Points by their distance from the origin and their angle in radians, ``(...,)`` each."""
     return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1)
 
 
@@ -47,22 +48,23 @@ def _s_curve(s: Points) -> Points:
     return np.stack((np.where(s < 0.5, x, -x), np.where(s < 0.5, y, -y)), axis=-1) * (0.7, 1.0)
 
 
-_SHAPES: dict[str, Callable[[Points], Points]] = {
-    "line": _corners((-1, -0.4), (1, 0.4)),
-    "arc": lambda s: _polar(np.ones_like(s), np.pi * (1 - s)),
-    "circle": lambda s: _polar(np.ones_like(s), 2 * np.pi * s),
-    "zigzag": _corners((-1, -0.5), (-0.5, 0.5), (0, -0.5), (0.5, 0.5), (1, -0.5)),
-    "spiral": lambda s: _polar(0.1 + 0.9 * s, 4 * np.pi * s),
+SHAPES: dict[str, Callable[[Points], Points]] = {
+    "line": corners((-1, -0.4), (1, 0.4)),
+    "arc": lambda s: polar(np.ones_like(s), np.pi * (1 - s)),
+    "circle": lambda s: polar(np.ones_like(s), 2 * np.pi * s),
+    "zigzag": corners((-1, -0.5), (-0.5, 0.5), (0, -0.5), (0.5, 0.5), (1, -0.5)),
+    "spiral": lambda s: polar(0.1 + 0.9 * s, 4 * np.pi * s),
     "wave": lambda s: np.stack((2 * s - 1, 0.5 * np.sin(4 * np.pi * s)), axis=-1),
-    "triangle": _corners((-0.9, -0.6), (0.9, -0.6), (0, 0.9), (-0.9, -0.6)),
+    "triangle": corners((-0.9, -0.6), (0.9, -0.6), (0, 0.9), (-0.9, -0.6)),
     "figure eight": lambda s: np.stack((0.6 * np.sin(4 * np.pi * s), np.cos(2 * np.pi * s)), axis=-1),
-    "square": _corners((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, 0.8), (-0.8, -0.8)),
+    "square": corners((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, 0.8), (-0.8, -0.8)),
     "heart": _heart,
     "S-curve": _s_curve,
 }
+"""By kind the way that a stroke takes, within about 1 of the origin, over the share of it that is done."""
 NEW = ("square", "heart", "S-curve")
 """Kinds to learn from a few strokes."""
-TRAINING = tuple(kind for kind in _SHAPES if kind not in NEW)
+TRAINING = tuple(kind for kind in SHAPES if kind not in NEW)
 """Kinds of pretraining."""
 
 
@@ -80,7 +82,7 @@ def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
     rng = np.random.default_rng([seed, task_key(kind)])
     even = np.linspace(0, 1, STEPS)
     uneven = rng.uniform(-0.5, 0.5, (count, 1)) * np.sin(np.pi * even) * np.cos(np.pi * even) / np.pi
-    points = _SHAPES[kind](even + uneven)
+    points = SHAPES[kind](even + uneven)
     size = rng.uniform(1.0, 2.0, (count, 1, 1)) * rng.uniform(0.85, 1.15, (count, 1, 2))
     turn = rng.uniform(-0.25, 0.25, count)
     rotation = np.stack((np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)), axis=-1).reshape(count, 2, 2)
@@ -101,10 +103,10 @@ def _shape(points: NDArray[np.float32]) -> Points:
 @functools.cache
 def _templates() -> Points:
     """``(kind * template, 80)``."""
-    return np.concatenate([_shape(strokes(kind, TEMPLATES, TEMPLATE_SEED)) for kind in _SHAPES])
+    return np.concatenate([_shape(strokes(kind, TEMPLATES, TEMPLATE_SEED)) for kind in SHAPES])
 
 
 def recognised(stroke: NDArray[np.float32]) -> list[str]:
     """The kind of each stroke ``(stroke, 40, 2)``: that of the nearest of all kinds' templates, whatever its place and size."""
     apart = np.linalg.norm(_shape(stroke)[:, None] - _templates(), axis=-1)
-    return [list(_SHAPES)[index // TEMPLATES] for index in apart.argmin(axis=1).tolist()]
+    return [list(SHAPES)[index // TEMPLATES] for index in apart.argmin(axis=1).tolist()]
