@@ -1,5 +1,6 @@
 """Episodes of Gymnasium environments, recorded and read back."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.errors import UserError
+from tests.conftest import ROOT
 
 gymnasium = pytest.importorskip("gymnasium", reason="no extra with gymnasium is installed")
 
@@ -138,6 +140,15 @@ def test_what_was_recorded_is_saved_in_every_format(name: str, monkeypatch: pyte
     found, recorded = Demonstrations.load(name), env.demonstrations()
     assert found.hash == recorded.hash
     assert (found.concepts, found.per_step) == (recorded.concepts, recorded.per_step)
+
+
+def test_the_example_of_the_page_runs() -> None:
+    page = (ROOT / "docs" / "own-data.md").read_text("utf-8")
+    (example,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Recorder" in block]
+    exec(compile(example, "own-data.md", "exec"), {})
+    found = Demonstrations.load("swing.npz")
+    assert found.states.shape == (3, 201, 3)
+    assert set(found.concepts) == {"swing"}
 
 
 def test_navigation_is_recorded(capsys: pytest.CaptureFixture[str]) -> None:
