@@ -1,7 +1,7 @@
 # Everything runs in .venv, made from pinned versions. PYTHON chooses the interpreter, TORCH another build of torch.
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := all,dev,cluster,docs,minari
+EXTRAS := all,dev,cluster,docs,lerobot,minari
 DOMAIN := object_rearrangement
 LOGS := logs/$(DOMAIN)
 

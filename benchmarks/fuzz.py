@@ -111,6 +111,14 @@ def flipped(content: bytes, draw: random.Random) -> bytes:
     return bytes(found)
 
 
+def _flipped_footer(content: bytes, draw: random.Random) -> bytes:
+    """The same of a Parquet file, whose header is at its end."""
+    if draw.random() < 0.5:
+        return flipped(content, draw)
+    at = max(0, len(content) - 3000)
+    return content[:at] + flipped(content[at:], draw)
+
+
 def as_json(tree: Any, draw: random.Random) -> bytes:
     """A mutated tree as text, maybe with a key twice or bytes changed."""
     text = json.dumps(mutated(tree, draw))
@@ -290,6 +298,7 @@ class Fuzz:
             "concept": self.concept,
             "safetensors": self.safetensors,
             "npz": self.npz,
+            "lerobot": self.lerobot,
             "csv": self.csv,
             "checkpoint": self.checkpoint,
             "yaml": self.yaml,
@@ -331,6 +340,19 @@ class Fuzz:
     def npz(self, draw: random.Random) -> None:
         """The same as ``.npz``."""
         self._used(self._written("demonstrations.npz", odd_npz(self.arrays, draw)))
+
+    def lerobot(self, draw: random.Random) -> None:
+        """The same as the folder of a LeRobot data set, one file of which is changed."""
+        folder = self.folder / "lerobot"
+        if not folder.is_dir():
+            Demonstrations.load(self.folder / "good.npz").save(f"lerobot:{folder}")
+        path = draw.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
+        content = path.read_bytes()
+        path.write_bytes(as_json(json.loads(content), draw) if path.suffix == ".json" else _flipped_footer(content, draw))
+        try:
+            self._used(folder)
+        finally:
+            path.write_bytes(content)
 
     def _used(self, path: Path) -> None:
         found = Demonstrations.load(path).named("file")
@@ -453,7 +475,7 @@ def counts(kind: str, count: int, seed: int, limit: float) -> collections.Counte
 
 def main() -> None:
     """Print the counts of one kind of files, or of all."""
-    kinds = ("config.json", "concept", "safetensors", "npz", "csv", "checkpoint", "yaml")
+    kinds = ("config.json", "concept", "safetensors", "npz", "lerobot", "csv", "checkpoint", "yaml")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kind", choices=("all", *kinds), default="all")
     parser.add_argument("--count", type=int, default=1000)

@@ -27,7 +27,7 @@ myst_heading_anchors = 3
 nb_execution_mode = "off"  # the notebooks hold their output
 
 autodoc_default_options = {"members": True, "show-inheritance": True}
-autodoc_mock_imports = [name for name in ("minari",) if importlib.util.find_spec(name) is None]  # an extra
+autodoc_mock_imports = [name for name in ("minari", "pyarrow") if importlib.util.find_spec(name) is None]  # extras
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False  # Lightning's and torch's own documentation is theirs
 autodoc_typehints = "description"

@@ -18,7 +18,8 @@ class CheckOptions:
     """Say whether demonstrations of a concept suffice, and which of them is odd.
 
     Attributes:
-        file: of demonstrations (.npz or .safetensors), or the name of a Minari data set; each of its concepts is checked.
+        file: of demonstrations (.npz or .safetensors), the folder of a LeRobot data set, or the name of a Minari data set; each of
+            its concepts is checked.
         pretrained: folder of the pretrained model that is to learn from them, or the name of one that ships; empty to look for
             faults alone.
         learn: also learn each concept from some of its demonstrations and measure the others; needs a model.
@@ -46,12 +47,9 @@ class CheckOptions:
 def check(options: CheckOptions) -> None:
     """Check every concept of the file, print what was found, and draw it."""
     from ftl_lightning.demonstrations.mended_file import read_mended
-    from ftl_lightning.domains.from_file import read_own
     from ftl_lightning.few_shot import FewShot
-    from ftl_lightning.inputs import MINARI
 
-    recorded = MINARI.fullmatch(options.file) and not Path(options.file).exists()
-    demonstrations, broken = (read_own(options.file), ()) if recorded else read_mended(options.file)
+    demonstrations, broken = read_mended(options.file)
     model = FewShot.from_pretrained(options.pretrained, options.settings or None) if options.pretrained else None
     if model is not None:
         demonstrations = _fitting(model, demonstrations, options.file)

@@ -1,6 +1,5 @@
 """The verbs that need no trainer: plain typed functions. Their imports are inside, so that each starts at once."""
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,18 +30,15 @@ def generate(
         count: demonstrations of the task, or of each training concept.
         seed: the same seed gives the same bytes.
         workers: processes, in domains whose expert takes long; a run that was stopped goes on where it was.
-        out: file to write, or "minari:NAME" for a Minari data set (the extra "minari"), such as "minari:strokes/test-v0".
+        out: file to write (.safetensors or .npz), or "minari:NAME" for a Minari data set (the extra "minari"), such as
+            "minari:strokes/test-v0", or "lerobot:FOLDER" for a LeRobot data set (the extra "lerobot").
         root: folder of your copy of the data, for domains whose demonstrations do not ship.
     """
     from ftl_lightning.domains.registry import load_domain
-    from ftl_lightning.errors import UserError
 
     expect_count("count", count, 1, MOST_DEMONSTRATIONS)
     expect_range("seed", seed, 0)
     expect_count("workers", workers, 1, MOST_WORKERS)
-    name = out.removeprefix("minari:")
-    if name != out and importlib.util.find_spec("minari") is None:
-        raise UserError(f"out: expected a file, found the Minari data set {name!r}, which needs the extra 'minari'")
     found = load_domain(domain)
     source = found.source(Path(root) if root else None)
     try:
@@ -51,13 +47,8 @@ def generate(
         if task:
             found.expect_goal(task, "task")
         raise
-    if name != out:
-        from ftl_lightning.demonstrations.minari import write_minari
-
-        write_minari(demonstrations, name)
-    else:
-        demonstrations.save(out)
-    say(f"{name}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
+    demonstrations.save(out)
+    say(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
 
 
 def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Packages that come with an extra of this one: simulators, and what a few measures and figures need.
+"""Packages that come with an extra of this one: simulators, other programs' data sets, and what a few measures and figures need.
 
 Without them everything is imported, and learns and generates from data of one's own. What truly needs one asks here first and then
 imports it where it is used.
@@ -11,6 +11,8 @@ from ftl_lightning.errors import UserError
 
 EXTRAS: Mapping[str, Mapping[str, str]] = {
     "driving": {"highway_env": "highway-env", "gymnasium": "gymnasium"},
+    "lerobot": {"pyarrow": "pyarrow"},
+    "minari": {"minari": "minari"},
     "mocap": {"sklearn": "scikit-learn"},
     "navigation": {"pybullet": "pybullet", "gymnasium": "gymnasium"},
     "notebooks": {"sklearn": "scikit-learn"},

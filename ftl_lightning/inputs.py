@@ -1,15 +1,16 @@
 """Files that a command line names, looked at before anything slow is imported: what is read is there, what is written no device."""
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ftl_lightning.configuration import configurations, load
-from ftl_lightning.errors import UserError, about
+from ftl_lightning.data_names import INFO, read_from, written_to
+from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.extras import expect_extra
 from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.shipped import missing_model, pretrained_folder
-from ftl_lightning.targets import expect_writable_file, expect_writable_folder
+from ftl_lightning.targets import expect_new_folder, expect_writable_file, expect_writable_folder
 
 Check = Callable[[str], None]
 """Raises a :class:`UserError` for a path where nothing is that could be meant."""
@@ -28,12 +29,11 @@ def _checkpoint(path: str) -> None:
 
 
 def _demonstrations(path: str) -> None:
-    if not MINARI.fullmatch(path):
-        _file("demonstrations")(path)
-
-
-MINARI = re.compile(r"[\w./-]+-v\d+")
-"""How Minari names a data set."""
+    kind, name = read_from(path)
+    if kind == "lerobot":
+        expect_readable(Path(name) / INFO, "LeRobot info", MOST_TEXT)
+    elif kind == "file":
+        expect_readable(name, "demonstrations")
 
 
 def _file(kind: str, most: int | None = None) -> Check:
@@ -45,12 +45,25 @@ def _file(kind: str, most: int | None = None) -> Check:
 
 def _written(key: str, expect: Callable[[str, str], None] = expect_writable_file) -> Check:
     def check(path: str) -> None:
-        if not path.startswith("minari:"):
-            expect(path, key)
-        if key == "out" and path.endswith(".npz"):
-            raise UserError(f"{key}: expected a name that ends in .safetensors, which is what is written, found {path!r}")
+        expect(path, key)
 
     return check
+
+
+def _written_demonstrations(path: str) -> None:
+    kind, name = written_to(path)
+    if kind == "file":
+        return expect_writable_file(name, "out")
+    expect_extra(kind, f"out: {short(path)}: this data set")
+    if kind == "lerobot":
+        expect_new_folder(name, "out")
+        expect_writable_folder(name, "out")
+
+
+def _table(path: str) -> None:
+    if path.endswith(".npz"):
+        raise UserError(f"out: expected a name that ends in .safetensors, which is what is written, found {path!r}")
+    expect_writable_file(path, "out")
 
 
 def _added(key: str) -> Check:
@@ -73,13 +86,13 @@ TRAINER: Mapping[str, Check] = {
     "evaluation.films": _written("evaluation.films"),
 }
 """Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
-_COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _file("demonstrations")}
-_OUT: Mapping[str, Check] = {"out": _written("out")}
+_COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _demonstrations}
+_OUT: Mapping[str, Check] = {"out": _written_demonstrations}
 _FOLDER: Mapping[str, Check] = {"out": _written("out", expect_writable_folder)}
 _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
     "check": {"figure": _written("figure")},
-    "encode": _OUT,
+    "encode": {"out": _table},
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},

@@ -35,7 +35,7 @@ class SampleOptions:
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
             drawn from the seed; without a goal, those of the task that the concept was learned from, or of the first composed text.
         initial: demonstrations file whose initial states are used instead; one sample of each.
-        out: demonstrations file to write.
+        out: demonstrations file to write, as generate does.
         figure: picture to write, .png or .svg.
         execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
             episodes ended.

@@ -35,6 +35,14 @@ def expect_writable_file(path: str | Path, key: str = "") -> None:
     _expect_place(Path(path).absolute().parent, Path(path), key)
 
 
+def expect_new_folder(path: str | Path, key: str = "") -> None:
+    """As :func:`expect_folder`, and refuse a folder that holds something."""
+    expect_folder(path, key)
+    if Path(path).is_dir() and any(Path(path).iterdir()):
+        name = short(f"{key}: {path}" if key else str(path), 150)
+        raise UserError(f"{name}: expected an empty folder or nothing there, found one with files; choose another name")
+
+
 def expect_writable_folder(path: str | Path, key: str = "") -> None:
     """The same of a folder that files are to be written to."""
     expect_folder(path, key)

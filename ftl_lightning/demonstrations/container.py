@@ -8,10 +8,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from ftl_lightning.data_names import written_to
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed, take
 from ftl_lightning.demonstrations.file_format import INITIAL, read, write
 from ftl_lightning.demonstrations.file_keys import KIND, OBSERVED
 from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.extras import expect_extra
 from ftl_lightning.representation import Shown, counted
 from ftl_lightning.tensor_file import bytes_hash, serialise
 
@@ -199,7 +201,27 @@ class Demonstrations(Shown):
         return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:
-        """Write one safetensors file with a JSON header, whole or not at all; images in it are compressed (zlib)."""
+        """Write them, whole or not at all.
+
+        Args:
+            path: a safetensors file, in which images are compressed (zlib); an ``.npz`` file, if it ends so;
+                ``'minari:NAME'`` for a Minari data set; or ``'lerobot:FOLDER'`` for a LeRobot data set. Each format holds all
+                there is but for padding, an ``.npz`` without the provenance.
+
+        Raises:
+            UserError: naming it, if it cannot be written, or an extra is not installed that it needs.
+        """
+        kind, name = written_to(str(path))
+        if kind != "file":
+            expect_extra(kind, f"{path}: this data set")
+        if kind == "minari":
+            from ftl_lightning.demonstrations.minari import write_minari
+
+            return write_minari(self, name)
+        if kind == "lerobot":
+            from ftl_lightning.demonstrations.lerobot import write_lerobot
+
+            return write_lerobot(self, name)
         header = {
             "domain": self.domain,
             "state_names": self.state_names,
@@ -212,7 +234,8 @@ class Demonstrations(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by :meth:`save`, or an ``.npz`` file without objects.
+        """Read what :meth:`save` wrote or another program did: a safetensors file, an ``.npz`` file without objects, a Minari data
+        set by its name, or the folder of a LeRobot data set.
 
         An ``.npz`` needs ``states`` ``(demo, time, state)``; ``concepts`` (texts, or one for all), ``lengths`` (all full),
         ``state_names``, ``state_units``, ``domain``, ``scenes`` and observed features as ``observed/NAME`` are optional. Names
@@ -221,7 +244,7 @@ class Demonstrations(Shown):
         Raises:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
         """
-        contents = read(Path(path))
+        contents = read(path)
         with about(path):
             return cls(**contents)
 

@@ -7,11 +7,13 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
+from ftl_lightning.data_names import read_from
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.demonstrations.file_keys import KIND, OBSERVED, TEXTS
 from ftl_lightning.demonstrations.images import compressed, decompressed_images
-from ftl_lightning.demonstrations.npz import read_npz
+from ftl_lightning.demonstrations.npz import read_npz, write_npz
 from ftl_lightning.errors import UserError, about, short, shown
+from ftl_lightning.extras import expect_extra
 from ftl_lightning.schema import expect_type
 from ftl_lightning.tensor_file import load_tensors, save_tensors
 
@@ -44,28 +46,42 @@ class Contents(TypedDict):
 
 
 def write(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write one safetensors file with a JSON header, whole or not at all.
+    """Write one safetensors file with a JSON header, or an ``.npz``, whole or not at all.
 
     Args:
-        path: the file.
+        path: the file; what ends in ``.npz`` is one, and says nothing of how the demonstrations came about.
         tensors: by key; what is of uint8 is images and is compressed, see :data:`VERSION`.
         header: what else there is to say, by key.
 
     Raises:
         UserError: where the file cannot be written.
     """
+    if Path(path).suffix == ".npz":
+        return write_npz(path, tensors, header)
     images = {key: values for key, values in tensors.items() if values.dtype == torch.uint8}
     shapes = {"compressed": {key: list(values.shape) for key, values in images.items()}} if images else {}
     stored = {**tensors, **{key: compressed(values) for key, values in images.items()}}
     save_tensors(path, KIND, stored, {**header, **shapes}, VERSION if images else PLAIN)
 
 
-def read(path: Path) -> Contents:
-    """Read what :func:`write` wrote, in any of its forms, or an ``.npz`` file without objects.
+def read(path: str | Path) -> Contents:
+    """Read what :func:`write` wrote, in any of its forms, an ``.npz`` file without objects, or a data set.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, of another kind, or says something of another type.
     """
+    kind, name = read_from(str(path))
+    if kind == "lerobot":
+        expect_extra("lerobot", f"{path}: a LeRobot data set")
+        from ftl_lightning.demonstrations.lerobot import read_contents
+
+        return read_contents(name)
+    if kind == "minari":
+        expect_extra("minari", f"{path}: expected a file, found none; a Minari data set of this name")
+        from ftl_lightning.demonstrations.minari import read_contents as read_data_set
+
+        return read_data_set(name)
+    path = Path(path)
     tensors, header = read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, PLAIN, VERSION))
     with about(path):
         if "states" not in tensors:

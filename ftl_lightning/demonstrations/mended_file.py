@@ -15,7 +15,7 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
     """Demonstrations of a file, those without a text named after it, with states that are not finite mended.
 
     Args:
-        path: ``.npz`` or safetensors.
+        path: ``.npz``, safetensors, or a data set.
 
     Returns:
         Demonstrations, and where states were not finite.
@@ -23,7 +23,7 @@ def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
     Raises:
         UserError: naming the file, for every other mistake in it.
     """
-    contents = read(Path(path))
+    contents = read(path)
     found: tuple[Finding, ...] = ()
     states, lengths = contents["states"], contents["lengths"]
     if states.dim() == 3 and states.dtype == torch.float32 and lengths.shape == states.shape[:1]:

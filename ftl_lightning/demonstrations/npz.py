@@ -1,13 +1,12 @@
 """Demonstrations as an ``.npz`` file of plain arrays, which other software writes."""
 
-import io
 import lzma
 import math
 import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from torch import Tensor
 from ftl_lightning.demonstrations.file_keys import OBSERVED, TEXTS
 from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.limits import MOST_TENSORS, expect_readable, expect_unpacked
+from ftl_lightning.tensor_file import atomic
 
 _DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)
 """What numpy and zipfile raise for files that are damaged or none of theirs."""
@@ -62,17 +62,21 @@ def read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, header
 
 
-def npz_bytes(tensors: Mapping[str, Tensor], texts: Mapping[str, Sequence[str] | str]) -> bytes:
-    """An ``.npz`` that :func:`read_npz` reads, the same bytes for the same content.
+def write_npz(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write what :func:`read_npz` reads, without compression, whole or not at all.
 
     Args:
-        tensors: by key.
-        texts: by key, of which those that are empty are left out.
+        path: the file.
+        tensors: numbers by key.
+        header: of it the domain and the lists of texts are written; an array has no place for the rest.
+
+    Raises:
+        UserError: where the file cannot be written.
     """
-    content = io.BytesIO()
-    arrays = {key: values.numpy() for key, values in tensors.items()}
-    np.savez_compressed(content, **arrays, **{key: np.array(text) for key, text in texts.items() if len(text)})  # type: ignore[arg-type]
-    return content.getvalue()
+    arrays: dict[str, Any] = {key: values.detach().cpu().numpy() for key, values in tensors.items()}
+    arrays |= {key: np.array(header[key], dtype=np.str_) for key in ("domain", *TEXTS) if key in header}
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def expect_arrays(path: Path, size: int) -> None:

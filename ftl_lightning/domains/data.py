@@ -249,7 +249,8 @@ class OwnData(PretrainingData):
 
     Args:
         demonstrations: the file (``.npz`` or safetensors), see
-            :meth:`ftl_lightning.demonstrations.container.Demonstrations.load`; or the name of an installed Minari data set.
+            :meth:`ftl_lightning.demonstrations.container.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
+            an installed Minari data set.
         metrics: what plans are judged by, a name and a number each, see :mod:`ftl_lightning.domains.from_file`; empty for nothing.
         validation_share: share of each concept's demonstrations that is held out, at least one.
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
@@ -301,8 +302,9 @@ class InversionData(pl.LightningDataModule):
     Args:
         domain: name of the domain, or ``package.module:DOMAIN``; ``'own'`` for a user's own data.
         suite: the concepts of this suite of the domain are learned, from demonstrations drawn from the seed.
-        demonstrations: a file of your own instead (safetensors or npz), or the name of an installed Minari data set. Its concept
-            texts name the concepts to learn; demonstrations without a text belong to one concept named after the file.
+        demonstrations: a file of your own instead (safetensors or npz), the folder of a LeRobot data set, or the name of an
+            installed Minari data set. Its concept texts name the concepts to learn; demonstrations without a text belong to one
+            concept named after the file.
         demonstrations_per_concept: how many are drawn; the paper's number is 5.
         seed: decides the demonstrations that are drawn.
         steps: gradient steps, which is the length of the one epoch.
@@ -373,7 +375,7 @@ def shares(demonstrations: Demonstrations, balance: float) -> Tensor:
 
 
 def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
-    """A file or Minari data set of a domain's demonstrations; those without a text are named after it.
+    """A file or data set of a domain's demonstrations; those without a text are named after it.
 
     Raises:
         UserError: naming it, if it does not fit the domain.

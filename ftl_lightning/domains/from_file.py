@@ -18,7 +18,6 @@ Its training concepts are the texts, in the order in which they first appear. Pl
 Demonstrations that plans are compared with are held out from training; of a new concept, those that it was learned from.
 """
 
-import importlib.util
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +33,6 @@ from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.domains.hand_drawn import drawn_by_hand
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.errors import UserError
-from ftl_lightning.inputs import MINARI
 from ftl_lightning.seeding import generator
 
 OWN = "own"
@@ -123,7 +121,7 @@ def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float
     """The domain that a file is.
 
     Args:
-        path: the file, or the name of an installed Minari data set.
+        path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
         horizon: states in a plan; ``None`` for the longest demonstration's.
         metrics: see :func:`own_domain`.
         share: of each concept's demonstrations that is held out, at least one.
@@ -150,19 +148,13 @@ def read_own(path: str) -> Demonstrations:
     """A file of one's own behaviour; demonstrations without a text are named after the file.
 
     Args:
-        path: ``.npz`` or safetensors, or the name of an installed Minari data set such as ``strokes/test-v0``.
+        path: ``.npz`` or safetensors, the folder of a LeRobot data set, or the name of an installed Minari data set such as
+            ``strokes/test-v0``.
 
     Raises:
         UserError: naming it, if it is missing or damaged.
     """
-    file = Path(path)
-    if file.suffix in (".npz", ".safetensors") or file.exists() or not MINARI.fullmatch(path):
-        return Demonstrations.load(file).named(file.stem)
-    if importlib.util.find_spec("minari") is None:
-        raise UserError(f"{path}: expected a file, found the name of a Minari data set, which needs the extra 'minari'")
-    from ftl_lightning.demonstrations.minari import read_minari
-
-    return read_minari(path)
+    return Demonstrations.load(path).named(Path(path).stem)
 
 
 def _scaled(examples: Demonstrations, states: Tensor) -> tuple[Tensor, Tensor]:

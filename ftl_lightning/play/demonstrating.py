@@ -1,13 +1,11 @@
 """The demonstrations of one concept that a person has shown so far, by hand, from the library or from files."""
 
 import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
-from ftl_lightning.demonstrations.npz import npz_bytes
 from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, expect_path
 from ftl_lightning.errors import UserError, short
@@ -198,5 +196,7 @@ class Demonstrating:
 
 def as_npz(own: Demonstrations) -> bytes:
     """Demonstrations as an ``.npz`` file."""
-    texts: dict[str, Sequence[str] | str] = {"concepts": own.concepts, "domain": own.domain, "per_step": own.per_step}
-    return npz_bytes(own.tensors, {**texts, "state_names": own.state_names, "state_units": own.state_units})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "demonstrations.npz"
+        own.save(path)
+        return path.read_bytes()

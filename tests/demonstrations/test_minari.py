@@ -21,6 +21,7 @@ pytest.importorskip("h5py", reason="the extra 'minari' is not installed")
 from minari.data_collector import EpisodeBuffer  # noqa: E402
 
 from ftl_lightning.demonstrations.minari import read_minari, write_minari  # noqa: E402
+from tests.demonstrations.recorded import everything, expect_same  # noqa: E402
 
 VECTOR = gymnasium.spaces.Box(-1, 1, (3,), np.float64)
 IMAGE = gymnasium.spaces.Box(0, 255, (4, 4, 3), np.uint8)
@@ -74,6 +75,36 @@ def test_what_is_written_is_read_back() -> None:
     assert episodes[0].truncations.tolist() == [False, False, False, True]
 
 
+def test_features_scenes_and_names_are_read_back() -> None:
+    written = everything()
+    written.save("minari:strokes/all-v0")
+    expect_same(Demonstrations.load("minari:strokes/all-v0"), written)
+    expect_same(Demonstrations.load("strokes/all-v0"), written)
+    space = minari.load_dataset("strokes/all-v0").observation_space
+    assert sorted(space.spaces) == ["goal", "grid", "observation", "view", "wind"]
+    assert read_minari("strokes/all-v0", observed=["wind", "goal"]).per_step == ("wind",)
+    winds = read_minari("strokes/all-v0", "wind", [])
+    assert (winds.state_names, winds.per_step) == (("0", "1", "2"), ())
+    assert torch.equal(winds.states, written.observed["wind"])
+
+
+def test_data_sets_of_the_form_before_features_are_read() -> None:
+    made = make("form-v0", [episode(vectors(2), 2)])
+    made.storage.update_metadata({"ftl_lightning": {"domain": "d", "state_names": ["x", "y", "z"], "state_units": ["m"] * 3}})
+    found = read_minari("form-v0")
+    assert (found.domain, found.state_names, found.state_units) == ("d", ("x", "y", "z"), ("m", "m", "m"))
+    made.storage.update_metadata({"ftl_lightning": {"domain": 1}})
+    with pytest.raises(UserError, match=r"form-v0: key 'ftl_lightning.domain': expected a text, found 1"):
+        read_minari("form-v0")
+
+
+def test_names_that_cannot_be_keys_are_refused() -> None:
+    for name in ("observation", "a/b"):
+        written = Demonstrations(torch.rand(1, 2, 1), torch.tensor([2]), "", ("x",), ("",), ("a",), {name: torch.rand(1, 2)})
+        with pytest.raises(UserError, match=r"x-v0: expected the name of an observed feature other than 'observation' and without"):
+            write_minari(written, "x-v0")
+
+
 def test_a_texts_place_is_the_episode_then_its_metadata_then_the_data_set() -> None:
     infos = [{"concept": ["go left"] * 3}, None, {"speed": [1.0] * 3}]
     made = make("three-v0", [episode(vectors(2, row / 4), 2, info) for row, info in enumerate(infos)])
@@ -97,13 +128,20 @@ def test_of_several_parts_the_observation_or_the_only_vector_is_read() -> None:
     parts = {"observation": VECTOR, "goal": VECTOR}
     both = {"observation": vectors(2, 0.25), "goal": vectors(2, 0.75)}
     make("goal-v0", [episode(both, 2)], gymnasium.spaces.Dict(parts))
-    assert (read_minari("goal-v0").states == 0.25).all()
-    assert (read_minari("goal-v0", "goal").states == 0.75).all()
+    found = read_minari("goal-v0")
+    assert (found.states == 0.25).all()
+    assert (found.observed["goal"] == 0.75).all()
+    assert (found.per_step, found.observed["goal"].shape) == (("goal",), (1, 3, 3))
+    assert read_minari("goal-v0", observed=()).observed == {}
+    assert (read_minari("goal-v0", "goal", ()).states == 0.75).all()
+    with pytest.raises(UserError, match=r"goal-v0: observed: expected some of goal, observation, found 'speed'"):
+        read_minari("goal-v0", observed=["speed"])
     with pytest.raises(UserError, match=r"goal-v0: expected .* one of goal, observation, found 'speed'"):
         read_minari("goal-v0", "speed")
     pose = {"pose": vectors(2), "camera": list(np.zeros((3, 4, 4, 3), np.uint8))}
     make("camera-v0", [episode(pose, 2)], gymnasium.spaces.Dict({"pose": VECTOR, "camera": IMAGE}))
     assert read_minari("camera-v0").states.shape == (1, 3, 3)
+    assert read_minari("camera-v0").observed == {}
 
 
 def test_what_is_no_data_set_of_vectors_is_a_clear_error(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import torch
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.errors import UserError
+from tests.demonstrations.recorded import everything, expect_same
 
 
 def test_npz_is_accepted_without_objects(tmp_path: Path) -> None:
@@ -18,6 +19,14 @@ def test_npz_is_accepted_without_objects(tmp_path: Path) -> None:
     np.savez(tmp_path / "o.npz", states=np.array([{}], dtype=object))
     with pytest.raises(UserError, match=r"o\.npz: expected an \.npz of plain arrays"):
         Demonstrations.load(tmp_path / "o.npz")
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    written = everything()
+    written.save(tmp_path / "d.npz")
+    expect_same(Demonstrations.load(tmp_path / "d.npz"), written, provenance=False)
+    assert dict(np.load(tmp_path / "d.npz", allow_pickle=False))["concepts"].tolist() == list(written.concepts)
+    assert [path.name for path in tmp_path.iterdir()] == ["d.npz"]
 
 
 def test_images_stay_bytes_in_npz_files_and_in_our_own(tmp_path: Path) -> None:
