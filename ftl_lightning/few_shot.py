@@ -154,7 +154,7 @@ class FewShot(Shown):
         """
         return Composition(self.model.concept(text)[None, None], torch.ones(1, device=self.device), space=self._space)
 
-    def library(self, folders: Sequence[str | Path] = ()) -> Library:
+    def library(self, *folders: str | Path) -> Library:
         """The concepts of this model by name: training concepts, learned ones in its own folder, and saved ones.
 
         Args:
@@ -163,6 +163,8 @@ class FewShot(Shown):
         Raises:
             UserError: for a folder that is none.
         """
+        for folder in folders:
+            expect_path("folder", folder, "a folder of learned concepts")
         return library(self.model.hash, self.training_concepts, self.folder, folders)
 
     def load(self, path: str | Path) -> LearnedConcept:
@@ -174,7 +176,7 @@ class FewShot(Shown):
         Raises:
             UserError: naming the file, if it is none or belongs to another model.
         """
-        expect_path("path", path, "the file or folder of a learned concept, or 'owner/name' on the Hub")
+        expect_path("path", path, "the file of a learned concept, its folder or 'owner/name' on the Hub")
         name, file = str(path), Path(path)
         if not os.path.lexists(file) and is_repository(name) and not name.endswith(".safetensors"):
             file = download(name, CONCEPT_FILES, "a concept's file, its folder or one on the Hub")

@@ -299,7 +299,10 @@ WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
     ),
     "no text of a concept": (lambda of: of.agent[3], "concept 3: expected a training concept"),
     "no text to compose": (lambda of: of.agent.compose(3), "compose: expected a text, such as 'go to red object"),
-    "no file of a concept": (lambda of: of.agent.load(3), "path: expected the file of a learned concept, found 3"),
+    "no file of a concept": (
+        lambda of: of.agent.load(3),
+        "path: expected the file of a learned concept, its folder or 'owner/name' on the Hub, found 3",
+    ),
     "True for a count": (lambda of: of.scenes.learn(of.five, adapter=True), "learn: adapter: expected a whole number, found True"),
     "a setting of another name": (
         lambda of: of.scenes.learn(of.five, lr=3),
@@ -339,6 +342,12 @@ WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
         lambda of: of.scenes.sample(of.scenes[SCENE], temperature="warm"),
         "temperature: expected a number, found 'warm'",
     ),
+    "a folder that is none": (
+        lambda of: of.scenes.library("nowhere"),
+        "folder: expected a folder of learned concepts, found nothing",
+    ),
+    "a folder that is a number": (lambda of: of.scenes.library(3), "folder: expected a folder of learned concepts, found 3"),
+    "no name to upload to": (lambda of: of.learned.push_to_hub(3), "repository: expected a name on the Hub, such as 'owner/name'"),
     "no plans": (lambda of: of.scenes.sample(of.scenes[SCENE], count=0), "count: expected 1 or more, found 0"),
     "half a plan": (lambda of: of.scenes.sample(of.scenes[SCENE], 0.5), "count: expected a whole number, 1 or more, found 0.5"),
     "no batch": (lambda of: of.scenes.sample(of.scenes[SCENE], batch_size=0), "batch_size: expected 1 or more, found 0"),

@@ -117,9 +117,9 @@ def test_training_concepts_go_first_and_names_are_exact(scenes: FewShot, learned
     assert told.match(expected)
     learned.save("mine.safetensors")
     learned.save("yours.safetensors")
-    assert scenes.library(["."]).nearest("yors")[0] == "yours"  # names of several are told by their files
+    assert scenes.library(".").nearest("yors")[0] == "yours"  # names of several are told by their files
     with pytest.raises(UserError, match=r"expected one, found mine\.safetensors and yours\.safetensors; give one of these files"):
-        scenes.library(["."]).learned_as(NEW)
+        scenes.library(".").learned_as(NEW)
 
 
 def test_names_with_one_file_name_are_kept_apart_and_inside(scenes: FewShot, learned: LearnedConcept) -> None:
@@ -406,4 +406,4 @@ def test_nothing_else_in_a_folder_is_read_or_run(scenes: FewShot, learned: Learn
     scenes.load("shared")
     assert not {"concept", "modeling", "sitecustomize"} & (set(sys.modules) - before)
     assert not Path("ran").exists()
-    assert [entry.name for entry in scenes.library(["."]).learned] == [NEW]
+    assert [entry.name for entry in scenes.library(".").learned] == [NEW]
