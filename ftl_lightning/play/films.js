@@ -1,5 +1,6 @@
 // All films of the page share one clock: a bar at the bottom plays, stops and scrubs them; a click on one makes it large.
 const PAUSE = 1.5; // seconds that films rest at their end
+const FIRST = 20; // films out of sight that are drawn for the first time in a picture
 const PER_SECOND = 30; // pictures: more would take time from learning, which runs on the same machine
 const films = new Set();
 const player = { clock: 0, length: 0, playing: true, resting: false, changed: true, last: 0, shown: 0, large: null };
@@ -8,11 +9,11 @@ const near = new IntersectionObserver((changes) => {
   for (const change of changes) if (change.target.film) change.target.film.near = change.isIntersecting;
 }, { rootMargin: "120px" });
 
-// A canvas for a film, that is drawn as long as it is near the part of the page in sight. Several films lie on each other.
+// A canvas for a film, which moves as long as it is near the part of the page in sight. Several films lie on each other.
 function addCanvas() {
   const canvas = made("canvas", { width: 10, height: 10 });
   canvas.setAttribute("role", "img");
-  const one = { canvas, films: [], view: null, near: true, key: "" };
+  const one = { canvas, films: [], view: null, near: null, key: "" };
   canvas.film = one;
   films.add(one);
   near.observe(canvas);
@@ -110,8 +111,10 @@ function measure() {
 
 function paint() {
   if (player.changed) measure();
+  let first = FIRST;
   for (const one of films) {
-    if (!one.films.length || (!one.near && one !== player.large) || !one.canvas.isConnected) continue;
+    if (!one.films.length || !one.canvas.isConnected) continue;
+    if (one.near === false && one !== player.large && (one.key || --first < 0)) continue;
     const until = Math.max(...one.films.map(seconds)), at = Math.min(player.clock, until);
     const key = `${at} ${one.canvas.clientWidth} ${looking.turned}`;
     if (key === one.key) continue;

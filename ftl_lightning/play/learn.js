@@ -134,8 +134,11 @@ function lossTold(line) {
 function lossCurve(steps) {
   const wide = 300, tall = 70, most = Math.max(...learning.losses.map((one) => one[1])) || 1;
   const line = (losses) => losses.map(([step, loss]) => `${(step / steps * wide).toFixed(1)},${(tall - 4 - loss / most * (tall - 8)).toFixed(1)}`).join(" ");
-  let mean = learning.losses[0][1];
-  const smoothed = learning.losses.map(([step, loss]) => [step, mean += 0.15 * (loss - mean)]);
+  const beside = Math.floor(learning.losses.length / 20);
+  const smoothed = learning.losses.map(([step], at, all) => {
+    const some = all.slice(Math.max(0, at - beside), at + beside + 1);
+    return [step, some.reduce((sum, one) => sum + one[1], 0) / some.length];
+  });
   find("loss-each").setAttribute("points", line(learning.losses));
   find("loss-mean").setAttribute("points", line(smoothed));
 }

@@ -32,7 +32,7 @@ function card(concept) {
 
 function about(concept) {
   const parts = [];
-  if (concept.count) parts.push(many(concept.count, "demonstration"));
+  if (concept.count) parts.push(`from ${concept.count}`);
   if (concept.accuracy !== null && concept.accuracy !== undefined) parts.push(`accuracy ${concept.accuracy.toFixed(2)}`);
   if (concept.form) parts.push(concept.form);
   return parts.join(", ");

@@ -34,7 +34,7 @@ function reach(film) {
 // The square that bodies within such a reach are seen in, from wherever they are looked at.
 function roomAround(films) {
   const radius = Math.max(...films.map((film) => reach(film)[0])), height = Math.max(...films.map((film) => reach(film)[1]));
-  return { radius, height, side: 1.06 * Math.max(2 * radius, height + 0.5 * radius) };
+  return { radius, height, side: 1.06 * Math.max(2 * radius, Math.hypot(height, radius)) };
 }
 
 function drawBody(canvas, film, seconds, room, how = {}) {
@@ -42,7 +42,8 @@ function drawBody(canvas, film, seconds, room, how = {}) {
   const pen = canvas.getContext("2d"), scale = across / room.side, space = film.space;
   const at = points(space), size = 3 * space.count, frame = Math.min(seconds * film.rate, film.frames - 1);
   const before = Math.floor(frame), after = Math.min(before + 1, film.frames - 1), part = frame - before;
-  const middle = down / 2 + scale * room.height * Math.cos(looking.above) / 2;
+  const front = room.radius * Math.sin(looking.above), top = Math.max(room.height * Math.cos(looking.above), front);
+  const middle = down / 2 + scale * (top - front) / 2; // of the floor, so that all is in the middle of the picture
   const pixel = ([right, up]) => [across / 2 + right * scale, middle - up * scale];
   const body = [], shade = [];
   for (let point = 0; point < space.count; point++) {

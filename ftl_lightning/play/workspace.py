@@ -2,7 +2,7 @@
 
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -22,6 +22,7 @@ from ftl_lightning.play.films import Json, films
 from ftl_lightning.play.mixing import Mixture, goal_of, judged, samples, sampling_of, starts_of
 from ftl_lightning.play.same import VARIABLES, Learned, Part, Sampled, command, python
 from ftl_lightning.tensor_file import kind_of
+from ftl_lightning.tuned import OWN
 
 SHOWN, SHOWN_FIRST = 8, 4
 """Samples that are shown of a learned concept, and while it is learned."""
@@ -30,7 +31,10 @@ FIRST, EVERY, SHARE = 0.2, 0.5, 3.0
 showing takes is learned before the next one.
 """
 TOLERANCE = 0.03
-"""Of learning quickly, where the settings name none."""
+"""Of learning quickly, where the settings of a domain name none."""
+QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
+QUICK_STEPS = 250
+"""Of learning quickly from a user's own data; chosen on strokes, see docs/experiments-own-data.md."""
 
 Tell = Callable[[Json], None]
 
@@ -247,8 +251,9 @@ class Workspace:
             Stopped: if nobody waits.
         """
         name = " ".join(asked.name.split())
-        own, begin, steps = self._shown.together(name), monotonic(), self._model.tuned.learning_steps
-        changes, due = self._settings(asked.quick), begin + FIRST
+        own, begin = self._shown.together(name), monotonic()
+        changes, steps = self._settings(asked.quick)
+        due = begin + FIRST
 
         def watch(now: Learning) -> None:
             nonlocal due
@@ -261,10 +266,10 @@ class Workspace:
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what they tell stands beside the demonstrations
-            concept = self._model.learn(own, name=name, watch=watch, **changes)
+            concept = self._model.learn(own, name=name, steps=steps, watch=watch, **changes)
         seconds = monotonic() - begin
         self._count += 1
-        key, how = f"l{self._count}", Learned(self._unused(name), changes)
+        key, how = f"l{self._count}", Learned(self._unused(name), changes, None if steps == self._model.tuned.learning_steps else steps)
         known = Known(name, "learned", concept, concept.concept, learned=how, demonstrations=own)
         shown, right = self._samples(concept, GENERATED)
         quality: Json = {"line": right, "numbers": {}}
@@ -285,12 +290,14 @@ class Workspace:
             found, number = f"{name} {number}", number + 1
         return found
 
-    def _settings(self, quick: bool) -> dict[str, Any]:
-        """What differs from the tuned settings: where a person waits, a single set of embeddings that stops when little changes."""
-        tuned = self._model.tuned.inversion
+    def _settings(self, quick: bool) -> tuple[dict[str, Any], int]:
+        """What differs from the tuned settings, and steps: where a person waits, a single set of embeddings, learned quickly."""
+        tuned, steps = self._model.tuned.inversion, self._model.tuned.learning_steps
         if not quick or tuned.modes.sets != 1 or tuned.adapter.rank:
-            return {}
-        return {"form": PAPER} | ({} if tuned.budget.tolerance is not None else {"tolerance": TOLERANCE})
+            return {}, steps
+        if self._model.settings == OWN:
+            return dict(QUICK), QUICK_STEPS
+        return {"form": PAPER} | ({} if tuned.budget.tolerance is not None else {"tolerance": TOLERANCE}), steps
 
     # Samples.
 

@@ -5,7 +5,7 @@ import gzip
 import json
 import re
 import shutil
-import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,6 @@ from ftl_lightning.evaluation.films import packed
 from ftl_lightning.play.page import page, request_key
 from ftl_lightning.testing.strokes import strokes
 
-BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
-QUIET = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-QUIET += ["--disable-component-update", "--disable-sync", "--enable-logging=stderr", "--virtual-time-budget=8000", "--dump-dom"]
 NONCE = "abc123"
 WEIGHTS = [0, 0.5, 1, 1.5]
 TEMPERATURE = 0.5
@@ -93,35 +90,53 @@ def packed_page(answers: Json) -> str:
     return page(NONCE, gzip.compress(json.dumps(answers).encode(), mtime=0))
 
 
-def in_browser(text: str, folder: Path, script: str, width: int = 1280) -> Json:
-    """What a script tells that runs in the page 1.5 s after its beginning, and where the page goes wrong."""
-    ask = f"""<script nonce="{NONCE}">{{
-    const told = {{ errors: [] }};
-    addEventListener("error", (event) => told.errors.push(String(event.message)));
-    addEventListener("unhandledrejection", (event) => told.errors.push(String(event.reason)));
-    const pause = (time) => new Promise((done) => setTimeout(done, time));
-    const texts = (where) => [...document.querySelectorAll(where)].map((one) => one.textContent);
-    const pictures = (where) => [...document.querySelectorAll(where)].map((one) => one.toDataURL()).join();
-    const put = (where, value) => {{ where.value = value; where.dispatchEvent(new Event("input")); }};
-    setTimeout(async () => {{
-      {script}
-      told.wide = document.documentElement.scrollWidth - innerWidth;
-      told.loaded = performance.getEntriesByType("resource").map((one) => one.name);
-      told.told = find("error-text").textContent;
-      document.body.dataset.answer = JSON.stringify(told);
-    }}, 1500);
-    }}</script>"""
-    asking = folder / "asking.html"
-    asking.write_text(text.replace("</body>", f"{ask}</body>"))
-    command = [str(BROWSER), *QUIET, f"--user-data-dir={folder / 'browser'}", f"--window-size={width},900", asking.as_uri()]
-    ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert "CONSOLE" not in ran.stderr, ran.stderr
-    found = re.search(r'data-answer="([^"]*)"', ran.stdout)
-    assert found, ran.stdout[-2000:]
-    told: Json = json.loads(found[1].replace("&quot;", '"').replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
-    assert told["errors"] == []
-    assert told["wide"] <= 0
-    assert [name for name in told["loaded"] if not name.startswith("data:")] == []
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    program, driver = (shutil.which("chromium") or shutil.which("google-chrome")), shutil.which("chromedriver")
+    if program is None or driver is None:
+        pytest.skip("no chromium with chromedriver is installed, so that the page is not tested in a browser")
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"):
+        options.add_argument(argument)
+    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('profile')}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    found = webdriver.Chrome(options=options, service=Service(driver))
+    yield found
+    found.quit()
+
+
+HELP = """
+const done = arguments[0], told = {};
+const pause = (time) => new Promise((then) => setTimeout(then, time));
+const until = async (what) => { for (let waited = 0; waited < 200 && !what(); waited++) await pause(25); };
+const texts = (where) => [...document.querySelectorAll(where)].map((one) => one.textContent);
+const pictures = (where) => [...document.querySelectorAll(where)].map((one) => one.toDataURL()).join();
+const put = (where, value) => { where.value = value; where.dispatchEvent(new Event("input")); };
+"""
+
+
+def asked(browser: Any, text: str, folder: Path, script: str, width: int = 1280) -> Json:
+    """What a script tells of a page, which is as wide as its window, loads nothing and has no mistakes."""
+    path = folder / "page.html"
+    path.write_text(text, encoding="utf-8")
+    metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    browser.get(path.as_uri())
+    whole = f"(async () => {{ await until(() => document.body.dataset.ready); {script} }})()"
+    run = f"{HELP} {whole}.then(() => done(told), (error) => done(String(error)));"
+    told = browser.execute_async_script(run)
+    assert isinstance(told, dict), told
+    assert browser.execute_script("return document.documentElement.scrollWidth - innerWidth") <= 0
+    assert (
+        browser.execute_script("return performance.getEntriesByType('resource').filter((one) => !one.name.startsWith('data:'))")
+        == []
+    )
+    assert browser.get_log("browser") == []
+    told["error"] = browser.execute_script("return find('error-text').textContent")
     return told
 
 
@@ -147,10 +162,10 @@ def test_the_name_of_a_request_is_that_of_the_page() -> None:
     )
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_page_made_before_shows_samples_of_pairs(tmp_path: Path, width: int) -> None:
+def test_a_page_made_before_shows_samples_of_pairs(browser: Any, tmp_path: Path, width: int) -> None:
     script = """
+      await until(() => document.body.dataset.samples);
       told.samples = Number(document.body.dataset.samples);
       told.ready = Number(document.body.dataset.ready);
       told.hidden = ["canvas", "learning", "ways", "sampling"].filter((id) => !find(id).offsetParent);
@@ -159,10 +174,11 @@ def test_a_page_made_before_shows_samples_of_pairs(tmp_path: Path, width: int) -
       told.mix = texts("#mix .name");
       told.marks = texts("#mixed .mark");
       find("mixed").scrollIntoView();  // films are drawn where they are in sight
-      await pause(300);
-      const before = pictures("#mixed canvas"), canvas = document.querySelector("#mixed canvas");
+      const canvas = document.querySelector("#mixed canvas");
+      await until(() => canvas.film.near && document.body.dataset.samples);
+      const before = pictures("#mixed canvas");
       put(document.querySelector("#mix input"), 1.3);
-      await pause(300);
+      await until(() => document.body.dataset.samples > told.samples);
       told.weights = texts("#mix output");
       told.said = find("told").textContent;
       told.python = find("python").textContent;
@@ -175,13 +191,14 @@ def test_a_page_made_before_shows_samples_of_pairs(tmp_path: Path, width: int) -
       told.moved = pictures("#mixed canvas") !== early;
       told.playing = player.playing;
       told.alone = [...document.querySelectorAll("#concepts .pick")].map((one) => one.disabled);
+      if (innerWidth > 1000) await until(() => document.querySelectorAll("#concepts .filmed").length === 3);
       told.thumbnails = document.querySelectorAll("#concepts .filmed").length;
       document.querySelector("#mixed button").click();
       told.large = find("large").open;
       find("large-close").click();
     """
-    told = in_browser(packed_page(made_before()), tmp_path, script, width)
-    assert told["told"] == ""
+    told = asked(browser, packed_page(made_before()), tmp_path, script, width)
+    assert told["error"] == ""
     assert told["samples"] == 1
     assert told["ready"] > 0
     assert told["hidden"] == ["canvas", "learning", "ways", "sampling"]
@@ -203,17 +220,20 @@ def test_a_page_made_before_shows_samples_of_pairs(tmp_path: Path, width: int) -
     assert told["large"]
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-def test_a_request_that_has_no_answer_is_told_and_breaks_nothing(tmp_path: Path) -> None:
+def test_a_request_that_has_no_answer_is_told_and_breaks_nothing(browser: Any, tmp_path: Path) -> None:
     answers = made_before()
-    script = "put(document.querySelector('#mix input'), 0.5); await pause(300); told.films = texts('#mixed figure').length;"
-    told = in_browser(packed_page({name: one for name, one in answers.items() if '"weight":0.5' not in name}), tmp_path, script)
-    assert "no samples of this choice" in told["told"]
+    script = """
+      await until(() => document.body.dataset.samples);
+      put(document.querySelector("#mix input"), 0.5);
+      await until(() => !find("error").hidden);
+      told.films = texts("#mixed figure").length;
+    """
+    told = asked(browser, packed_page({name: one for name, one in answers.items() if '"weight":0.5' not in name}), tmp_path, script)
+    assert "no samples of this choice" in told["error"]
     assert told["films"] == 8
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(tmp_path: Path) -> None:
+def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(browser: Any, tmp_path: Path) -> None:
     hearts = [
         {"film": line(stroke), "label": str(number), "flags": ["It is short."]}
         for number, stroke in enumerate(strokes("heart", 3, 0))
@@ -231,6 +251,7 @@ def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(tmp_p
       told.over = document.querySelectorAll("#view-films canvas").length;
       find("view-over").click();
       put(find("time"), 500);
+      await until(() => document.querySelector("#view-films canvas").film.near);
       const button = [...document.querySelectorAll("#view-films button")].at(-1);
       const before = button.querySelector("canvas").toDataURL();
       button.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true, cancelable: true }));
@@ -241,8 +262,8 @@ def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(tmp_p
       told.one = concepts();
       told.left = films.size;
     """
-    told = in_browser(packed_page({"/api/state": state(viewer=viewer, offline=None)}), tmp_path, script)
-    assert told["told"] == ""
+    told = asked(browser, packed_page({"/api/state": state(viewer=viewer, offline=None)}), tmp_path, script)
+    assert told["error"] == ""
     assert not told["play"]
     assert told["concepts"] == ["heart, 3 films", "pole, 2 films"]
     assert told["flags"] == [f"⚠ {number}: It is short." for number in range(3)]
