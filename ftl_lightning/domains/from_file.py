@@ -8,6 +8,9 @@ Its training concepts are the texts, in the order in which they first appear. Pl
     demonstrations is: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
 ``nearest_demonstration: K``
     right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
+``nearest_shape: K``
+    right if most of the K demonstrations nearest in shape are of the goal: Euclidean distance of all states after place (the mean of
+    each column) and size (root mean square) are taken away. For behaviour that may be anywhere and of any size, such as pen strokes.
 ``end_point_within: R``
     right if the plan ends within R (Euclidean, in the file's units) of where a demonstration of the goal ends.
 ``dtw_within: R``
@@ -238,6 +241,28 @@ def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float
     return Metric(measure, identity=examples.hash)
 
 
+def _nearest_shape(examples: Demonstrations, horizon: int, number: float) -> Metric:
+    count = int(number)
+    if count < 1:
+        raise UserError(f"data.metrics.nearest_shape: expected 1 or more neighbours, found {number:g}")
+    times = torch.arange(horizon).clamp(max=examples.states.shape[1] - 1)
+    known = _shapes(examples.states[:, times])
+
+    def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        own = torch.zeros(len(examples), dtype=torch.bool)
+        own[_goal_rows(examples, goal)] = True
+        near = torch.cdist(_shapes(states), known).topk(min(count, len(examples)), largest=False).indices
+        return own[near].float().mean(dim=1) > 0.5
+
+    return Metric(measure, identity=examples.hash)
+
+
+def _shapes(states: Tensor) -> Tensor:
+    """Behaviour ``(n, time, state)`` without its place and size, ``(n, time * state)``."""
+    moved = states - states.mean(dim=1, keepdim=True)
+    return (moved / moved.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp(min=1e-9)).flatten(1)
+
+
 def _end_point_within(examples: Demonstrations, horizon: int, number: float) -> Metric:
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
         rows = _goal_rows(examples, goal)
@@ -264,6 +289,7 @@ def _dtw_to_demonstrations(examples: Demonstrations, horizon: int, number: float
 METRICS: dict[str, Callable[[Demonstrations, int, float], Metric]] = {
     "recognised": _recognised,
     "nearest_demonstration": _nearest_demonstration,
+    "nearest_shape": _nearest_shape,
     "end_point_within": _end_point_within,
     "dtw_within": _dtw_within,
     "dtw_to_demonstrations": _dtw_to_demonstrations,

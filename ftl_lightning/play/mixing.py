@@ -78,7 +78,7 @@ def judged(model: FewShot, plans: Demonstrations, goal: str) -> tuple[list[Json]
         measured = domain.measure(goal, plans.states, plans.initial_states)
         for name, right in measured.items():
             if right.dtype == torch.bool and right.dim():
-                return films(domain, plans, right.tolist()), f"{name} {float(right.float().mean()):.2f} ({goal})"
+                return films(domain, plans, right.tolist()), f"{name.replace('_', ' ')} {float(right.float().mean()):.2f} ({goal})"
     return films(domain, plans), ""
 
 

@@ -269,7 +269,10 @@ class Workspace:
             concept = self._model.learn(own, name=name, steps=steps, watch=watch, **changes)
         seconds = monotonic() - begin
         self._count += 1
-        key, how = f"l{self._count}", Learned(self._unused(name), changes, None if steps == self._model.tuned.learning_steps else steps)
+        key, how = (
+            f"l{self._count}",
+            Learned(self._unused(name), changes, None if steps == self._model.tuned.learning_steps else steps),
+        )
         known = Known(name, "learned", concept, concept.concept, learned=how, demonstrations=own)
         shown, right = self._samples(concept, GENERATED)
         quality: Json = {"line": right, "numbers": {}}

@@ -179,6 +179,18 @@ def test_most_of_the_nearest_demonstrations_decide() -> None:
         METRICS["nearest_demonstration"](known, TIME, 0)
 
 
+def test_a_shape_is_known_wherever_it_is_and_whatever_its_size() -> None:
+    time = np.linspace(0, 1, TIME)
+    bow, line = np.stack((time, time * (1 - time)), axis=-1), np.stack((time, time), axis=-1)
+    known = examples(bow=np.stack((bow, 2 * bow + 5)), line=np.stack((line, 3 * line - 1)))
+    plans = torch.from_numpy(np.stack((0.1 * bow - 40, 7 * line + 9))).float()
+    measure = METRICS["nearest_shape"](known, TIME, 1).measure
+    assert measure("bow", plans, None).tolist() == [True, False]
+    assert measure("line", plans, None).tolist() == [False, True]
+    with pytest.raises(UserError, match=r"data\.metrics\.nearest_shape: expected 1 or more neighbours, found 0"):
+        METRICS["nearest_shape"](known, TIME, 0)
+
+
 def test_columns_are_scaled_alike_where_neighbours_are_looked_for() -> None:
     # The second column is what tells the concepts apart, and a thousandth as large as the noise in the first.
     draw = np.random.default_rng(0)
