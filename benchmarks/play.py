@@ -47,9 +47,9 @@ def learn(page: Browser, server: Served, kind: str) -> tuple[dict[str, float], b
         page.drag(places)
         drawing = time.monotonic() - begin
         if number + 1 < SHOWN:
-            page.until(lambda count=number + 1: page.count("#slots canvas") == count)
+            until_count(page, number + 1)
     done = begin + drawing
-    page.until(lambda: int(page.data("samples") or 0) > seen)
+    until_samples(page, seen)
     first = time.monotonic() - done
     page.until(lambda: page.data("learning") == "yes")
     page.until(lambda: page.data("learning") == "no")
@@ -57,6 +57,16 @@ def learn(page: Browser, server: Served, kind: str) -> tuple[dict[str, float], b
     concept = [one for one in server.get("/api/state")["concepts"] if one["kind"] == "learned"][-1]
     content = server.ask("GET", f"/api/concept?id={concept['id']}")[1]
     return {"first samples": first, "learned": learned, "drawing": drawing}, content
+
+
+def until_count(page: Browser, count: int) -> None:
+    """Wait until so many demonstrations are there."""
+    page.until(lambda: page.count("#slots canvas") == count)
+
+
+def until_samples(page: Browser, seen: int) -> None:
+    """Wait until there are samples after so many sets of them."""
+    page.until(lambda: int(page.data("samples") or 0) > seen)
 
 
 def slide(page: Browser) -> list[float]:
@@ -70,7 +80,7 @@ def slide(page: Browser) -> list[float]:
         )
         begin = time.monotonic()
         page.js(f"{script.replace('arguments[0]', str(0.5 + 0.1 * move))}()")
-        page.until(lambda before=before: int(page.data("samples")) > before)
+        until_samples(page, before)
         found.append(time.monotonic() - begin)
     return found
 

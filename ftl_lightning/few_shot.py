@@ -458,3 +458,17 @@ class FewShot(Shown):
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder)
             return upload(folder, repository, private)
+
+    def publish(self, concept: LearnedConcept, repository: str, private: bool = False, demonstrations: bool = False) -> str:
+        """Upload a concept that was learned with this model, see :meth:`LearnedConcept.push_to_hub`; :meth:`load` takes its name.
+
+        Returns:
+            Where it is.
+
+        Raises:
+            UserError: for what is no learned concept of this model, a name that is none, or a place that cannot be written to.
+        """
+        self._own("publish", concept)
+        if not isinstance(concept, LearnedConcept):
+            raise UserError(f"publish: expected a learned concept, such as what model.learn returns, found {shown(concept)}")
+        return concept.push_to_hub(repository, private, demonstrations)

@@ -9,8 +9,8 @@ Its training concepts are the texts, in the order in which they first appear. Pl
 ``nearest_demonstration: K``
     right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
 ``nearest_shape: K``
-    right if most of the K demonstrations nearest in shape are of the goal: Euclidean distance of all states after place (the mean of
-    each column) and size (root mean square) are taken away. For behaviour that may be anywhere and of any size, such as pen strokes.
+    right if most of the K demonstrations nearest in shape are of the goal: by Euclidean distance after place (the mean of each
+    column) and size (root mean square) are taken away. For behaviour that may be anywhere and of any size, such as pen strokes.
 ``end_point_within: R``
     right if the plan ends within R (Euclidean, in the file's units) of where a demonstration of the goal ends.
 ``dtw_within: R``
