@@ -190,7 +190,7 @@ function setWays() {
   const { library, uploads } = state, known = state.concepts.filter((one) => one.kind === "training").map((one) => one.name);
   const first = library.tasks.find((task) => !known.includes(task)); // something new
   find("library").replaceChildren(...library.tasks.map((task) => made("option", { value: task, textContent: task, selected: task === first })));
-  find("library").disabled = find("draw").disabled = !library.tasks.length;
+  find("library").disabled = find("draw").disabled = find("drawing").hidden = !library.tasks.length;
   find("library-why").textContent = library.why;
   find("upload").accept = uploads.join(",");
   find("upload-kinds").textContent = uploads.join(", ");

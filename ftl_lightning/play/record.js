@@ -21,6 +21,7 @@ function reset() {
   const scene = recorder.scene;
   Object.assign(recorder, { at: scene.pieces.map((piece) => [...piece.at]), path: [], times: [], down: false, held: null, pointer: null, passed: 0 });
   if (recorder.kind !== "draw") recorder.shown = [];
+  find("canvas").classList.toggle("flat", scene.film.window[3] < 0.7 * scene.film.window[2]); // what is beside it goes below
   handles();
   told();
   redraw();

@@ -92,12 +92,12 @@ function drawBody(canvas, film, seconds, room, how = {}) {
   pen.globalAlpha = 1;
 }
 
-// What is in sight in all of some films of either kind: a square, unless all have the same window.
+// What is in sight in all of some films of either kind: their window if they have one in common, else what is no higher than wide.
 function viewOf(films) {
   if (films.some((film) => film.space)) return roomAround(films);
-  const [left, lower, width, height] = around(films), side = Math.max(width, height);
-  if (films.every((film) => film.window.every((edge, number) => edge === films[0].window[number]))) return films[0].window;
-  return [left + (width - side) / 2, lower + (height - side) / 2, side, side];
+  if (films.length > 1 && films.every((film) => film.window.every((edge, number) => edge === films[0].window[number]))) return films[0].window;
+  const [left, lower, width, height] = around(films), wide = Math.max(width, height), high = Math.max(height, 0.5 * width);
+  return [left + (width - wide) / 2, lower + (height - high) / 2, wide, high];
 }
 
 // The view that there was, if it does for other films too: samples that follow a slider keep their scale.
@@ -106,7 +106,7 @@ function steadyView(before, films) {
   if (!before || Array.isArray(before) !== Array.isArray(now)) return now;
   if (!Array.isArray(now)) return now.radius <= before.radius && now.height <= before.height && now.side > 0.6 * before.side ? before : now;
   const within = [0, 1].every((axis) => now[axis] >= before[axis] && now[axis] + now[axis + 2] <= before[axis] + before[axis + 2]);
-  return within && now[2] > 0.6 * before[2] ? before : now;
+  return within && now[2] > 0.6 * before[2] && now[3] > 0.6 * before[3] ? before : now;
 }
 
 const drawFilm = (canvas, film, at, view, how) => film.space ? drawBody(canvas, film, at, view, how) : draw(canvas, film, at, view, how);
