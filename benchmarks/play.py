@@ -121,6 +121,7 @@ def main() -> None:
         "seconds": round(time.monotonic() - begin, 1),
     }
     write_text(options.out, json.dumps(whole, indent=2) + "\n")
+    write_text(Path(options.out).with_suffix(".md"), _table(whole))
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, float]:
@@ -133,6 +134,21 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     for key in ("first samples", "learned", "slider"):
         found[f"{key}, seconds"] = round(statistics.median(row[key] for row in rows), 2)
     return found
+
+
+def _table(whole: dict[str, Any]) -> str:
+    """The same as Markdown."""
+    keys = ("first samples", "learned", "slider")
+    lines = ["| | recognised (least) | first samples | learned | slider |", "|---|---|---|---|---|"]
+    for name in ("validation", "test"):
+        if found := whole[name]:
+            rate = f"{found['recognised']:.2f} ± {found['standard error']:.2f} ({found['least']:.2f})"
+            cells = [f"{found[f'{key}, seconds']:.1f} s" for key in keys]
+            count = sum(kind in whole["kinds"] for kind in (VALIDATION if name == "validation" else TEST))
+            lines.append(f"| {count} {name} kinds | {rate} | {' | '.join(cells)} |")
+    opened = whole["seconds from the command to samples on the page"]
+    told = "Mean ± standard error over kinds; seconds are medians, from the end of the fifth stroke, and from the move of a slider to new"
+    return "\n".join(lines) + f"\n\n{told} samples. From the command to the first samples on the page: {opened:.1f} s.\n"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The verb ``play``: its options, and what it does. Its imports are inside, so that it starts at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ class PlayOptions:
         root: folder of your copy of recordings, for domains whose demonstrations do not ship.
         static: folder to write a page to that needs no program, in place of serving one: the demonstrations, what is learned from
             them, and samples for a grid of weights.
+        pairs: of concepts that such a page mixes, such as ["walk + jumping_jacks", "walk + run"]; empty for some.
         host: address to listen at. With "0.0.0.0" a phone in the same network can open the page, and everybody else there who
             knows its address.
         port: of the address; 0 for 8765, or any other if another program has that.
@@ -32,12 +33,19 @@ class PlayOptions:
     demonstrations: str = ""
     root: str = ""
     static: str = ""
+    pairs: list[str] = field(default_factory=list)
     host: str = "127.0.0.1"
     port: int = 0
     browser: bool = True
 
     def __post_init__(self) -> None:
+        from ftl_lightning.errors import UserError
+
         expect_range("port", self.port, 0, LARGEST_PORT)
+        if self.pairs and not self.static:
+            raise UserError("pairs: expected --static FOLDER beside it, found none")
+        if bad := [pair for pair in self.pairs if len(pair.split(" + ")) != 2]:
+            raise UserError(f"pairs: expected two concepts each, such as 'walk + run', found {bad[0]!r}")
 
 
 def play(options: PlayOptions) -> None:
@@ -59,14 +67,17 @@ def play(options: PlayOptions) -> None:
         return found
 
     if options.static:
-        _write_static(workspace(options.pretrained), Path(options.static) / f"{Path(options.pretrained).name}.html")
+        path = Path(options.static) / f"{Path(options.pretrained).name}.html"
+        _write_static(
+            workspace(options.pretrained), path, [(one, other) for one, other in (pair.split(" + ") for pair in options.pairs)]
+        )
         return
     desk = Desk(list(dict.fromkeys((options.pretrained, *shipped_models()))), workspace)
     place = Place(options.host, options.port, options.browser)
     serve(playing(desk), place, lambda: desk.work(desk.state), desk.ended.set)
 
 
-def _write_static(workspace: "Workspace", path: Path) -> None:
+def _write_static(workspace: "Workspace", path: Path, pairs: "list[tuple[str, str]]") -> None:
     from ftl_lightning.play.offline import PAIRS, WEIGHTS, write_offline
     from ftl_lightning.play.requests import Learn
     from ftl_lightning.printing import say
@@ -74,8 +85,8 @@ def _write_static(workspace: "Workspace", path: Path) -> None:
 
     if workspace.work()["demonstrations"]:
         workspace.learn(Learn(workspace.suggestion), lambda told: None, lambda: False)
-    with bar(f"{path.name}: mixes", PAIRS * len(WEIGHTS) ** 2) as advance:
-        size = write_offline(workspace, path, lambda: advance(1, ""))
+    with bar(f"{path.name}: mixes", (len(pairs) or PAIRS) * len(WEIGHTS) ** 2) as advance:
+        size = write_offline(workspace, path, pairs, lambda: advance(1, ""))
     say(f"{path}: {size / 1e6:.1f} MB")
 
 
