@@ -147,8 +147,9 @@ def _table(whole: dict[str, Any]) -> str:
             count = sum(kind in whole["kinds"] for kind in (VALIDATION if name == "validation" else TEST))
             lines.append(f"| {count} {name} kinds | {rate} | {' | '.join(cells)} |")
     opened = whole["seconds from the command to samples on the page"]
-    told = "Mean ± standard error over kinds; seconds are medians, from the end of the fifth stroke, and from the move of a slider to new"
-    return "\n".join(lines) + f"\n\n{told} samples. From the command to the first samples on the page: {opened:.1f} s.\n"
+    told = "Mean ± standard error over kinds. Seconds are medians: from the end of the fifth stroke, and from the move of a slider "
+    told += f"to new samples. From the command to the first samples on the page: {opened:.1f} s."
+    return "\n".join((*lines, "", told, ""))
 
 
 if __name__ == "__main__":

@@ -68,9 +68,8 @@ def play(options: PlayOptions) -> None:
 
     if options.static:
         path = Path(options.static) / f"{Path(options.pretrained).name}.html"
-        _write_static(
-            workspace(options.pretrained), path, [(one, other) for one, other in (pair.split(" + ") for pair in options.pairs)]
-        )
+        pairs = [(one, other) for one, other in (pair.split(" + ") for pair in options.pairs)]
+        _write_static(workspace(options.pretrained), path, pairs)
         return
     desk = Desk(list(dict.fromkeys((options.pretrained, *shipped_models()))), workspace)
     place = Place(options.host, options.port, options.browser)
