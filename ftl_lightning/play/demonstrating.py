@@ -5,11 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ftl_lightning.demonstrations.check import check
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, expect_path
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.demonstration_check import fit_findings
 from ftl_lightning.play import requests
 from ftl_lightning.play.films import Json, film, films
 
@@ -69,7 +71,9 @@ class Demonstrating:
         flags: dict[int, list[str]] = {}
         general: list[str] = []
         if self._own:
-            for finding in self._model.check(self.together("demonstrations")).warnings:
+            own = self.together("demonstrations")
+            found = (*check(own), *fit_findings(self._model.model, own))  # what the model knows of them takes longer
+            for finding in (one for one in found if one.severity != "note"):
                 for row in finding.rows:
                     flags.setdefault(row, []).append(finding.text)
                 general += [] if finding.rows else [finding.text]

@@ -1,7 +1,7 @@
 // All films of the page share one clock: a bar at the bottom plays, stops and scrubs them; a click on one makes it large.
 const PAUSE = 1.5; // seconds that films rest at their end
 const FIRST = 20; // films out of sight that are drawn for the first time in a picture
-const PER_SECOND = 30; // pictures: more would take time from learning, which runs on the same machine
+const PER_SECOND = 30, WHILE_LEARNING = 6; // pictures: more would take time from learning, which runs on the same machine
 const films = new Set();
 const player = { clock: 0, length: 0, playing: true, resting: false, changed: true, last: 0, shown: 0, large: null };
 
@@ -128,9 +128,10 @@ function paint() {
 
 function tick(now) {
   requestAnimationFrame(tick);
-  if (now - player.shown < 1000 / PER_SECOND - 2) return;
+  const often = document.body.dataset.learning === "yes" ? WHILE_LEARNING : PER_SECOND;
+  if (now - player.shown < 1000 / often - 2) return;
   player.shown = now;
-  const passed = Math.min((now - player.last) / 1000, 0.1) * Number(find("speed").value);
+  const passed = Math.min((now - player.last) / 1000, 0.2) * Number(find("speed").value);
   player.last = now;
   if (player.playing && player.length > 0.05) {
     player.clock += passed;

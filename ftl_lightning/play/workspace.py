@@ -30,6 +30,8 @@ FIRST, EVERY, SHARE = 0.2, 0.5, 3.0
 """Seconds of learning before its first samples are shown, and the least between two showings; and how many times as long as a
 showing takes is learned before the next one.
 """
+TOLD = 0.05
+"""Seconds between two losses that are told: each takes time from learning."""
 TOLERANCE = 0.03
 """Of learning quickly, where the settings of a domain name none."""
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
@@ -253,14 +255,16 @@ class Workspace:
         name = " ".join(asked.name.split())
         own, begin = self._shown.together(name), monotonic()
         changes, steps = self._settings(asked.quick)
-        due = begin + FIRST
+        due, told_at = begin + FIRST, begin
 
         def watch(now: Learning) -> None:
-            nonlocal due
+            nonlocal due, told_at
             if stopped():
                 raise Stopped
-            tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
-            if (shown := monotonic()) >= due:
+            if (shown := monotonic()) >= told_at + TOLD or now.step in (1, steps):
+                tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
+                told_at = shown
+            if shown >= due:
                 tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST)[0]})
                 due = monotonic() + max(EVERY, SHARE * (monotonic() - shown))
 

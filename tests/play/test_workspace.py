@@ -38,7 +38,8 @@ def learned(workspace: Workspace, name: str = TASK, count: int = 5) -> tuple[Jso
 def test_learning_tells_loss_and_samples_as_it_goes(workspace: Workspace) -> None:
     last, told = learned(workspace)
     steps = [line["step"] for line in told if "loss" in line]
-    assert steps == list(range(1, len(steps) + 1))
+    assert steps == sorted(set(steps))
+    assert steps[0] == 1
     assert any("samples" in line and "done" not in line for line in told)
     assert last["done"]
     assert len(last["samples"]) == 8
