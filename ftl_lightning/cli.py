@@ -40,6 +40,8 @@ COMMANDS = {
 }
 POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study", "view"}
 """Commands whose required arguments are given by position."""
+FIRST = {"play": "pretrained"}
+"""Commands with an option that may also be given by position, at the front."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
 REPEATED = {"concepts": "folder"}
@@ -99,6 +101,8 @@ def _interrupted() -> int:
 
 def _dispatch(arguments: list[str]) -> None:
     verb = arguments[0] if arguments else "--help"
+    if verb in FIRST and len(arguments) > 1 and not arguments[1].startswith("-"):
+        arguments = [verb, f"--{FIRST[verb]}={arguments[1]}", *arguments[2:]]
     if verb in ("-h", "--help"):
         say(_overview())
     elif verb == "--version":

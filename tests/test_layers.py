@@ -16,6 +16,7 @@ LAYERS = (
     ("evaluation",),
     ("reporting", "study"),
     ("few_shot", "trainer", "training_bar"),
+    ("play",),
     ("lightning_cli",),
     ("ablation",),
     ("commands",),

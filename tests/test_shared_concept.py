@@ -247,7 +247,7 @@ def test_names_of_strangers_mean_nothing_in_a_card(learned: LearnedConcept, name
 # The Hub
 
 
-def test_a_concept_is_uploaded(learned: LearnedConcept, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_concept_is_uploaded(scenes: FewShot, learned: LearnedConcept, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[object] = []
 
     class Hub:
@@ -264,6 +264,10 @@ def test_a_concept_is_uploaded(learned: LearnedConcept, monkeypatch: pytest.Monk
     learned.push_to_hub(PLACE, private=True, demonstrations=True)
     assert calls[2] == (PLACE, True, True)
     assert "demonstrations.safetensors" in calls[3][1]  # type: ignore[index]
+
+    assert scenes.publish(learned, PLACE) == f"https://hub/{PLACE}"
+    with pytest.raises(UserError, match=r"^publish: expected a learned concept"):
+        scenes.publish(scenes["circle above square"], PLACE)  # type: ignore[arg-type]
 
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError("401\nlong story")

@@ -11,7 +11,7 @@ from tests.play.served import Served, served
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """The page of object rearrangement, whose model ships."""
-    with served(tmp_path_factory.mktemp("played"), ["--pretrained", "object_rearrangement"]) as found:
+    with served(tmp_path_factory.mktemp("played"), ["object_rearrangement"]) as found:
         yield found
 
 
