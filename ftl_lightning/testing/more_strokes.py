@@ -113,6 +113,8 @@ _GOES_ON |= {"pentagon", "infinity"}
 """Closed strokes, which may begin a little early or late and end before or beyond where they began."""
 KNOWN = (*TRAINING, *_OPEN, *_CLOSED)
 """Kinds of pretraining."""
+MIRRORED, BACKWARDS = "mirrored ", "backwards "
+"""Before the name of a kind, which is drawn from the right to the left then, or from the end to the start."""
 VALIDATION = (*NEW, *_VALIDATION)
 """New kinds that the model was chosen by: those of :data:`ftl_lightning.testing.strokes.NEW`, and six more."""
 TEST = tuple(_TEST)
@@ -139,7 +141,8 @@ def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.fl
     """Strokes of one kind as a hand draws them.
 
     Args:
-        kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, or :data:`RANDOM`.
+        kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, also :data:`MIRRORED` or :data:`BACKWARDS`; or
+            :data:`RANDOM`.
         count: how many.
         seed: decides them; the same on every machine up to rounding.
         alike: 0 for strokes of many people, all over the canvas; up to 1 for those of one who draws the same at the same place,
@@ -149,6 +152,7 @@ def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.fl
         ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
     """
     rng = np.random.default_rng([seed, task_key(kind)])
+    plain = kind.removeprefix(MIRRORED).removeprefix(BACKWARDS)
     free = 1 - alike
     person = rng.uniform(-1, 1, 6) * alike  # what all strokes of one who draws alike have in common
 
@@ -158,10 +162,14 @@ def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.fl
     even = np.linspace(0, 1, STEPS)
     pace = rng.uniform(-0.4, 0.4, (count, 1)) * np.sin(np.pi * even) * np.cos(np.pi * even) / np.pi
     done = even + pace
-    if kind in _GOES_ON:
+    if kind.startswith(BACKWARDS):
+        done = 1 - done
+    if plain in _GOES_ON:
         begin, beyond = rng.uniform(-0.02, 0.02, (count, 1)), rng.uniform(-0.04, 0.03, (count, 1))
         done = (begin + done * (1 + beyond)) % 1
-    points = _random(done, rng) if kind == RANDOM else _EVERY[kind](done)
+    points = _random(done, rng) if kind == RANDOM else _EVERY[plain](done)
+    if kind.startswith(MIRRORED):
+        points = points * (-1, 1)
     rounded = points.copy()
     rounded[:, 1:-1] = (points[:, :-2] + points[:, 1:-1] + points[:, 2:]) / 3
     points = points + rng.uniform(0, 1, (count, 1, 1)) * (rounded - points)
