@@ -54,7 +54,7 @@ def pretrain(folder: Path, seed: int) -> None:
     parts = {kind: drawn(kind, count, seed) for kind, count in (counts | {RANDOM: RANDOMS}).items()}
     options = ["--data.demonstrations=strokes.npz", "--data.encoder=hashing", f"--trainer.max_steps={STEPS}"]
     options += [f"--model.denoiser_args={DENOISER}", f"--seed_everything={seed}"]
-    options += ["--trainer.limit_val_batches=0", "--trainer.accelerator=cpu"]
+    options += ["--data.metrics={nearest_shape: 1, recognised: 0.98}", "--trainer.limit_val_batches=0", "--trainer.accelerator=cpu"]
     with tempfile.TemporaryDirectory() as place:
         with chdir(place):
             np.savez(
