@@ -6,7 +6,7 @@ import pytest
 
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.quality import Quality
-from ftl_lightning.testing.more_strokes import KNOWN, RANDOM, TEST, VALIDATION, Judge, drawn
+from ftl_lightning.testing.more_strokes import BACKWARDS, KNOWN, MIRRORED, RANDOM, TEST, VALIDATION, Judge, drawn
 from ftl_lightning.testing.strokes import STEPS
 
 CARD = Path(__file__).parents[2] / "pretrained" / "strokes" / "README.md"
@@ -22,10 +22,11 @@ def model() -> FewShot:
     return FewShot.from_pretrained("strokes")
 
 
-def test_no_new_kind_is_one_of_pretraining() -> None:
+def test_no_new_kind_is_one_of_pretraining(model: FewShot) -> None:
     every = (*KNOWN, *VALIDATION, *TEST)
     assert len(set(every)) == len(every)
-    assert set(KNOWN) | {RANDOM} >= set(FewShot.from_pretrained("strokes").training_concepts)
+    plain = {text.removeprefix(MIRRORED).removeprefix(BACKWARDS) for text in model.training_concepts}
+    assert plain == {*KNOWN, RANDOM}
 
 
 @pytest.mark.parametrize("kind", [*KNOWN, *VALIDATION, *TEST])
@@ -41,6 +42,12 @@ def test_fresh_strokes_are_recognised_and_differ_from_each_other(judge: Judge, k
 def test_one_hand_draws_more_alike_than_many() -> None:
     many, one = drawn("heart", 100, 0), drawn("heart", 100, 0, alike=0.8)
     assert one.std(axis=0).mean() < 0.5 * many.std(axis=0).mean()
+
+
+def test_mirrored_and_backwards_strokes_are_not_taken_for_the_kind_itself(judge: Judge) -> None:
+    assert judge.rate(drawn(MIRRORED + "letter L", 50, 0), "letter L") == 0
+    back, forth = drawn(BACKWARDS + "letter L", 200, 0).mean(axis=0), drawn("letter L", 200, 0).mean(axis=0)
+    assert np.abs(back[::-1] - forth).max() < 0.5 < np.abs(back - forth).max()
 
 
 def test_noise_is_no_kind_rather_than_another(judge: Judge) -> None:
