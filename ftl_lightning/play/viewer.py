@@ -65,7 +65,8 @@ def viewed(file: str, model: str = "") -> dict[str, Any]:
 
 
 def _state(title: str, told: list[str], groups: list[Json]) -> dict[str, Any]:
-    return {"title": title, "viewer": {"title": title, "told": told, "groups": groups}, "offline": None}
+    shown = {"title": title, "told": told, "groups": groups}
+    return {"title": title, "model": {"name": "", "title": "", "hash": ""}, "models": [], "viewer": shown, "offline": None}
 
 
 def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:
