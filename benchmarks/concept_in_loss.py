@@ -38,7 +38,9 @@ def losses(model: ConceptModel, shown: Demonstrations, t: int) -> dict[str, floa
         states, observed = own.windows(torch.arange(count), torch.zeros(count, dtype=torch.int64), model.window)
         draws = model.draws(count, 1.0, generator("cpu", t))
         assert draws is not None
-        draws = Draws(torch.full_like(draws.t, t), draws.noise)
+        device = model.empty.device
+        draws = Draws(torch.full_like(draws.t, t).to(device), draws.noise.to(device))
+        states, observed = states.to(device), {name: value.to(device) for name, value in observed.items()}
         each = {
             name: model.losses(states, observed, together(concept), draws, "epsilon")[0]
             for name, concept in zip(("none", *texts), (model.empty, *model.training_embeddings), strict=True)
@@ -55,9 +57,11 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=50, help="demonstrations of each training concept")
     parser.add_argument("--split", choices=("train", "validation"), default="validation", help="train: those it has seen")
     parser.add_argument("--timesteps", type=int, nargs="+", default=TIMESTEPS)
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda for a large model")
     parser.add_argument("--out", help="JSON file")
     options = parser.parse_args()
     few = FewShot.from_pretrained(options.pretrained)
+    few.model.to(options.device)
     shown = few.domain.source(None).split(options.split, options.count, 0)
     found = {t: losses(few.model, shown, t) for t in options.timesteps}
     for t, told in found.items():

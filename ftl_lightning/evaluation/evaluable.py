@@ -1,7 +1,7 @@
 """What an evaluated module offers."""
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard
 
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.point import Point
@@ -11,7 +11,6 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.concept_model import ConceptModel
 
 
-@runtime_checkable
 class Evaluable(Protocol):
     """The model, names of the method, of its form, of its variant and of learned concepts, and the points of concept space."""
 
@@ -38,6 +37,15 @@ class Evaluable(Protocol):
     def demonstrated(self, concept: str) -> Demonstrations | None: ...
 
     def concept_points(self) -> list[Point]: ...
+
+
+def is_evaluable(module: object) -> TypeGuard[Evaluable]:
+    """Whether a module offers all of that.
+
+    Not by ``isinstance``: from Python 3.12 on it looks past ``__getattr__``, by which a module gives its submodules, the model too.
+    """
+    members = (*Evaluable.__annotations__, *(name for name in vars(Evaluable) if not name.startswith("_")))
+    return all(hasattr(module, name) for name in members)
 
 
 def demonstrations_of(task: EvaluationTask, demonstrated: Callable[[str], Demonstrations | None]) -> Demonstrations | None:

@@ -16,7 +16,7 @@ from ftl_lightning.errors import UserError, short
 from ftl_lightning.evaluation.chosen import chosen
 from ftl_lightning.evaluation.diversity import lines, real_behaviour
 from ftl_lightning.evaluation.drawing import draw
-from ftl_lightning.evaluation.evaluable import Evaluable
+from ftl_lightning.evaluation.evaluable import Evaluable, is_evaluable
 from ftl_lightning.evaluation.films import write_films
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged
@@ -186,7 +186,7 @@ def _evaluable(module: pl.LightningModule) -> Evaluable:
     Raises:
         UserError: for one that generates no behaviour.
     """
-    if not isinstance(module, Evaluable):
+    if not is_evaluable(module):
         raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(module).__name__}")
     return module
 

@@ -154,9 +154,9 @@ def latest(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.drop_duplicates(_SUBJECT, keep="last")
 
 
-COMPARISON, CURVES, CHANGES = "comparison", "curves", "changes"
+COMPARISON, CURVES, CHANGES, PAPER_SIZE = "comparison", "curves", "changes", "paper_size"
 """Names of results files that are shown apart from ablations: all methods; numbers of demonstrations and components; ours with one
-of its changes to the paper's form taken away at a time."""
+of its changes to the paper's form taken away at a time; models of the paper's size, which have no table of their own."""
 
 
 def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
@@ -167,7 +167,7 @@ def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
     """
     path = Path(path)
     files = _files(path) if path.is_dir() else [path]
-    named = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES))]
+    named = [file for file in files if (file.stem == name if name else file.stem not in (COMPARISON, CURVES, CHANGES, PAPER_SIZE))]
     return pd.concat([read_rows(file) for file in named], ignore_index=True) if named else pd.DataFrame(columns=COLUMNS)
 
 

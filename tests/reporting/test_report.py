@@ -192,6 +192,13 @@ def test_what_a_killed_process_left_is_no_result(tmp_path: Path) -> None:
     assert len(read_rows(tmp_path)) == len(read_study(tmp_path)) == 1
 
 
+def test_models_of_the_papers_size_stand_apart_from_ablations(tmp_path: Path) -> None:
+    append_rows(tmp_path / "r.csv", [row("new concept", "one", 1.0)])
+    append_rows(tmp_path / "paper_size.csv", [row("new concept", "one", 0.5)])
+    assert read_study(tmp_path)["value"].tolist() == [1.0]
+    assert read_study(tmp_path, "paper_size")["value"].tolist() == [0.5]
+
+
 def test_a_missing_file_to_update_is_told_before_anything_is_written(capsys: pytest.CaptureFixture[str], results: Path) -> None:
     assert main(["report", f"--results={results}", "--out=report", "--readme=missing.md"]) == 2
     assert capsys.readouterr().err == "error: missing.md: expected a Markdown file, found nothing\n"
