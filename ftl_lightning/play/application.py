@@ -208,6 +208,11 @@ def playing(desk: Desk) -> list[Route]:
         await desk.work(lambda workspace: workspace.forget(asked))
         return JSONResponse(await desk.work(desk.state))
 
+    async def rename(request: Request) -> Response:
+        asked = built(requests.Renamed, await _asked(request), "")
+        await desk.work(lambda workspace: workspace.rename(asked))
+        return JSONResponse(await desk.work(desk.state))
+
     async def learn(request: Request) -> Response:
         asked = built(requests.Learn, await _asked(request), "")
         return StreamingResponse(_learned(desk, request, asked), media_type="application/x-ndjson")
@@ -222,6 +227,7 @@ def playing(desk: Desk) -> list[Route]:
         Route("/api/open", opened, methods=["POST"]),
         Route("/api/upload", upload, methods=["POST"]),
         Route("/api/forget", forget, methods=["POST"]),
+        Route("/api/rename", rename, methods=["POST"]),
         Route("/api/learn", learn, methods=["POST"]),
     ]
 

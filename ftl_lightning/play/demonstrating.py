@@ -58,7 +58,7 @@ class Demonstrating:
                 self._source.draw(next(iter(known)), 1, 0)
                 self._library = {"tasks": list(known), "why": ""}
             except UserError as error:
-                self._library = {"tasks": [], "why": str(error)}
+                self._library = {"tasks": [], "why": f"This model comes without demonstrations to choose from: {error}"}
         return self._library
 
     @property
@@ -157,7 +157,9 @@ class Demonstrating:
                 imports = self._domain.imports.get(ending)
                 self.add(self._model.demonstrations((imports or Demonstrations.load)(path), name=stem))
             except UserError as error:  # which names a file that the person does not know
-                raise UserError(str(error).replace(str(path), short(Path(name).name))) from error
+                told = str(error).replace(str(path), short(Path(name).name))
+                told = told if told.startswith(short(Path(name).name)) else f"{short(Path(name).name)}: {told}"
+                raise UserError(told) from error
 
     def add(self, more: Demonstrations) -> None:
         """Take further ones, each on its own.

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -11,7 +12,6 @@ from ftl_lightning.domains.domain import SUCCESS, Domain, Show
 from ftl_lightning.domains.line_plots import line_film
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import VectorFilm
-from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.films import packed, packed_space
 
 Json = dict[str, Any]
@@ -82,7 +82,7 @@ def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tenso
         film(
             draw(rollout.take(number, number + 1)),
             None if succeeded is None else bool(succeeded[number]),
-            outcome_text(outcomes, number),
+            ", ".join(name for name, values in outcomes.items() if values.dtype == torch.bool and values[number]),
         )
         for number in range(len(rollout.failed))
     ]

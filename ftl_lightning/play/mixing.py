@@ -11,8 +11,10 @@ import torch
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.few_shot import FewShot
+from ftl_lightning.judging import judging_domain
 from ftl_lightning.play.films import Json, episode_films, films
 from ftl_lightning.play.requests import Sample
 from ftl_lightning.play.same import Sampled
@@ -30,10 +32,12 @@ class Mixture:
     Attributes:
         concepts: as they are mixed, their weights included.
         names: of each.
+        examples: demonstrations of those that were learned here.
     """
 
     concepts: Sequence[Composition]
     names: Sequence[str]
+    examples: Sequence[Demonstrations] = ()
 
     @property
     def mixed(self) -> Composition:
@@ -62,23 +66,35 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
     raise UserError(f"task: expected one that {model.domain.name} reads, found {short(', '.join(tasks))!r}")
 
 
-def goal_of(model: FewShot, names: Sequence[str], task: str) -> str:
+def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
     """What a mix is judged by: its names joined where the domain reads that, or the task whose scenes were asked for.
 
     Empty where nobody can say.
     """
-    reads = model.judging.concepts.reads
+    reads = domain.concepts.reads
     return next((text for text in (JOINED.join(names), task) if text and reads(text)), "")
 
 
-def judged(model: FewShot, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
-    """Films of samples, and what share of them is right, in words; empty where nobody judges."""
-    domain = model.judging
+def judge_of(model: FewShot, examples: Sequence[Demonstrations]) -> Domain:
+    """The domain that judges samples: of a user's own data with these demonstrations of new concepts beside those of training."""
+    base = model.model.examples
+    return judging_domain(model.model, [*([] if base is None else [base]), *examples])
+
+
+def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
+    """Films of samples, and what share of them is right, in words; empty where nobody judges.
+
+    Args:
+        domain: that judges.
+        plans: samples.
+        goal: what they are judged by; empty for nothing.
+    """
     if goal and domain.metrics:
         measured = domain.measure(goal, plans.states, plans.initial_states)
         for name, right in measured.items():
             if right.dtype == torch.bool and right.dim():
-                return films(domain, plans, right.tolist()), f"{name.replace('_', ' ')} {float(right.float().mean()):.2f} ({goal})"
+                share = float(right.float().mean())
+                return films(domain, plans, right.tolist()), f"{share:.0%} right ({name.replace('_', ' ')}: {goal})"
     return films(domain, plans), ""
 
 
@@ -97,14 +113,15 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
     Raises:
         UserError: for a task that the domain does not read, or what cannot be executed.
     """
+    judge = judge_of(model, mixture.examples)
     if asked.task:
-        model.judging.expect_goal(asked.task, "task")
+        judge.expect_goal(asked.task, "task")
     how = sampling_of(model, asked.temperature)
     task, starts = starts_of(model, (asked.task, *tasks), asked.count, asked.seed)
-    goal = goal_of(model, mixture.names, asked.task)
+    goal = goal_of(judge, mixture.names, asked.task)
     if not asked.execute:
         plans = model.sample(mixture.mixed, asked.count, starts, seed=asked.seed, **how)
-        shown, told = judged(model, plans, goal)
+        shown, told = judged(judge, plans, goal)
     elif starts is None:
         raise UserError(f"execute: expected a model whose behaviour is executed, found one of {model.domain.name}")
     else:
@@ -112,5 +129,5 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
         outcomes: Mapping[str, torch.Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
         shown = episode_films(model.domain, done.rollout, outcomes)
         told = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())
-        told = f"{told} ({goal})" if told else ""
+        told = f"mean of {asked.count}: {told} ({goal})" if told else ""
     return shown, told, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)

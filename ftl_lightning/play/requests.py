@@ -11,6 +11,16 @@ MOST_SAMPLES, MOST_DRAWN, MOST_PARTS, MOST_NAME = 64, 20, 12, 100
 MOST_TEMPERATURE = 4.0
 
 
+def expect_name(name: str) -> None:
+    """Refuse a name that is none.
+
+    Raises:
+        UserError: for an empty or long one, or letters that cannot be printed.
+    """
+    if not 1 <= len(name.strip()) <= MOST_NAME or not name.isprintable():
+        raise UserError(f"name: expected 1 to {MOST_NAME} letters, found {len(name)}")
+
+
 @dataclass(frozen=True)
 class Open:
     """Another model, by name."""
@@ -66,6 +76,17 @@ class Named:
 
 
 @dataclass(frozen=True)
+class Renamed:
+    """Another name for a concept that was learned or opened here."""
+
+    id: str
+    name: str
+
+    def __post_init__(self) -> None:
+        expect_name(self.name)
+
+
+@dataclass(frozen=True)
 class Nothing:
     """No more than the address says."""
 
@@ -83,8 +104,7 @@ class Learn:
     quick: bool = True
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.name.strip()) <= MOST_NAME or not self.name.isprintable():
-            raise UserError(f"name: expected 1 to {MOST_NAME} letters, found {len(self.name)}")
+        expect_name(self.name)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ftl_lightning.concepts.concept import file_name
 from ftl_lightning.regrouped import INVERSION
 
 FOLDER = "concepts"
@@ -20,24 +21,26 @@ class Learned:
     """A concept that was learned on the page.
 
     Attributes:
-        name: of it.
+        name: under which it was learned, which decides where learning starts.
+        label: its name on the page, which may have been changed.
         changes: settings that differ from those that go with the model.
         steps: of gradient descent; ``None`` for the tuned number.
     """
 
     name: str
+    label: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     steps: int | None = None
 
     @property
     def variable(self) -> str:
         """A name that Python takes."""
-        word = re.sub(r"\W+", "_", self.name.lower()).strip("_") or "concept"
+        word = re.sub(r"\W+", "_", self.label.lower()).strip("_") or "concept"
         return f"_{word}" if word[0].isdigit() else word
 
     @property
     def file(self) -> str:
-        """Of the concept, that ``invert`` writes and the page downloads."""
+        """Of the concept, that the page downloads."""
         return f"{self.variable}.safetensors"
 
     @property
@@ -134,7 +137,7 @@ def composed(parts: Sequence[Part]) -> str:
     """As ``--compose`` takes it."""
     told = []
     for part in parts:
-        name = f"{FOLDER}/{part.learned.file}" if part.learned else part.file or part.text
+        name = f"{FOLDER}/{file_name(part.learned.name)}.safetensors" if part.learned else part.file or part.text
         at = f"@{','.join(part.groups)}" if part.groups else ""
         told.append(f"{name}{at}:{part.weight:g}")
     return " + ".join(told)

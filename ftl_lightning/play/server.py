@@ -7,6 +7,7 @@ import socket
 import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import FrameType
 
 import uvicorn
 from starlette.routing import Route
@@ -18,8 +19,8 @@ from ftl_lightning.printing import say
 LOOPBACK = "127.0.0.1"
 PORT = 8765
 """Unless another program has it."""
-MOST_CONNECTIONS, IDLE = 200, 5
-"""Connections at a time, and seconds that an idle one is kept."""
+MOST_CONNECTIONS, IDLE, PATIENCE = 200, 5, 3
+"""Connections at a time, seconds that an idle one is kept, and that the last answers may take when the program ends."""
 
 
 @dataclass(frozen=True)
@@ -57,18 +58,17 @@ def serve(
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
     hosts = [f"{name}:{port}" for name in names]
-    app = guarded(routes, token, hosts, lambda: setattr(server, "should_exit", True), begin)
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app,
-            log_level="error",
-            ws="none",
-            server_header=False,
-            limit_concurrency=MOST_CONNECTIONS,
-            timeout_keep_alive=IDLE,
-            timeout_graceful_shutdown=1,
-        )
+    app = guarded(routes, token, hosts, lambda: server.end(), begin)
+    config = uvicorn.Config(
+        app,
+        log_level="critical",
+        ws="none",
+        server_header=False,
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_keep_alive=IDLE,
+        timeout_graceful_shutdown=PATIENCE,
     )
+    server = _Server(config, close)
     address = f"http://{hosts[0]}/?token={token}"
     say(f"open {address}\nCtrl-C ends the program")
     if not ipaddress.ip_address(place.host).is_loopback:
@@ -77,11 +77,31 @@ def serve(
     if place.browser:
         webbrowser.open(address)
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
-        try:
-            server.run(sockets=[listening])
-        finally:
-            close()
+        server.run(sockets=[listening])
     say("ended")
+
+
+class _Server(uvicorn.Server):
+    """Stops what runs before it waits for the last answers.
+
+    Args:
+        config: of the server.
+        close: called first when the program ends.
+    """
+
+    def __init__(self, config: uvicorn.Config, close: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._close = close
+
+    def end(self) -> None:
+        """End the program."""
+        self._close()
+        self.should_exit = True
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """At Ctrl-C, as uvicorn names it."""
+        self._close()
+        super().handle_exit(sig, frame)
 
 
 def _listening(host: str, port: int) -> socket.socket:

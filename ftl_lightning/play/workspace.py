@@ -19,7 +19,7 @@ from ftl_lightning.learning.quality import GENERATED
 from ftl_lightning.play import requests
 from ftl_lightning.play.demonstrating import Demonstrating, as_npz
 from ftl_lightning.play.films import Json, films
-from ftl_lightning.play.mixing import Mixture, goal_of, judged, samples, sampling_of, starts_of
+from ftl_lightning.play.mixing import Mixture, goal_of, judge_of, judged, samples, sampling_of, starts_of
 from ftl_lightning.play.same import VARIABLES, Learned, Part, Sampled, command, python
 from ftl_lightning.tensor_file import kind_of
 from ftl_lightning.tuned import OWN
@@ -32,8 +32,6 @@ showing takes is learned before the next one.
 """
 TOLD = 0.05
 """Seconds between two losses that are told: each takes time from learning."""
-TOLERANCE = 0.03
-"""Of learning quickly, where the settings of a domain name none."""
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
 QUICK_STEPS = 250
 """Of learning quickly from a user's own data; chosen on strokes, see docs/experiments-own-data.md."""
@@ -94,7 +92,7 @@ class Workspace:
         self._domain = self._model.domain
         self._shown = Demonstrating(self._model, self._domain.source(root))
         self._count = 0
-        self._last: tuple[Sequence[Part], Sampled | None] = ((), None)
+        self._newest: Learned | None = None
         self._concepts = {
             f"t{number}": Known(text, "training", self._model[text]) for number, text in enumerate(self._model.training_concepts)
         }
@@ -126,7 +124,8 @@ class Workspace:
 
     def work(self) -> dict[str, Any]:
         """The demonstrations that are there, and what a check says of them."""
-        return self._shown.told() | {"same": self._same()}
+        parts = (Part(self._newest.label, learned=self._newest),) if self._newest else ()
+        return self._shown.told() | {"same": self._same(parts, None)}
 
     @property
     def suggestion(self) -> str:
@@ -212,7 +211,8 @@ class Workspace:
             try:
                 found = self._model.load(path)
             except UserError as error:
-                raise UserError(str(error).replace(str(path), short(name))) from error
+                told = str(error).replace(str(path), short(name))
+                raise UserError(f"{told}; open the model that it was learned with first") from error
         self._count += 1
         self._concepts[f"o{self._count}"] = Known(found.concept.origin.name, "opened", found, found.concept, name)
 
@@ -240,6 +240,22 @@ class Workspace:
             raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
         del self._concepts[asked.id]
 
+    def rename(self, asked: requests.Renamed) -> None:
+        """Call a concept otherwise that was learned or opened here; its file then says so.
+
+        Raises:
+            UserError: for one of the model's own.
+        """
+        known, name = self._known(asked.id), " ".join(asked.name.split())
+        if known.kind not in ("learned", "opened") or known.concept is None:
+            raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
+        if name == known.name:
+            return
+        concept = replace(known.concept, origin=replace(known.concept.origin, name=name))
+        learned = known.learned and replace(known.learned, label=self._unused(name))
+        self._newest = learned if self._newest is known.learned else self._newest
+        self._concepts[asked.id] = replace(known, name=name, concept=concept, learned=learned)
+
     def learn(self, asked: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
         """Learn a concept from the demonstrations, telling loss and samples as it goes.
 
@@ -265,7 +281,7 @@ class Workspace:
                 tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
                 told_at = shown
             if shown >= due:
-                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST)[0]})
+                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, own)[0]})
                 due = monotonic() + max(EVERY, SHARE * (monotonic() - shown))
 
         with warnings.catch_warnings():
@@ -273,27 +289,26 @@ class Workspace:
             concept = self._model.learn(own, name=name, steps=steps, watch=watch, **changes)
         seconds = monotonic() - begin
         self._count += 1
-        key, how = (
-            f"l{self._count}",
-            Learned(self._unused(name), changes, None if steps == self._model.tuned.learning_steps else steps),
-        )
+        told_steps = None if steps == self._model.tuned.learning_steps else steps
+        key, how = f"l{self._count}", Learned(name, self._unused(name), changes, told_steps)
         known = Known(name, "learned", concept, concept.concept, learned=how, demonstrations=own)
-        shown, right = self._samples(concept, GENERATED)
+        shown, right = self._samples(concept, GENERATED, own)
         quality: Json = {"line": right, "numbers": {}}
         if len(own) > 1:
             found = concept.quality.quality
             quality = {"line": ", ".join(filter(None, (right, found.words))), "numbers": found.numbers}
         decided = [film["right"] for film in shown if film["right"] is not None]
         self._concepts[key] = known = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
-        self._last = ((Part(how.name, learned=how),), None)
+        self._newest = how
         told = {"done": True, "concept": self._told(key, known), "concepts": self._listed(), "quality": quality}
-        tell({**told, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": self._same()})
+        same = self._same((Part(how.label, learned=how),), None)
+        tell({**told, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
 
     def _unused(self, name: str) -> str:
-        """A name whose files and variable no other concept that was learned here has."""
+        """A label whose files and variable no other concept that was learned here has."""
         taken = VARIABLES | {known.learned.variable for known in self._concepts.values() if known.learned}
         found, number = name, 2
-        while Learned(found).variable in taken:
+        while Learned(name, found).variable in taken:
             found, number = f"{name} {number}", number + 1
         return found
 
@@ -304,7 +319,7 @@ class Workspace:
             return {}, steps
         if self._model.settings == OWN:
             return dict(QUICK), QUICK_STEPS
-        return {"form": PAPER} | ({} if tuned.budget.tolerance is not None else {"tolerance": TOLERANCE}), steps
+        return {"form": PAPER}, steps
 
     # Samples.
 
@@ -322,21 +337,23 @@ class Workspace:
             for part, one in zip(asked.parts, known, strict=True)
         ]
         names = [one.name for one in known]
-        shown, told, how = samples(self._model, Mixture(concepts, names), asked, (self._shown.task, *names))
-        self._last = (
-            [
-                Part(one.name, part.weight, tuple(part.groups), one.learned, one.file)
-                for part, one in zip(asked.parts, known, strict=True)
-            ],
-            how,
-        )
-        return {"samples": shown, "told": told, "seconds": round(monotonic() - begin, 3), "same": self._same()}
+        examples = [
+            replace(one.demonstrations, concepts=(one.name,) * len(one.demonstrations)) for one in known if one.demonstrations
+        ]
+        mixture = Mixture(concepts, names, examples)
+        shown, told, how = samples(self._model, mixture, asked, (self._shown.task, *names))
+        parts = [
+            Part(one.name, part.weight, tuple(part.groups), one.learned, one.file)
+            for part, one in zip(asked.parts, known, strict=True)
+        ]
+        return {"samples": shown, "told": told, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
 
-    def _samples(self, concept: LearnedConcept, count: int) -> tuple[list[Json], str]:
-        """Of a concept that was just learned, and what share is right."""
+    def _samples(self, concept: LearnedConcept, count: int, own: Demonstrations) -> tuple[list[Json], str]:
+        """Of a concept that was just learned from some demonstrations, and what share is right."""
         task, starts = starts_of(self._model, (self._shown.task,), count, 0)
         plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
-        return judged(self._model, plans, goal_of(self._model, (concept.concept.origin.name,), task))
+        judge = judge_of(self._model, [own])
+        return judged(judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
 
     def thumbnail(self, key: str) -> Json:
         """A sample of a concept."""
@@ -345,6 +362,5 @@ class Workspace:
         plans = self._model.sample(known.composition, 1, starts, seed=0, **sampling_of(self._model))
         return {"film": films(self._domain, plans)[0]}
 
-    def _same(self) -> Json:
-        parts, how = self._last
+    def _same(self, parts: Sequence[Part], how: Sampled | None) -> Json:
         return {"python": python(self.name, parts, how), "command": command(self.name, self._model.settings, parts, how)}

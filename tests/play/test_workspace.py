@@ -17,6 +17,7 @@ from ftl_lightning.play import requests
 from ftl_lightning.play.films import Json
 from ftl_lightning.play.same import VARIABLES, Learned
 from ftl_lightning.play.workspace import Stopped, Workspace
+from ftl_lightning.testing.more_strokes import drawn
 from tests.conftest import ROOT
 
 TASK = "square diagonal to triangle"
@@ -44,6 +45,7 @@ def test_learning_tells_loss_and_samples_as_it_goes(workspace: Workspace) -> Non
     assert last["done"]
     assert len(last["samples"]) == 8
     assert last["concept"]["accuracy"] > 0.8
+    assert f"% right (accuracy: {TASK})" in last["quality"]["line"]
     assert "novelty" in last["quality"]["line"]
     assert "accuracy" in last["quality"]["line"]
     assert [one["kind"] for one in last["concepts"]].count("learned") == 1
@@ -122,6 +124,27 @@ def test_what_a_check_finds_stands_beside_the_demonstration(workspace: Workspace
     assert all(one["flags"] for one in workspace.work()["demonstrations"])
 
 
+def test_another_name_changes_neither_the_numbers_nor_the_code(workspace: Workspace, tmp_path: Path) -> None:
+    last, _ = learned(workspace)
+    key = last["concept"]["id"]
+    before = Concept.load(saved(workspace, key, tmp_path / "before.safetensors"))
+    workspace.rename(requests.Renamed(key, "my  diagonal"))
+    after = Concept.load(saved(workspace, key, tmp_path / "after.safetensors"))
+    assert torch.equal(before.embeddings, after.embeddings)
+    assert (before.origin.name, after.origin.name) == (TASK, "my diagonal")
+    told = workspace.sample(requests.Sample((requests.Mixed(key),), count=1))["same"]
+    assert f"my_diagonal = model.learn(Demonstrations.load('my_diagonal.npz'), name={TASK!r}" in told["python"]
+    assert "concepts/square_diagonal_to_triangle.safetensors" in told["command"]
+    with pytest.raises(UserError, match="found one of the model's"):
+        workspace.rename(requests.Renamed("t0", "mine"))
+
+
+def saved(workspace: Workspace, key: str, path: Path) -> Path:
+    """The concept's file."""
+    path.write_bytes(workspace.concept_file(key)[1])
+    return path
+
+
 def test_files_come_back_as_they_were(workspace: Workspace, tmp_path: Path) -> None:
     last, _ = learned(workspace)
     file, content = workspace.concept_file(last["concept"]["id"])
@@ -151,6 +174,19 @@ def test_learning_stops_when_nobody_waits(workspace: Workspace) -> None:
     assert "left" not in [one["name"] for one in workspace.state()["concepts"]]
 
 
+def test_an_older_concept_of_the_same_kind_is_no_rival() -> None:
+    strokes = Workspace("strokes")
+    for name in ("first heart", "second heart"):
+        strokes.clear(requests.Nothing())
+        place = strokes.scene(requests.Pose())["scene"]
+        for stroke in drawn("heart", 5, 3):
+            path = [[[float(x), float(y)]] for x, y in stroke]
+            strokes.record(requests.Recorded(place, path, [0.02 * step for step in range(len(path))]))
+        told: list[Json] = []
+        strokes.learn(requests.Learn(name), told.append, lambda: False)
+        assert told[-1]["concept"]["accuracy"] > 0.8
+
+
 def test_all_that_is_told_is_json(workspace: Workspace) -> None:
     last, told = learned(workspace)
     for one in (*told, workspace.state(), workspace.thumbnail("t0"), workspace.thumbnail(last["concept"]["id"])):
@@ -159,6 +195,6 @@ def test_all_that_is_told_is_json(workspace: Workspace) -> None:
 
 @pytest.mark.parametrize(("name", "variable"), [("go to red bowl", "go_to_red_bowl"), ("5 steps!", "_5_steps"), ("---", "concept")])
 def test_names_become_variables(name: str, variable: str) -> None:
-    assert Learned(name).variable == variable
+    assert Learned("any", name).variable == variable
     assert variable.isidentifier()
     assert variable not in VARIABLES
