@@ -152,4 +152,4 @@ def test_the_project_offers_the_extras_with_their_packages() -> None:
     for extra, packages in EXTRAS.items():
         assert set(packages.values()) <= {Requirement(text).name for text in offered[extra]}
     (together,) = [one for one in map(Requirement, offered["all"]) if one.name == "ftl-lightning"]
-    assert together.extras == {"driving", "navigation", "tabletop"}
+    assert together.extras == {"driving", "navigation", "play", "tabletop"}

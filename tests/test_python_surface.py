@@ -307,7 +307,7 @@ WRONG: dict[str, tuple[Callable[[Things], Any], str]] = {
     "a setting of another name": (
         lambda of: of.scenes.learn(of.five, lr=3),
         "learn: expected components, omega, form, initial_omega, off_span, initial_spread, start, restarts, "
-        "... (or steps, seed, progress), found 'lr'; model.tuned shows all settings; "
+        "... (or steps, seed, progress, watch), found 'lr'; model.tuned shows all settings; "
         "did you mean learning_rate?",
     ),
     "a setting that is no number": (
