@@ -225,6 +225,7 @@ async function sample() {
   find("mixed").setAttribute("aria-busy", "true");
   if (mix.parts.length) {
     const asked = question(), name = mixName();
+    if (!find("mix-name").textContent) find("mix-name").textContent = name;
     await attempt(async () => {
       const found = await ask("/api/sample", asked, stop.signal);
       if (stop.signal.aborted) return;
