@@ -31,13 +31,26 @@ function learnOf(work) {
 
 // What is said before something is learned from demonstrations that a check flags; empty without any.
 function doubt() {
-  const some = state.work.demonstrations.flatMap((one, number) => one.flags.length ? [number + 1] : []);
+  const some = state.work.demonstrations.flatMap((one, number) => one.flags.some((flag) => !alike(flag)) ? [number + 1] : []);
   if (!some.length) return "";
   if (some.length === 1) return `Demonstration ${some[0]} looks different from the others. Remove it, or press Learn.`;
-  return `Demonstrations ${some.slice(0, -1).join(", ")} and ${some.at(-1)} look different from the others. Remove them, or press Learn.`;
+  return `Demonstrations ${listed(some)} look different from the others. Remove them, or press Learn.`;
 }
 
-const checks = (work) => [...work.demonstrations.flatMap((one, number) => one.flags.map((flag) => `\u26A0 Demonstration ${number + 1}: ${flag}`)), ...work.check];
+// A flag of several demonstrations that are alike, which hold up nothing.
+const alike = (flag) => flag.startsWith("are ");
+
+// What a check says: of each demonstration, of some that are alike, and of all.
+function checks(work) {
+  const each = [], together = new Map();
+  work.demonstrations.forEach((one, number) => one.flags.forEach((flag) => {
+    if (alike(flag)) together.set(flag, [...(together.get(flag) || []), number + 1]);
+    else each.push(`\u26A0 Demonstration ${number + 1}: ${flag}`);
+  }));
+  return [...each, ...[...together].map(([flag, own]) => `\u26A0 Demonstrations ${listed(own)} ${flag}`), ...work.check];
+}
+
+const listed = (numbers) => numbers.length < 2 ? numbers.join() : `${numbers.slice(0, -1).join(", ")} and ${numbers.at(-1)}`;
 
 function slots() {
   const { demonstrations, wanted } = state.work, list = find("slots"), view = slotView(demonstrations.map((one) => one.film));
