@@ -1,8 +1,7 @@
-"""The page in the hands of a person: pointer and keys together, demonstrations that look wrong, what becomes of learned concepts."""
+"""The page in the hands of a person: pointer and keys together, demonstrations that look wrong, learned concepts."""
 
 import shutil
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -15,8 +14,10 @@ from tests.play.served import served
 
 pytestmark = pytest.mark.skipif(not DRIVER.exists() or not shutil.which("chromium"), reason="needs Chromium and its driver")
 
-TAP = """((key) => { const on = document.activeElement;
-  for (const kind of ["keydown", "keyup"]) on.dispatchEvent(new KeyboardEvent(kind, { key, bubbles: true, cancelable: true })); })(arguments[0])"""
+TAP = """((key) => {
+  for (const kind of ["keydown", "keyup"])
+    document.activeElement.dispatchEvent(new KeyboardEvent(kind, { key, bubbles: true, cancelable: true }));
+})(arguments[0])"""
 """A key that is let go before anything is drawn."""
 
 
@@ -86,7 +87,8 @@ def test_a_short_tap_moves_the_pen(strokes: Browser) -> None:
     x, y = strokes.js("recorder.pen")
     strokes.js(TAP, "ArrowRight")
     right, up = strokes.js("recorder.pen")
-    assert right > x and up == y
+    assert right > x
+    assert up == y
     strokes.press(Keys.SPACE)
     strokes.js("document.activeElement.blur()")
     for _ in range(12):
@@ -122,7 +124,8 @@ def test_learning_waits_where_a_demonstration_looks_wrong(strokes: Browser) -> N
     cleared(strokes)
     for bend in (0.3, 0.28, 0.31, 0.29):
         stroke(strokes, bend)
-    work = "{...state.work, demonstrations: [...state.work.demonstrations, {...state.work.demonstrations[0], id: 99, flags: ['It differs.']}]}"
+    fifth = "{...state.work.demonstrations[0], id: 99, flags: ['It differs.']}"
+    work = f"{{...state.work, demonstrations: [...state.work.demonstrations, {fifth}]}}"
     strokes.js(f"(worked({work}, true), true)")
     assert strokes.text("waiting") == "Demonstration 5 looks different from the others. Remove it, or press Learn."
     assert strokes.data("learning") != "yes"
@@ -134,7 +137,8 @@ def test_learning_waits_where_a_demonstration_looks_wrong(strokes: Browser) -> N
 def test_what_is_learned_is_in_the_mix_alone_and_two_half_and_half(strokes: Browser) -> None:
     stroke(strokes, 0.305)
     learned(strokes)
-    weights = "[...document.querySelectorAll('#mix li')].map((one) => [one.querySelector('.name').textContent, one.querySelector('input').value])"
+    one = "[one.querySelector('.name').textContent, one.querySelector('input').value]"
+    weights = f"[...document.querySelectorAll('#mix li')].map((one) => {one})"
     assert strokes.js(weights) == [["my stroke 1", "1"]]
     assert strokes.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
     strokes.click("learn")  # again, from the same
