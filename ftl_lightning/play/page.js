@@ -115,7 +115,6 @@ async function end() {
 function theme(dark) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   find("theme").setAttribute("aria-label", dark ? "Light page" : "Dark page");
-  for (const one of films) one.key = ""; // drawn anew
 }
 
 async function start() {

@@ -1,7 +1,7 @@
 // Bodies in space: seen from one place without perspective, turned together by dragging or with arrow keys.
 const looking = { side: 28 * Math.PI / 180, above: 12 * Math.PI / 180, turned: 0 }; // about the vertical, above the floor, how often
 const LIMB = 0.045; // width of a line in metres
-const FLOORS = { light: ["#eef0f2", "#d6dade"], dark: ["#bfc8cf", "#a5b0b9"] }; // a floor and what is drawn on it, by theme
+const FLOOR = "#eef0f2", SHADE = "#d6dade";
 
 function turn(across, up) {
   looking.side += across;
@@ -45,7 +45,7 @@ function drawBody(canvas, film, seconds, room, how = {}) {
   const front = room.radius * Math.sin(looking.above), top = Math.max(room.height * Math.cos(looking.above), front);
   const middle = down / 2 + scale * (top - front) / 2; // of the floor, so that all is in the middle of the picture
   const pixel = ([right, up]) => [across / 2 + right * scale, middle - up * scale];
-  const body = [], shade = [], [floor, drawnOn] = FLOORS[document.documentElement.dataset.theme] || FLOORS.light;
+  const body = [], shade = [];
   for (let point = 0; point < space.count; point++) {
     const [x, y, z] = [0, 1, 2].map((axis) => {
       const one = at[before * size + 3 * point + axis];
@@ -60,9 +60,9 @@ function drawBody(canvas, film, seconds, room, how = {}) {
       const wide = room.radius * ring * scale;
       pen.beginPath();
       pen.ellipse(across / 2, middle, wide, wide * Math.abs(Math.sin(looking.above)), 0, 0, 2 * Math.PI);
-      pen.fillStyle = floor;
+      pen.fillStyle = FLOOR;
       if (ring === 1) pen.fill();
-      pen.strokeStyle = drawnOn;
+      pen.strokeStyle = SHADE;
       pen.lineWidth = 1;
       pen.stroke();
     }
@@ -77,7 +77,7 @@ function drawBody(canvas, film, seconds, room, how = {}) {
     pen.lineTo(...pixel(to));
     pen.stroke();
   };
-  if (!how.over) for (const [a, b] of space.lines) line(shade[a], shade[b], drawnOn);
+  if (!how.over) for (const [a, b] of space.lines) line(shade[a], shade[b], SHADE);
   // What is nearer hides what is behind it.
   const parts = space.lines.map(([a, b], number) => [(body[a][2] + body[b][2]) / 2, () => line(body[a], body[b], space.colours[number])]);
   for (const [point, radius, colour] of space.heads) {

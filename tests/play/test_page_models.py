@@ -148,7 +148,6 @@ def test_the_end_is_asked_for_and_calm(tmp_path: Path) -> None:
         page.click("sure-yes")
         page.until(lambda: page.count("#ended") == 1)
         server.process.wait(20)
-        page.js(
         page.js("(performance.clearResourceTimings(), resample(), mix.waiting.push(...mix.cards.values()), thumbnails(), true)")
         page.driver.execute_async_script("setTimeout(arguments[0], 600)")
         assert page.js("performance.getEntriesByType('resource').length") == 0
