@@ -97,21 +97,21 @@ def main() -> None:
     parser.add_argument("--torch-index", help="address of the index that torch comes from")
     parser.add_argument("--out", default="results/install.json")
     options = parser.parse_args()
-    runs = []
-    with tempfile.TemporaryDirectory() as folder:
-        built = wheel(Path(folder))
-        size = built.stat().st_size
-        for python in options.python:
-            with tempfile.TemporaryDirectory() as place:
-                runs.append(installed(python, built, options.torch_index, Path(place)))
-            print(json.dumps(runs[-1]), flush=True)
     machine = {
         "processor": platform.processor() or platform.machine(),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "cores": len(os.sched_getaffinity(0)),
     }
-    content = {"machine": machine, "wheel, megabytes": round(size / 1e6, 1), "runs": runs}
-    write_text(Path(options.out), json.dumps(content, indent=2) + "\n")
+    runs = []
+    with tempfile.TemporaryDirectory() as folder:
+        built = wheel(Path(folder))
+        size = round(built.stat().st_size / 1e6, 1)
+        for python in options.python:
+            with tempfile.TemporaryDirectory() as place:
+                runs.append(installed(python, built, options.torch_index, Path(place)))
+            print(json.dumps(runs[-1]), flush=True)
+            content = {"machine": machine, "wheel, megabytes": size, "runs": runs}
+            write_text(Path(options.out), json.dumps(content, indent=2) + "\n")  # after each, since the next takes minutes
 
 
 if __name__ == "__main__":
