@@ -71,9 +71,9 @@ function newCard(concept) {
 }
 
 const forget = (concept) => attempt(async () => {
-  await ask("/api/forget", { id: concept.id });
+  const found = await ask("/api/forget", { id: concept.id });
   learning.unsaved.delete(concept.hash + concept.id);
-  await renew(await ask("/api/state"));
+  await renew(found);
 });
 
 // Films of concepts are asked for one at a time, when they come in sight, after the first samples are there.

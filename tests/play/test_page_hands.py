@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -134,43 +135,46 @@ def test_learning_waits_where_a_demonstration_looks_wrong(strokes: Browser) -> N
     assert strokes.text("waiting").startswith("Learning starts by itself")
 
 
-def test_what_is_learned_is_in_the_mix_alone_and_two_half_and_half(strokes: Browser) -> None:
-    stroke(strokes, 0.305)
-    learned(strokes)
-    one = "[one.querySelector('.name').textContent, one.querySelector('input').value]"
-    weights = f"[...document.querySelectorAll('#mix li')].map((one) => {one})"
-    assert strokes.js(weights) == [["my stroke 1", "1"]]
-    assert strokes.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
-    strokes.click("learn")  # again, from the same
-    strokes.until(lambda: strokes.js("justLearned() && learning.concept.name === 'my stroke 2'"))
-    assert strokes.js(weights) == [["my stroke 1", "0.5"], ["my stroke 2", "0.5"]]
-    assert strokes.js("find('name').value") == "my stroke 2"
-    assert not strokes.errors()
+YOURS = "state.concepts.filter((one) => one.kind === 'learned').map((one) => one.name)"
+WEIGHTS = """[...document.querySelectorAll('#mix li')].map(
+  (one) => [one.querySelector('.name').textContent, one.querySelector('input').value])"""
 
 
-def test_a_concept_is_forgotten(strokes: Browser) -> None:
-    yours = "state.concepts.filter((one) => one.kind === 'learned').map((one) => one.name)"
-    assert strokes.js(yours) == ["my stroke 1", "my stroke 2"]
-    button = strokes.driver.find_element("css selector", "button[aria-label='Forget my stroke 2']")
-    strokes.js("arguments[0].scrollIntoView({ block: 'center' })", button)
-    button.click()
-    strokes.until(lambda: strokes.js(yours) == ["my stroke 1"])
-    assert strokes.count("#mix li") == 1
-    assert strokes.count("#learned") == strokes.count("#samples canvas") == 0
-    assert strokes.text("error-text") == ""
-    assert strokes.js("find('name').value") == "my stroke 2"  # the next one's
-
-
-def test_a_learned_concept_gets_another_name(strokes: Browser) -> None:
-    strokes.click("learn")
-    learned(strokes)
-    assert strokes.count("#rename") == 0
-    strokes.js("(find('name').value = '', find('name').focus())")
-    strokes.press("bow")
-    assert strokes.count("#rename") == 1
-    strokes.press(Keys.ENTER)
-    strokes.until(lambda: "bow" in strokes.js("state.concepts.map((one) => one.name)"))
-    strokes.until(lambda: "bow" in strokes.text("mix-name"))
-    assert strokes.text("waiting").startswith("Learned “bow” in")
-    assert strokes.count("button[aria-label='Forget bow']") == 1
-    assert strokes.count("#rename") == 0
+def test_what_is_learned_is_mixed_forgotten_and_renamed(tmp_path: Path) -> None:
+    with served(tmp_path, ["strokes"]) as server, browser(tmp_path) as page:
+        page.open(server.address)
+        page.until(lambda: int(page.data("samples") or 0) > 0)
+        for bend in (0.3, 0.28, 0.31, 0.29, 0.305):
+            stroke(page, bend)
+        learned(page)
+        # Alone in the mix; a second one beside it, half and half.
+        assert page.js(WEIGHTS) == [["my stroke 1", "1"]]
+        assert page.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
+        page.click("learn")  # again, from the same
+        page.until(lambda: page.js("justLearned() && learning.concept.name === 'my stroke 2'"))
+        assert page.js(WEIGHTS) == [["my stroke 1", "0.5"], ["my stroke 2", "0.5"]]
+        assert page.js("find('name').value") == "my stroke 2"
+        # Forgotten.
+        assert page.js(YOURS) == ["my stroke 1", "my stroke 2"]
+        button = page.driver.find_element("css selector", "button[aria-label='Forget my stroke 2']")
+        page.js("arguments[0].scrollIntoView({ block: 'center' })", button)
+        button.click()
+        page.until(lambda: page.js(YOURS) == ["my stroke 1"])
+        assert page.count("#mix li") == 1
+        assert page.count("#learned") == page.count("#samples canvas") == 0
+        assert page.text("error-text") == ""
+        assert page.js("find('name').value") == "my stroke 2"  # the next one's
+        # Called otherwise.
+        page.click("learn")
+        learned(page)
+        assert page.count("#rename") == 0
+        page.js("(find('name').value = '', find('name').focus())")
+        page.press("bow")
+        assert page.count("#rename") == 1
+        page.press(Keys.ENTER)
+        page.until(lambda: "bow" in page.js("state.concepts.map((one) => one.name)"))
+        page.until(lambda: "bow" in page.text("mix-name"))
+        assert page.text("waiting").startswith("Learned “bow” in")
+        assert page.count("button[aria-label='Forget bow']") == 1
+        assert page.count("#rename") == 0
+        assert not page.errors()
