@@ -56,6 +56,13 @@ def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
     return InversionModule(str(pretrained), **{field.name: getattr(settings, field.name) for field in fields(settings)})
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Say at once what failed: a run that is stopped from outside never comes to its summary."""
+    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
+        print(f"\nFAILED {report.nodeid} ({report.when}, after {report.duration:.0f} s)\n{report.longreprtext[-3000:]}", flush=True)
+
+
 @pytest.fixture(autouse=True)
 def _in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # logs and outputs of a test stay its own
