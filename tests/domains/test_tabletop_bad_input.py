@@ -149,7 +149,7 @@ def test_demonstrations_of_states_alone_on_the_command_line(shipped: Path, capsy
         (["--task", PUSH, "--count=0"], "count: expected 1 or more, found 0"),
         (["--task", PUSH, "--seed=-1"], "seed: expected 0 or more, found -1"),
         (["--task", PUSH, "--workers=0"], "workers: expected 1 or more, found 0"),
-        (["--task", PUSH, "--out=demos.npz"], "out: expected a name that ends in .safetensors"),
+        (["--task", PUSH, "--out=."], "out: .: expected a file or nothing there, found a folder"),
     ],
 )
 def test_commands_that_cannot_be_followed(options: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
