@@ -82,7 +82,13 @@ def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tenso
         film(
             draw(rollout.take(number, number + 1)),
             None if succeeded is None else bool(succeeded[number]),
-            ", ".join(name for name, values in outcomes.items() if values.dtype == torch.bool and values[number]),
+            _ended(outcomes, number),
         )
         for number in range(len(rollout.failed))
     ]
+
+
+def _ended(outcomes: Mapping[str, Tensor], number: int) -> str:
+    """What came true in an episode, in words."""
+    judged = {name: bool(values[number]) for name, values in outcomes.items() if values.dtype == torch.bool}
+    return ", ".join(name for name, true in judged.items() if true) or (f"no {SUCCESS}" if SUCCESS in judged else "")
