@@ -60,7 +60,8 @@ def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """Say at once what failed: a run that is stopped from outside never comes to its summary."""
     if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
-        print(f"\nFAILED {report.nodeid} ({report.when}, after {report.duration:.0f} s)\n{report.longreprtext[-3000:]}", flush=True)
+        told = f"{report.nodeid[:200]} ({report.when}, after {report.duration:.0f} s)"
+        print(f"\nFAILED {told}\n{report.longreprtext[-3000:]}", flush=True)
 
 
 @pytest.fixture(autouse=True)
