@@ -11,11 +11,12 @@ import lightning.pytorch as pl
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from ftl_lightning import log_folder
+from ftl_lightning import log_folder, process_group
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
 from ftl_lightning.learning_rate import LearningRate
+from ftl_lightning.printing import silence
 from ftl_lightning.ranges import expect_range
 
 HARMLESS = {
@@ -138,6 +139,7 @@ class Trainer(pl.Trainer):
             for name, value in options.items()
             if name not in HARMLESS and value != usual.get(name)
         }
+        process_group.take_over(self)
         self.callbacks += [_Begun(), LearningRate()]  # type: ignore[attr-defined]
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
             self.strategy.checkpoint_io = WholeCheckpoints()
@@ -151,6 +153,9 @@ class Trainer(pl.Trainer):
                 raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
         if self.limit_train_batches == 0:
             raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
+        process_group.expect_exact(self)
+        if self.global_rank:
+            silence()
         with self._restoring():
             try:
                 super().fit(model, *arguments, **options)
@@ -161,12 +166,14 @@ class Trainer(pl.Trainer):
         _expect_monitors(self)
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
-        """As Lightning's."""
+        """As Lightning's, in one process."""
+        process_group.expect_alone(self, "validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
     def test(self, *arguments: Any, **options: Any) -> Any:
-        """As Lightning's."""
+        """As Lightning's, in one process."""
+        process_group.expect_alone(self, self.verb if self.verb == "invert" else "test")
         with self._restoring():
             return super().test(*arguments, **options)
 
@@ -198,6 +205,7 @@ class Trainer(pl.Trainer):
         if ckpt_path and not model.learns:
             raise UserError(f"ckpt_path: expected none for {model.method}, which learns nothing, found {ckpt_path}")
         self.verb = "invert"
+        process_group.expect_alone(self, self.verb)
         if model.learns:
             self.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
         self.test(model, datamodule=datamodule, verbose=False)
