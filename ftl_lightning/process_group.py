@@ -164,4 +164,8 @@ def expect_exact(trainer: pl.Trainer) -> None:
     if trainer.num_devices * trainer.num_nodes > 1 and not (
         isinstance(strategy, DDPStrategy) and isinstance(strategy.launcher, _SubprocessScriptLauncher | None)
     ):
-        raise UserError(f"trainer.strategy: expected ddp for several processes, found {short(type(strategy).__name__)}")
+        raise UserError(f"trainer.strategy: expected ddp for several processes, found {_name(strategy)}")
+
+
+def _name(strategy: object) -> str:
+    return str(getattr(strategy, "_start_method", None) or short(type(strategy).__name__))
