@@ -49,6 +49,11 @@ def learn(page: Browser, server: Served, kind: str) -> tuple[dict[str, float], b
         if number + 1 < SHOWN:
             until_count(page, number + 1)
     done = begin + drawing
+    page.until(lambda: page.data("learning") == "yes" or page.count("#slots canvas") == SHOWN)
+    if page.data("learning") != "yes" and page.js("!document.getElementById('learn').disabled && !recorder.busy"):
+        time.sleep(0.3)  # learning waits where a stroke looks different from the others
+        if page.data("learning") != "yes" and int(page.data("samples") or 0) == seen:
+            page.click("learn")
     until_samples(page, seen)
     first = time.monotonic() - done
     page.until(lambda: page.data("learning") == "yes")

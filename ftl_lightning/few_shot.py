@@ -3,7 +3,6 @@
 import functools
 import operator
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -32,7 +31,7 @@ from ftl_lightning.learned_concept import LearnedConcept, Learning, concept_of
 from ftl_lightning.learning.concept_check import expect_concept, expect_sizes
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
-from ftl_lightning.learning.hub import CONCEPT_FILES, download, expect_repository, is_repository, save_with_card, upload
+from ftl_lightning.learning.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
 from ftl_lightning.learning.inversion import Watch
 from ftl_lightning.learning.learner import Learner
 from ftl_lightning.learning.library import Library, library
@@ -454,10 +453,7 @@ class FewShot(Shown):
         Raises:
             UserError: for a name that is none, or a place that cannot be written to.
         """
-        expect_repository(repository)
-        with tempfile.TemporaryDirectory() as folder:
-            self.save_pretrained(folder)
-            return upload(folder, repository, private)
+        return upload(self.save_pretrained, repository, private)
 
     def publish(self, concept: LearnedConcept, repository: str, private: bool = False, demonstrations: bool = False) -> str:
         """Upload a concept that was learned with this model, see :meth:`LearnedConcept.push_to_hub`; :meth:`load` takes its name.

@@ -1,7 +1,6 @@
 """A learned concept as a user of the Python API holds it."""
 
 import functools
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.hub import expect_repository, upload
+from ftl_lightning.learning.hub import upload
 from ftl_lightning.learning.library import kept_file
 from ftl_lightning.learning.quality import Inspection, inspected
 from ftl_lightning.shared_concept import write_folder
@@ -138,10 +137,7 @@ class LearnedConcept(Composition):
         Raises:
             UserError: for a name that is none, or a place that cannot be written to.
         """
-        expect_repository(repository)
-        with tempfile.TemporaryDirectory() as folder:
-            self.save_pretrained(folder, demonstrations)
-            return upload(folder, repository, private)
+        return upload(lambda folder: self.save_pretrained(folder, demonstrations), repository, private)
 
 
 def concept_of(model: ConceptModel, space: str, call: str, concept: object) -> Composition:

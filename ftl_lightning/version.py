@@ -1,3 +1,3 @@
-"""The version of this package."""
+"""The version of this package: here alone, but for ``CITATION.cff``, which a test compares."""
 
 __version__ = "0.1.0"

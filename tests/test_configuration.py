@@ -4,9 +4,6 @@ import functools
 import importlib
 import inspect
 import shutil
-import subprocess
-import sys
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +13,7 @@ import yaml
 from ftl_lightning.cli import main
 from ftl_lightning.configuration import SECTIONS, _say_once, expanded, find, load, parts
 from ftl_lightning.errors import UserError
-from ftl_lightning.shipped import FOLDERS, shipped
+from ftl_lightning.shipped import shipped
 from ftl_lightning.tuned import settings_of
 from tests.conftest import CONF, ROOT
 from tests.test_cli import CONFIGS
@@ -363,26 +360,3 @@ def test_sections_do_not_say_the_same(path: Path) -> None:
     """What counts for both stands above them."""
     sections = [dict(leaves(yaml.safe_load(path.read_text()).get(name, {}))) for name in SECTIONS]
     assert {key for key in sections[0].keys() & sections[1].keys() if sections[0][key] == sections[1][key]} == set()
-
-
-def test_a_wheel_holds_every_configuration_and_model(tmp_path: Path) -> None:
-    setuptools = pytest.importorskip("setuptools", reason="builds a wheel without the package index")
-    if int(setuptools.__version__.split(".")[0]) < 77:
-        pytest.skip("needs setuptools 77")
-    source = tmp_path / "source"
-    source.mkdir()
-    for name in ("ftl_lightning", "conf", "pretrained"):
-        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    offline = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", tmp_path, source], check=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        inside = set(archive.namelist())
-        (scripts,) = [archive.read(name).decode() for name in inside if name.endswith("entry_points.txt")]
-    for folder in FOLDERS:
-        files = [path.relative_to(ROOT) for path in (ROOT / folder).rglob("*") if path.is_file()]
-        assert files
-        assert {f"ftl_lightning/{path.as_posix()}" for path in files} <= inside
-    assert "ftl-lightning = ftl_lightning.cli:main" in scripts

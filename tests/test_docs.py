@@ -23,6 +23,8 @@ CARDS = (
     *ROOT.glob("ftl_lightning/domains/**/README.md"),
     ROOT / "conf" / "README.md",
     ROOT / "results" / "README.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "CONTRIBUTING.md",
 )
 PAGES = tuple(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts and not path.is_symlink())
 TEXTS = (README, *PAGES, *CARDS)

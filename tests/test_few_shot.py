@@ -137,7 +137,7 @@ def test_a_setting_can_be_another(scenes: FewShot, shown: Demonstrations, capsys
     assert found.concept.origin.weights == "learned"
     assert scenes.learn(shown.states, name="mine", steps=1).concept.origin.name == "mine"
     for changes, message in (
-        ({"pace": 1}, r"learn: expected components, omega, .* \(or steps, seed, progress\), found .pace."),
+        ({"pace": 1}, r"learn: expected components, omega, .* \(or steps, seed, progress, watch\), found .pace."),
         ({"components": 0}, r"model\.components: expected 1 or more, found 0"),
     ):
         with pytest.raises(UserError, match=message):

@@ -219,7 +219,7 @@ class Demonstrations(Shown):
 
             return write_minari(self, name)
         if kind == "lerobot":
-            from ftl_lightning.demonstrations.lerobot import write_lerobot
+            from ftl_lightning.demonstrations.lerobot_writing import write_lerobot
 
             return write_lerobot(self, name)
         header = {

@@ -1,7 +1,8 @@
 """Models and concepts on the Hugging Face Hub; all that is done there needs a network."""
 
 import re
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ftl_lightning.errors import UserError, short, shown
@@ -57,24 +58,32 @@ def download(
         raise UserError(f"{repository}: expected {expected}, found none ({_reason(error)})") from error
 
 
-def upload(folder: str | Path, repository: str, private: bool = False) -> str:
+def upload(write: Callable[[Path], object], repository: str, private: bool = False) -> str:
     """Upload a folder as ``owner/name``; needs a login.
+
+    Args:
+        write: puts the files into a folder; not called where the name is none.
+        repository: the name.
+        private: whether only you see it, if it is new.
 
     Returns:
         Where it is.
 
     Raises:
-        UserError: if it cannot be uploaded.
+        UserError: for a name that is none, or if it cannot be uploaded.
     """
-    from huggingface_hub import HfApi
+    expect_repository(repository)
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder))
+        from huggingface_hub import HfApi
 
-    hub = HfApi()
-    try:
-        hub.create_repo(repository, private=private, exist_ok=True)
-        return str(hub.upload_folder(repo_id=repository, folder_path=folder))
-    except Exception as error:
-        told = f"{repository}: expected a place on the Hub that you may write to, found none ({_reason(error)})"
-        raise UserError(f"{told}; log in first: hf auth login") from error
+        hub = HfApi()
+        try:
+            hub.create_repo(repository, private=private, exist_ok=True)
+            return str(hub.upload_folder(repo_id=repository, folder_path=folder))
+        except Exception as error:
+            told = f"{repository}: expected a place on the Hub that you may write to, found none ({_reason(error)})"
+            raise UserError(f"{told}; log in first: hf auth login") from error
 
 
 def _reason(error: Exception) -> str:

@@ -18,7 +18,7 @@ from starlette.routing import Route
 from ftl_lightning.errors import UserError, mistake_of_machine, short
 from ftl_lightning.play import requests
 from ftl_lightning.play.guard import Guard, body_of
-from ftl_lightning.play.page import page
+from ftl_lightning.play.page import POLICY, page
 from ftl_lightning.play.workspace import Stopped, Workspace
 from ftl_lightning.printing import line, say
 from ftl_lightning.schema import built, parse_json
@@ -29,10 +29,8 @@ MOST_WAITING = 32
 """Questions that wait for one that is being answered; more are sent away."""
 WAIT = 0.5
 """Seconds after which it is asked whether anybody still waits for what is learned."""
-POLICY = (
-    "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; img-src data: blob:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
+SERVED = "; connect-src 'self'; frame-ancestors 'none'"
+"""What a page that is served may do beside the policy of every page: ask this server."""
 
 ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
     "scene": (requests.Pose, Workspace.scene),
@@ -42,7 +40,6 @@ ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
     "undo": (requests.Nothing, Workspace.undo),
     "clear": (requests.Nothing, Workspace.clear),
     "sample": (requests.Sample, Workspace.sample),
-    "forget": (requests.Named, Workspace.forget),
 }
 """What is posted as JSON: its form, and who answers."""
 
@@ -158,7 +155,7 @@ def guarded(
 async def first_page(request: Request) -> Response:
     """The page itself; what it shows it asks for."""
     nonce = secrets.token_urlsafe(16)
-    return HTMLResponse(page(nonce), headers={"content-security-policy": POLICY.format(nonce=nonce)})
+    return HTMLResponse(page(nonce), headers={"content-security-policy": POLICY.format(nonce=nonce) + SERVED})
 
 
 def viewing(shown: Mapping[str, Any]) -> list[Route]:

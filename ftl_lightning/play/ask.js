@@ -2,11 +2,15 @@
 const GONE = "The program has ended; start it again and reload.";
 const token = new URLSearchParams(location.search).get("token") || "";
 let answers = null; // by request, where there is no program
+let closed = false; // whether a person ended the program: nothing is asked any more, and nothing is a mistake
 
 // The name of a request among answers that were made before.
 const requestKey = (path, body) => body === undefined ? path : `${path} ${JSON.stringify(body)}`;
 
+const gone = () => closed ? new DOMException("The program has ended.", "AbortError") : new Error(GONE);
+
 async function request(path, body, signal) {
+  if (closed) throw gone();
   const raw = body instanceof Blob;
   const headers = { "X-Token": token };
   if (body !== undefined) headers["Content-Type"] = raw ? "application/octet-stream" : "application/json";
@@ -14,7 +18,7 @@ async function request(path, body, signal) {
   try {
     response = await fetch(path, { method: body === undefined ? "GET" : "POST", headers, body: raw ? body : JSON.stringify(body), signal });
   } catch (error) {
-    throw error.name === "AbortError" ? error : new Error(GONE);
+    throw error.name === "AbortError" ? error : gone();
   }
   if (response.ok) return response;
   let told = "";
@@ -33,7 +37,7 @@ async function answered(response) {
   try {
     return await response.json();
   } catch (error) {
-    throw error.name === "AbortError" ? error : new Error(GONE);
+    throw error.name === "AbortError" ? error : gone();
   }
 }
 
@@ -46,7 +50,7 @@ async function* askLines(path, body, signal) {
     try {
       read = await reader.read();
     } catch (error) {
-      throw error.name === "AbortError" ? error : new Error(GONE);
+      throw error.name === "AbortError" ? error : gone();
     }
     rest += read.done ? decoder.decode() : decoder.decode(read.value, { stream: true });
     const lines = rest.split("\n");
@@ -68,6 +72,16 @@ function tellError(text, by = "") {
   find("error").dataset.by = by;
   find("error-text").textContent = text;
   find("error").hidden = !text;
+}
+
+// Asks before something is lost; answers whether it is wanted.
+function sure(text, yes) {
+  const dialog = find("sure");
+  find("sure-text").textContent = text;
+  find("sure-yes").textContent = yes;
+  dialog.returnValue = "";
+  dialog.showModal();
+  return new Promise((then) => dialog.addEventListener("close", () => then(dialog.returnValue === "yes"), { once: true }));
 }
 
 // Errors are told, and never break the page; what was given up for something newer is none. What a person does next takes

@@ -1,5 +1,5 @@
 // Steps 1 and 2: the demonstrations that are there, and learning a concept from them.
-const learning = { stop: null, concept: null, named: false, losses: [] };
+const learning = { stop: null, concept: null, from: "", told: "", samples: [], named: false, losses: [], unsaved: new Map() };
 const many = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 const announce = (text) => { find("announced").textContent = text; };
 
@@ -19,25 +19,63 @@ function worked(work, added = false) {
   learnable();
   if (added) {
     announce(`${many(work.demonstrations.length, "demonstration")} of ${work.wanted}.`);
-    if (work.demonstrations.length >= work.wanted) learnInSight();
+    learnOf(work);
   }
 }
 
-const checks = (work) => [...work.demonstrations.flatMap((one, number) => one.flags.map((flag) => `\u26A0 Demonstration ${number + 1}: ${flag}`)), ...work.check];
+// Learning starts by itself where there are enough demonstrations and none looks wrong.
+function learnOf(work) {
+  if (work.demonstrations.length < work.wanted) return;
+  doubt() ? announce(doubt()) : learnInSight();
+}
+
+// What is said before something is learned from demonstrations that a check flags; empty without any.
+function doubt() {
+  const some = state.work.demonstrations.flatMap((one, number) => one.flags.some((flag) => !alike(flag)) ? [number + 1] : []);
+  if (!some.length) return "";
+  if (some.length === 1) return `Demonstration ${some[0]} looks different from the others. Remove it, or press Learn.`;
+  return `Demonstrations ${listed(some)} look different from the others. Remove them, or press Learn.`;
+}
+
+// A flag of several demonstrations that are alike, which hold up nothing.
+const alike = (flag) => flag.startsWith("are ");
+
+// What a check says: of each demonstration, of some that are alike, and of all.
+function checks(work) {
+  const each = [], together = new Map();
+  work.demonstrations.forEach((one, number) => one.flags.forEach((flag) => {
+    if (alike(flag)) together.set(flag, [...(together.get(flag) || []), number + 1]);
+    else each.push(`\u26A0 Demonstration ${number + 1}: ${flag}`);
+  }));
+  return [...each, ...[...together].map(([flag, own]) => `\u26A0 Demonstrations ${listed(own)} ${flag}`), ...work.check];
+}
+
+const listed = (numbers) => numbers.length < 2 ? numbers.join() : `${numbers.slice(0, -1).join(", ")} and ${numbers.at(-1)}`;
 
 function slots() {
-  const { demonstrations, wanted } = state.work, list = find("slots"), view = demonstrations.length ? viewOf(demonstrations.map((one) => one.film)) : null;
+  const { demonstrations, wanted } = state.work, list = find("slots"), view = slotView(demonstrations.map((one) => one.film));
+  list.style.setProperty("--aspect", view && Array.isArray(view) ? view[2] / view[3] : 1);
   while (list.children.length > Math.max(wanted, demonstrations.length)) freed(list.lastChild);
   for (let number = 0; number < Math.max(wanted, demonstrations.length); number++) {
     const slot = list.children[number] || emptySlot(list, number), one = demonstrations[number];
     slot.classList.toggle("empty", !one);
     slot.number = one ? one.id : null;
-    slot.rubbish.hidden = !one || Boolean(answers);
+    slot.rubbish.hidden = Boolean(answers);
     slot.flag.textContent = one && one.flags.length ? "\u26A0" : "";
     slot.flag.title = one ? one.flags.join(" ") : "";
     slot.film.figure.hidden = !one;
     if (one) setFilm(slot.film, one.film, view, `Demonstration ${number + 1}${one.flags.length ? `, ${one.flags.join(" ")}` : ""}`);
   }
+}
+
+// The view of all slots. With a canvas it has the shape of this from the beginning, so that nothing moves at the first one.
+function slotView(shown) {
+  const canvas = recorder.scene && recorder.scene.film.window;
+  if (!shown.length) return canvas;
+  const view = viewOf(shown);
+  if (!canvas || !Array.isArray(view)) return view;
+  const [left, lower, width, height] = view, wide = Math.max(width, height * canvas[2] / canvas[3]), high = wide * canvas[3] / canvas[2];
+  return [left + (width - wide) / 2, lower + (height - high) / 2, wide, high];
 }
 
 function emptySlot(list, number) {
@@ -60,19 +98,71 @@ function freed(slot) {
 
 const KINDS = { draw: "stroke", arrange: "arrangement", steer: "trip" };
 
+const shownNow = () => JSON.stringify(state.work.demonstrations.map((one) => one.id));
+
+// Whether what is there is what the last concept was learned from, whose name is then the one that is shown and changed.
+const justLearned = () => Boolean(learning.concept && !learning.stop && learning.from === shownNow());
+
 function suggested() {
-  const learned = state.concepts.filter((one) => one.kind === "learned").length;
-  return learning.task || `my ${(state.recorder && KINDS[state.recorder.kind]) || "behaviour"} ${learned + 1}`;
+  if (justLearned()) return learning.concept.name;
+  return learning.task ? unused(learning.task) : unused(`my ${(state.recorder && KINDS[state.recorder.kind]) || "behaviour"} 1`);
+}
+
+// A name that no concept has: numbers count up.
+function unused(name) {
+  const taken = new Set(state.concepts.map((one) => one.name)), [, stem, number] = /^(.*?)(?: (\d{1,6}))?$/.exec(name);
+  if (!taken.has(name)) return name;
+  let next = Number(number || 1) + 1;
+  while (taken.has(`${stem} ${next}`)) next++;
+  return `${stem.slice(0, 90)} ${next}`;
 }
 
 function learnable() {
   const count = state.work.demonstrations.length, on = Boolean(learning.stop);
   find("learn").disabled = count < 2;
   find("learn").textContent = on ? "Start again" : "Learn";
-  if (!on && !learning.concept) {
-    find("waiting").textContent = count < state.work.wanted
-      ? `Learning starts by itself at demonstration ${state.work.wanted}${count >= 2 ? "; or press Learn now" : ""}.` : "Press Learn.";
-  }
+  find("learn-why").textContent = count === 1 ? "Show at least two" : "";
+  find("rename").hidden = !justLearned() || find("name").value.trim() === learning.concept.name;
+  if (on) return;
+  const enough = count >= state.work.wanted, waiting = find("waiting");
+  waiting.classList.toggle("warned", enough && !justLearned() && Boolean(doubt()));
+  if (enough && !justLearned() && doubt()) waiting.textContent = doubt();
+  else if (learning.concept) waiting.textContent = learning.told;
+  else if (enough) waiting.textContent = "Press Learn.";
+  else waiting.textContent = `Learning starts by itself at demonstration ${state.work.wanted}${count >= 2 ? "; or press Learn now" : ""}.`;
+}
+
+// Gives the concept that was just learned the name that stands in the field.
+function rename() {
+  const name = find("name").value.trim().replace(/\s+/g, " ");
+  if (!justLearned() || !name || name === learning.concept.name) return;
+  if (state.concepts.some((one) => one.name === name)) { tellError(`A concept has the name \u201c${name}\u201d already: choose another one.`); return; }
+  attempt(async () => {
+    const found = await ask("/api/rename", { id: learning.concept.id, name });
+    learning.named = false;
+    learning.told = learning.told.replace(`\u201c${learning.concept.name}\u201d`, () => `\u201c${name}\u201d`);
+    learning.concept = { ...learning.concept, name };
+    if (learning.unsaved.has(learning.concept.hash + learning.concept.id)) learning.unsaved.set(learning.concept.hash + learning.concept.id, name);
+    await renew(found);
+    samplesTold(learning.samples, name);
+    announce(`The concept is called ${name}.`);
+  });
+}
+
+function saveConcept(id) {
+  const { name, hash } = conceptOf(id);
+  return attempt(async () => {
+    await download(`/api/concept?id=${encodeURIComponent(id)}`, `${name}.safetensors`);
+    learning.unsaved.delete(hash + id);
+  });
+}
+
+// Goes on without what the last concept showed: another model is worked with, or the concept is there no more.
+function noConcept() {
+  Object.assign(learning, { concept: null, from: "", told: "", samples: [] });
+  fill(find("samples"), [], null, () => "");
+  find("quality").textContent = "";
+  find("progress").hidden = find("learned").hidden = find("meaning").hidden = true;
 }
 
 const smooth = () => matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth";
@@ -85,12 +175,14 @@ function learnInSight() {
 
 async function learn() {
   if (learning.stop) learning.stop.abort();
-  const stop = learning.stop = new AbortController(), name = find("name").value.trim() || suggested();
-  Object.assign(learning, { concept: null, losses: [] });
+  const name = unused((find("name").value.trim() || suggested()).replace(/\s+/g, " ")), stop = learning.stop = new AbortController();
+  Object.assign(learning, { concept: null, losses: [], from: shownNow() });
+  find("name").value = name;
   document.body.dataset.learning = "yes";
   find("quality").textContent = "";
-  find("learned").hidden = true;
+  find("learned").hidden = find("meaning").hidden = true;
   find("progress").hidden = false;
+  find("waiting").classList.remove("warned");
   find("waiting").textContent = "Learning \u2026";
   announce(`Learning ${name}.`);
   learnable();
@@ -107,7 +199,6 @@ async function learn() {
   learning.stop = null;
   document.body.dataset.learning = "no";
   find("progress").hidden = !learning.concept;
-  if (!learning.concept) find("waiting").textContent = "";
   learnable();
 }
 
@@ -146,11 +237,13 @@ function lossCurve(steps) {
 function learned(line) {
   learning.concept = line.concept;
   learning.named = false;
+  learning.samples = line.samples;
+  learning.unsaved.set(line.concept.hash + line.concept.id, line.concept.name);
   state.concepts = line.concepts;
-  const took = `Learned \u201c${line.concept.name}\u201d in ${line.seconds.toFixed(1)} seconds.`;
+  const took = learning.told = `Learned \u201c${line.concept.name}\u201d in ${line.seconds.toFixed(1)} seconds.`;
   find("waiting").textContent = took;
   find("quality").textContent = line.quality.line;
-  find("learned").hidden = false;
+  find("learned").hidden = find("meaning").hidden = false;
   same("work", line.same);
   samplesTold(line.samples, line.concept.name);
   if (learning.losses.length) {
@@ -194,7 +287,7 @@ function setWays() {
   find("library-why").textContent = library.why;
   find("upload").accept = uploads.join(",");
   find("upload-kinds").textContent = uploads.join(", ");
-  find("draw").textContent = `Draw ${["none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"][state.work.wanted] || state.work.wanted}`;
+  find("draw").textContent = `Take ${["none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"][state.work.wanted] || state.work.wanted}`;
 }
 
 async function upload(file) {
@@ -205,7 +298,7 @@ async function upload(file) {
     const added = JSON.stringify(found.work.demonstrations.map((one) => one.id)) !== before;
     await renew(found);
     announce(`${file.name} is opened.`);
-    if (added && found.work.demonstrations.length >= found.work.wanted) learnInSight();
+    if (added) learnOf(found.work);
   });
 }
 
@@ -215,8 +308,10 @@ function listenToWork() {
   find("undo").addEventListener("click", undo);
   find("clear").addEventListener("click", () => attempt(async () => worked(await ask("/api/clear", {}))));
   find("learn").addEventListener("click", learn);
-  find("name").addEventListener("input", () => { learning.named = find("name").value.trim() !== ""; });
-  find("save").addEventListener("click", () => attempt(() => download(`/api/concept?id=${encodeURIComponent(learning.concept.id)}`, `${learning.concept.name}.safetensors`)));
+  find("name").addEventListener("input", () => { learning.named = find("name").value.trim() !== ""; learnable(); });
+  find("name").addEventListener("keydown", (event) => { if (event.key === "Enter") rename(); });
+  find("rename").addEventListener("click", rename);
+  find("save").addEventListener("click", () => saveConcept(learning.concept.id));
   find("save-its").addEventListener("click", () => attempt(() => download(`/api/demonstrations?id=${encodeURIComponent(learning.concept.id)}`, "demonstrations.npz")));
   find("to-mix").addEventListener("click", () => {
     find("mix-title").scrollIntoView({ behavior: smooth() });

@@ -2,7 +2,9 @@
 const WAIT = 50; // milliseconds between a change and the question for its samples
 const SLOW = 400; // milliseconds after which it is told that samples are on their way
 const MANY = 10; // concepts above which they can be searched
-const mix = { parts: [], seed: 0, timer: 0, asking: null, again: false, view: null, thumbnails: new Map(), waiting: [], fetching: false };
+const FEW = 6; // concepts that a phone shows at first
+const phone = matchMedia("(max-width: 760px)");
+const mix = { parts: [], seed: 0, timer: 0, asking: null, again: false, view: null, cards: new Map(), all: false, waiting: [], fetching: null };
 const conceptOf = (id) => state.concepts.find((one) => one.id === id);
 
 // --- the list of concepts
@@ -11,31 +13,40 @@ const HEADINGS = { learned: "Yours", opened: "From files", training: "Known from
 
 function conceptList() {
   const sought = find("sought").value.trim().toLowerCase();
-  find("sought-label").hidden = state.concepts.length <= MANY;
-  const shown = state.concepts.filter((one) => one.name.toLowerCase().includes(sought));
-  mix.cards = mix.cards || new Map();
-  for (const [id, card] of mix.cards) if (!conceptOf(id)) { dropCanvas(card.film); mix.cards.delete(id); }
+  find("sought-label").hidden = state.concepts.length <= MANY && !sought;
+  const found = state.concepts.filter((one) => one.name.toLowerCase().includes(sought)), present = new Set(state.concepts.map(cardKey));
+  const order = Object.keys(HEADINGS), sorted = found.toSorted((one, other) => order.indexOf(one.kind) - order.indexOf(other.kind));
+  const few = phone.matches && !mix.all && !sought && found.length > FEW;
+  const shown = few ? sorted.filter((one, number) => number < FEW || mix.parts.some((part) => part.id === one.id)) : sorted;
+  for (const [key, card] of mix.cards) if (!present.has(key)) { dropCanvas(card.film); inSight.unobserve(card); mix.cards.delete(key); }
   const groups = Object.keys(HEADINGS).map((kind) => [kind, shown.filter((one) => one.kind === kind)]).filter(([, own]) => own.length);
   find("concepts").replaceChildren(...groups.flatMap(([kind, own]) => [made("h3", { textContent: HEADINGS[kind] }), made("ul", {}, ...own.map(card))]));
+  find("all").hidden = !few;
+  find("all").textContent = `Show all ${found.length}`;
   if (!shown.length) find("concepts").append(made("p", { className: "note", textContent: "No concept has this name." }));
 }
 
+// Models give the same ids to their concepts.
+const cardKey = (concept) => `${concept.hash} ${concept.id}`;
+
 function card(concept) {
-  const one = mix.cards.get(concept.id) || newCard(concept);
+  const one = mix.cards.get(cardKey(concept)) || newCard(concept);
   const on = mix.parts.some((part) => part.id === concept.id), pairs = state.offline && state.offline.pairs;
   one.pick.setAttribute("aria-pressed", on);
   one.pick.disabled = Boolean(pairs && !pairs.some((pair) => pair.includes(concept.id)));
   one.querySelector(".name").textContent = concept.name;
   one.querySelector(".about").textContent = about(concept);
+  one.pick.title = concept.form ? `Form: ${concept.form}` : "";
+  if (one.save) one.save.ariaLabel = `Save ${concept.name} as a file`;
+  if (one.forget) one.forget.ariaLabel = `Forget ${concept.name}`;
   return one;
 }
 
 function about(concept) {
   const parts = [];
-  if (concept.count) parts.push(`from ${concept.count}`);
-  if (concept.accuracy !== null && concept.accuracy !== undefined) parts.push(`accuracy ${concept.accuracy.toFixed(2)}`);
-  if (concept.form) parts.push(concept.form);
-  return parts.join(", ");
+  if (concept.count) parts.push(many(concept.count, "demonstration"));
+  if (concept.accuracy !== null && concept.accuracy !== undefined) parts.push(`${concept.accuracy.toFixed(2)} right`);
+  return parts.join(" \u00b7 ");
 }
 
 function newCard(concept) {
@@ -47,17 +58,23 @@ function newCard(concept) {
   one.pick.addEventListener("click", () => pick(concept.id));
   one.append(one.pick);
   if (["learned", "opened"].includes(concept.kind) && !answers) {
-    const save = made("button", { type: "button", className: "plain", textContent: "Save", ariaLabel: `Save ${concept.name} as a file` });
-    save.addEventListener("click", () => attempt(() => download(`/api/concept?id=${encodeURIComponent(concept.id)}`, `${concept.name}.safetensors`)));
-    const forget = made("button", { type: "button", className: "plain", textContent: "Forget", ariaLabel: `Forget ${concept.name}` });
-    forget.addEventListener("click", () => attempt(async () => renew(await ask("/api/forget", { id: concept.id }))));
-    one.append(made("div", { className: "row" }, save, forget));
+    one.save = made("button", { type: "button", className: "plain", textContent: "Save" });
+    one.save.addEventListener("click", () => saveConcept(concept.id));
+    one.forget = made("button", { type: "button", className: "plain", textContent: "Forget" });
+    one.forget.addEventListener("click", () => forget(concept));
+    one.append(made("div", { className: "row" }, one.save, one.forget));
   }
-  mix.cards.set(concept.id, one);
-  one.dataset.id = concept.id;
+  mix.cards.set(cardKey(concept), one);
+  one.concept = concept;
   inSight.observe(one);
   return one;
 }
+
+const forget = (concept) => attempt(async () => {
+  const found = await ask("/api/forget", { id: concept.id });
+  learning.unsaved.delete(concept.hash + concept.id);
+  await renew(found);
+});
 
 // Films of concepts are asked for one at a time, when they come in sight, after the first samples are there.
 const inSight = new IntersectionObserver((changes) => {
@@ -66,18 +83,37 @@ const inSight = new IntersectionObserver((changes) => {
 });
 
 async function thumbnails() {
-  if (mix.fetching || !document.body.dataset.samples) return;
-  mix.fetching = true;
-  while (mix.waiting.length) {
-    const one = mix.waiting.shift(), id = one.dataset.id;
-    if (!one.isConnected || !conceptOf(id)) continue;
+  if (mix.fetching || opening || !document.body.dataset.samples) return;
+  const stop = mix.fetching = new AbortController(), there = (one) => mix.cards.get(cardKey(one.concept)) === one;
+  while (mix.waiting.length && !stop.signal.aborted) {
+    const one = mix.waiting.shift();
+    if (!there(one)) continue;
+    if (!one.isConnected) { inSight.observe(one); continue; } // not shown for now
     try {
-      const { film } = await ask(`/api/thumbnail?id=${encodeURIComponent(id)}`);
-      setCanvas(one.film, [film], null, conceptOf(id) ? conceptOf(id).name : "");
+      const { film } = await ask(`/api/thumbnail?id=${encodeURIComponent(one.concept.id)}`, undefined, stop.signal);
+      if (stop.signal.aborted) break;
+      if (!there(one)) continue;
+      setCanvas(one.film, [film], null, one.concept.name);
       one.classList.add("filmed");
     } catch { /* a concept can be used without a picture */ }
   }
-  mix.fetching = false;
+  if (mix.fetching === stop) mix.fetching = null;
+}
+
+// Gives up all questions of a model: another one is opened, or the program ends.
+function noQuestions() {
+  if (mix.fetching) mix.fetching.abort();
+  if (mix.asking) mix.asking.abort();
+  clearTimeout(mix.timer);
+  Object.assign(mix, { timer: 0, again: false, fetching: null, waiting: [] });
+}
+
+// Nothing of a model that is left stays to be seen.
+function noSamples() {
+  fill(find("mixed"), [], null, () => "");
+  for (const id of ["told", "took", "mix-name"]) find(id).textContent = "";
+  find("enlarging").hidden = true;
+  same("mix", { python: "", command: "" });
 }
 
 // --- what is in the mix
@@ -101,17 +137,19 @@ function pickPair(id) {
   if (found) mix.parts = found.map((one) => mix.parts.find((old) => old.id === one) || part(one));
 }
 
-// The page is never empty: a concept of training is in the mix at the beginning, and what was just learned is added.
+// The page is never empty: a concept of training is in the mix at the beginning.
 function firstMix() {
   const first = state.concepts.find((one) => one.kind === "training") || state.concepts[0];
   mix.parts = first ? [part(first.id, true)] : [];
   if (state.offline) mix.parts = (state.offline.pairs[0] || []).map((id) => part(id));
 }
 
+// What was just learned is in the mix alone, or half and half with what was learned before, or added to what a person chose.
 function mixLearned(concept) {
-  const chosen = mix.parts.filter((one) => !one.automatic && one.id !== concept.id);
-  const other = state.concepts.find((one) => one.kind === "training" && one.name !== concept.name);
-  mix.parts = [...(chosen.length || !other ? chosen : [part(other.id, true)]), part(concept.id, true)];
+  const learned = (one) => conceptOf(one.id).kind === "learned", there = mix.parts.filter((one) => conceptOf(one.id) && one.id !== concept.id);
+  const chosen = there.filter((one) => !one.automatic), before = chosen.length ? chosen : there.filter(learned).slice(-1);
+  mix.parts = [...before, part(concept.id, true)];
+  if (before.length === 1 && learned(before[0])) for (const one of mix.parts) one.weight = 0.5;
   mixed();
 }
 
@@ -158,7 +196,7 @@ function groupBoxes(one, concept) {
     });
     return made("label", { className: "check" }, box, name);
   });
-  return made("fieldset", { className: "groups" }, made("legend", { textContent: `${concept.name} decides` }), ...boxes);
+  return made("fieldset", { className: "groups" }, made("legend", { textContent: `${concept.name} moves:` }), ...boxes);
 }
 
 // --- samples
@@ -174,6 +212,7 @@ function question() {
 // Samples follow the sliders while these move. Only one question is open at a time, as the program answers one after another;
 // what changes meanwhile is asked for next, so that no question of an older choice ever waits.
 function resample() {
+  if (opening || closed) return;
   mix.again = true;
   if (!mix.timer && !mix.asking) mix.timer = setTimeout(sample, WAIT);
 }
@@ -182,10 +221,11 @@ async function sample() {
   const stop = mix.asking = new AbortController();
   mix.again = false;
   mix.timer = 0;
-  const slow = setTimeout(() => { find("took").textContent = "sampling \u2026"; }, SLOW);
+  const slow = setTimeout(() => { if (!stop.signal.aborted) find("took").textContent = "sampling \u2026"; }, find("mixed").have && find("mixed").have.length ? SLOW : 0);
   find("mixed").setAttribute("aria-busy", "true");
   if (mix.parts.length) {
     const asked = question(), name = mixName();
+    if (!find("mix-name").textContent) find("mix-name").textContent = name;
     await attempt(async () => {
       const found = await ask("/api/sample", asked, stop.signal);
       if (stop.signal.aborted) return;
@@ -193,18 +233,18 @@ async function sample() {
       fill(find("mixed"), found.samples, mix.view, (number) => `Sample ${number + 1} of ${name}`);
       find("told").textContent = found.told;
       find("mix-name").textContent = name;
-      find("took").textContent = answers ? "" : found.seconds < 0.95 ? `${Math.round(1000 * found.seconds)} ms` : `${found.seconds.toFixed(1)} s`;
+      find("took").textContent = answers ? "" : `${Math.max(0.1, found.seconds).toFixed(1)} s`;
+      find("enlarging").hidden = !found.samples.length;
       same("mix", found.same);
       newSamples();
       thumbnails();
     }, "mix");
-  } else {
-    fill(find("mixed"), [], null, () => "");
-    find("told").textContent = find("took").textContent = find("mix-name").textContent = "";
-  }
+  } else noSamples();
   clearTimeout(slow);
+  if (mix.asking !== stop) return; // another model's is asked for
   if (find("took").textContent.startsWith("sampling")) find("took").textContent = "";
   mix.asking = null;
+  settled();
   if (mix.again) resample();
   find("mixed").setAttribute("aria-busy", "false");
 }
@@ -212,9 +252,12 @@ async function sample() {
 const mixName = () => mix.parts.map((one) => (one.weight === 1 ? "" : `${Number(one.weight.toFixed(2))} \u00d7 `) + conceptOf(one.id).name).join(" + ");
 
 function setMix() {
-  if (mix.asking) mix.asking.abort();
-  Object.assign(mix, { seed: 0, view: null, parts: [] });
-  find("seed").textContent = "noise 0";
+  noQuestions();
+  Object.assign(mix, { seed: 0, view: null, parts: [], all: false });
+  find("seed").textContent = "set 1";
+  find("sought").value = "";
+  find("count").value = 8;
+  find("execute").checked = find("careful").checked = false;
   find("temperature").value = state.temperature;
   find("temperature-value").textContent = Number(find("temperature").value).toFixed(2);
   find("executing").hidden = !state.executes;
@@ -228,6 +271,8 @@ function setMix() {
 function listenToMix() {
   find("temperature").addEventListener("input", () => { find("temperature-value").textContent = Number(find("temperature").value).toFixed(2); resample(); });
   for (const id of ["count", "execute", "starts"]) find(id).addEventListener("change", resample);
-  find("noise").addEventListener("click", () => { mix.seed += 1; find("seed").textContent = `noise ${mix.seed}`; resample(); });
+  find("noise").addEventListener("click", () => { mix.seed += 1; find("seed").textContent = `set ${mix.seed + 1}`; resample(); });
   find("sought").addEventListener("input", conceptList);
+  find("all").addEventListener("click", () => { mix.all = true; conceptList(); });
+  phone.addEventListener("change", () => { if (state && !state.viewer) conceptList(); });
 }

@@ -14,7 +14,7 @@ SCRIPTS = (FILM, *(HERE / f"{name}.js" for name in ("space", "films", "ask", "re
 POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""What a page that asks no program may do."""
+"""What every page may do: run its own program, and load nothing."""
 
 
 def page(nonce: str, offline: bytes | None = None) -> str:

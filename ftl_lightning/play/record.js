@@ -6,6 +6,15 @@ const recorder = { kind: "", scene: null, coming: null, queue: Promise.resolve()
 
 const board = () => find("show");
 
+// Nothing is shown in until another model's scene is there.
+function noScene() {
+  Object.assign(recorder, { scene: null, path: [], times: [], shown: [], down: false, held: null, pointer: null, penKeys: false });
+  recorder.keys.clear();
+  board().getContext("2d").clearRect(0, 0, board().width, board().height);
+  find("handles").replaceChildren();
+  find("pen-keys").setAttribute("aria-pressed", false);
+}
+
 async function newScene() {
   const task = find("task").value || "";
   recorder.coming = ask("/api/scene", { task }).then((scene) => {
@@ -187,6 +196,7 @@ function pointerDown(event) {
   if (!recorder.scene || event.button > 0 || (recorder.busy && recorder.kind !== "draw")) return;
   const place = placeOf(event);
   if (recorder.kind === "draw") {
+    if (recorder.penKeys) penMode(false); // who presses on the canvas draws
     Object.assign(recorder, { down: true, path: [[place]], times: [0], began: event.timeStamp });
   } else if (recorder.kind === "arrange") {
     recorder.held = under(place);
@@ -244,9 +254,10 @@ function keyDown(event) {
   const key = arrowOf(event), steers = recorder.kind === "steer", draws = recorder.kind === "draw" && recorder.penKeys;
   if (ARROWS[key] && (steers || (draws && key.startsWith("Arrow")))) {
     event.preventDefault();
-    recorder.keys.add(key);
     recorder.fast = event.shiftKey;
-    steers ? steering() : penMoving();
+    const anew = !recorder.keys.has(key);
+    recorder.keys.add(key);
+    steers ? steering(anew) : penMoving(anew);
   } else if (draws && key === " ") {
     event.preventDefault();
     if (event.repeat) return;
@@ -264,6 +275,7 @@ function keyDown(event) {
 }
 
 function penMode(on) {
+  if (!recorder.scene) return;
   recorder.penKeys = on;
   Object.assign(recorder, { down: false, path: [], times: [] });
   recorder.keys.clear();
@@ -284,39 +296,46 @@ function heading() {
   return [x / long, y / long];
 }
 
-// Moves the pen as long as an arrow key is held; its time stands still while none is.
-function penMoving() {
+function penStep(passed) {
+  const [x, y] = heading(), by = passed * recorder.scene.film.window[2] * (recorder.fast ? 0.9 : 0.4);
+  recorder.pen = inside([recorder.pen[0] + x * by, recorder.pen[1] + y * by]);
+  if (recorder.down) {
+    recorder.path.push([[...recorder.pen]]);
+    recorder.times.push(recorder.times.at(-1) + passed);
+  }
+  redraw();
+}
+
+// Moves the pen as long as an arrow key is held; its time stands still while none is. A key that is pressed anew moves it by a
+// step at once, however soon it is let go.
+function penMoving(anew) {
+  if (anew) penStep(STEP);
   if (recorder.moving) return;
   const move = (now) => {
-    const passed = Math.min(now - recorder.last, 50) / 1000, [x, y] = heading(), width = recorder.scene.film.window[2];
+    const passed = Math.max(0, Math.min(now - recorder.last, 50)) / 1000;
     recorder.last = now;
     if (!recorder.keys.size || !recorder.penKeys) { recorder.moving = false; return; }
-    const by = passed * width * (recorder.fast ? 0.9 : 0.4);
-    recorder.pen = inside([recorder.pen[0] + x * by, recorder.pen[1] + y * by]);
-    if (recorder.down) {
-      recorder.path.push([[...recorder.pen]]);
-      recorder.times.push(recorder.times.at(-1) + passed);
-    }
-    redraw();
+    penStep(passed);
     requestAnimationFrame(move);
   };
   recorder.moving = true;
-  recorder.last = performance.now() - 30;
+  recorder.last = performance.now();
   requestAnimationFrame(move);
 }
 
 // Moves what is steered towards the pointer or as keys say, no faster than it can. Time runs only while somebody steers.
-function steering() {
-  if (recorder.moving || (recorder.busy && recorder.kind === "steer")) return;
+// A key that is pressed anew moves it by a step at once, however soon it is let go.
+function steering(anew = false) {
+  if (recorder.busy && recorder.kind === "steer") return;
   if (!recorder.path.length) { recorder.path = [[[...recorder.at[0]]]]; recorder.times = [0]; }
+  if (anew && onwards()) return;
+  if (recorder.moving) { told(); redraw(); return; }
   const move = (now) => {
     let passed = Math.min((now - recorder.last) / 1000, 0.2);
     if (!recorder.path.length || (!recorder.pointer && !recorder.keys.size)) { recorder.moving = false; told(); return; }
-    const { seconds: most, speed, film } = recorder.scene;
     while (passed >= STEP) {
       passed -= STEP;
-      oneStep(speed || film.window[2] / 3, Boolean(speed));
-      if (most && recorder.passed >= most - 1e-6) { recorder.moving = false; recorder.keys.clear(); redraw(); finish(); return; }
+      if (onwards()) { recorder.moving = false; return; }
     }
     recorder.last = now - 1000 * passed;
     told();
@@ -325,7 +344,20 @@ function steering() {
   };
   recorder.moving = true;
   recorder.last = performance.now();
+  told();
+  redraw();
   requestAnimationFrame(move);
+}
+
+// A step of what is steered; returns whether its time is over.
+function onwards() {
+  const { seconds: most, speed, film } = recorder.scene;
+  oneStep(speed || film.window[2] / 3, Boolean(speed));
+  if (!most || recorder.passed < most - 1e-6) return false;
+  recorder.keys.clear();
+  redraw();
+  finish();
+  return true;
 }
 
 function oneStep(speed, limited) {
@@ -387,8 +419,7 @@ async function setRecorder(found) {
   find("stage").hidden = find("hand").hidden = find("next").hidden = !found;
   find("ways").open = !found;
   recorder.kind = found ? found.kind : "";
-  recorder.scene = null;
-  recorder.penKeys = false;
+  noScene();
   if (!found) { hint("This model has no canvas: choose demonstrations from the library or open a file."); return; }
   hint(found.hint);
   find("keys").textContent = KEYS[found.kind];
@@ -404,18 +435,33 @@ async function setRecorder(found) {
   await attempt(newScene);
 }
 
+function canvasInSight() {
+  if (find("sure").open || find("large").open || !recorder.scene) return false;
+  const box = board().getBoundingClientRect();
+  return box.height > 0 && box.bottom > 0 && box.top < innerHeight;
+}
+
+// After buttons that go on to another trip, keys steer at once.
+function toCanvas() {
+  if (recorder.kind === "steer") board().focus({ preventScroll: true });
+}
+
 function listenToHand() {
   const canvas = board();
   canvas.addEventListener("pointerdown", pointerDown);
   canvas.addEventListener("pointermove", pointerMove);
   canvas.addEventListener("pointerup", pointerUp);
   canvas.addEventListener("pointercancel", pointerCancel);
-  canvas.addEventListener("keydown", keyDown);
-  canvas.addEventListener("keyup", (event) => recorder.keys.delete(arrowOf(event)));
-  canvas.addEventListener("blur", () => recorder.keys.clear());
-  find("keep").addEventListener("click", finish);
+  // Keys work on the canvas, and as long as it is in sight, where nothing else has the focus.
+  addEventListener("keydown", (event) => {
+    const free = event.target === document.body || event.target === document.documentElement || event.target === find("stage");
+    if (event.target === canvas || (free && canvasInSight())) keyDown(event);
+  });
+  addEventListener("keyup", (event) => recorder.keys.delete(arrowOf(event)));
+  for (const one of [canvas, window]) one.addEventListener("blur", () => recorder.keys.clear());
+  find("keep").addEventListener("click", () => { finish(); toCanvas(); });
   find("pen-keys").addEventListener("click", () => penMode(!recorder.penKeys));
-  find("scene").addEventListener("click", () => attempt(newScene));
+  find("scene").addEventListener("click", () => { attempt(newScene); toCanvas(); });
   find("task").addEventListener("change", () => attempt(newScene));
   addEventListener("resize", redraw);
 }

@@ -96,13 +96,12 @@ class Workspace:
         self._concepts = {
             f"t{number}": Known(text, "training", self._model[text]) for number, text in enumerate(self._model.training_concepts)
         }
-        for number, entry in enumerate(self._model.library()):
-            if entry.path is not None:
-                found = self._model.load(entry.path)
-                several = sum(other.name == entry.name for other in self._model.library().learned) > 1
-                name = entry.stem if several else entry.name
-                known = Known(name, entry.kind, found, found.concept, str(entry.path), accuracy=entry.accuracy)
-                self._concepts[f"s{number}"] = known
+        learned = self._model.library().learned
+        for number, entry in enumerate(learned):
+            found = self._model.load(str(entry.path))
+            name = entry.stem if sum(other.name == entry.name for other in learned) > 1 else entry.name
+            known = Known(name, entry.kind, found, found.concept, str(entry.path), accuracy=entry.accuracy)
+            self._concepts[f"s{number}"] = known
 
     def state(self) -> dict[str, Any]:
         """All that the page shows at first."""

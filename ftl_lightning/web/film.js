@@ -59,7 +59,7 @@ function fitted(canvas, tall) {
 function draw(canvas, film, seconds, view, how = {}) {
   const [left, lower, width, height] = view;
   const [across, down] = fitted(canvas, height / width);
-  const pen = canvas.getContext("2d"), scale = across / width;
+  const pen = canvas.getContext("2d"), scale = across / width, fine = across / (canvas.clientWidth || across);
   const frame = Math.min(seconds * film.rate, film.frames - 1);
   if (!how.over) pen.clearRect(0, 0, across, down);
   pen.globalAlpha = how.alpha || 1;
@@ -75,7 +75,7 @@ function draw(canvas, film, seconds, view, how = {}) {
       places = [...way, ...places];
     }
     pen.fillStyle = pen.strokeStyle = shape.colour;
-    pen.lineWidth = Math.max((shape.size || 0) * scale, 1);
+    pen.lineWidth = Math.max((shape.size || 0) * scale, (shape.kind === "way" ? 2.5 : 1.5) * fine); // seen in a large view too
     if (shape.kind === "dots") {
       for (const place of places) {
         pen.beginPath();

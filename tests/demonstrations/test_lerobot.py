@@ -22,7 +22,8 @@ pa = pytest.importorskip("pyarrow", reason="the extra 'lerobot' is not installed
 
 import pyarrow.parquet as pq  # noqa: E402
 
-from ftl_lightning.demonstrations.lerobot import read_lerobot, write_lerobot  # noqa: E402
+from ftl_lightning.demonstrations.lerobot import read_lerobot  # noqa: E402
+from ftl_lightning.demonstrations.lerobot_writing import write_lerobot  # noqa: E402
 
 OFFICIAL = Path(__file__).parent / "lerobot_v30"
 """Written by LeRobot 0.4.4, see its README."""
@@ -90,8 +91,8 @@ def test_what_is_written_says_all_that_lerobot_needs() -> None:
 
 
 def test_large_data_are_several_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftl_lightning.demonstrations.lerobot._MEGABYTES", 1e-6)
-    monkeypatch.setattr("ftl_lightning.demonstrations.lerobot._CHUNK", 4)
+    monkeypatch.setattr("ftl_lightning.demonstrations.lerobot_writing._MEGABYTES", 1e-6)
+    monkeypatch.setattr("ftl_lightning.demonstrations.lerobot_writing._CHUNK", 4)
     written = everything()
     written.save("lerobot:robot")
     files = sorted(str(path.relative_to("robot/data")) for path in Path("robot/data").rglob("*.parquet"))

@@ -51,6 +51,14 @@ def arrange(found: Browser, touch: bool = False) -> None:
     found.until(lambda: found.count("#slots canvas") > before)
 
 
+def emptied(found: Browser) -> None:
+    """Without demonstrations, whatever other tests have left."""
+    found.until(lambda: found.data("learning") != "yes" and found.js("!recorder.busy"))
+    if found.count("#slots canvas"):
+        found.click("clear")
+        found.until(lambda: found.count("#slots canvas") == 0)
+
+
 def test_the_page_is_there_with_samples_before_anything_is_done(page: Browser) -> None:
     assert page.count("#mixed canvas") == 8
     assert page.count("#mix li") == 1
@@ -58,12 +66,13 @@ def test_the_page_is_there_with_samples_before_anything_is_done(page: Browser) -
 
 
 def test_five_arrangements_become_a_concept(page: Browser) -> None:
+    emptied(page)
     for _ in range(5):
         arrange(page)
     learned(page)
     assert page.count("#samples canvas") == 8
     assert "novelty" in page.text("quality")
-    assert page.count("#mix li") == 2
+    assert page.count("#mix li") == 1  # alone
     assert page.js("document.querySelectorAll('#loss polyline')[0].points.length") > 10
     page.until(lambda: "model.learn(" in page.text("python"))
     assert "invert" in page.text("command")
@@ -71,9 +80,10 @@ def test_five_arrangements_become_a_concept(page: Browser) -> None:
 
 
 def test_a_slider_changes_the_samples(page: Browser) -> None:
+    slider = page.driver.find_element("css selector", "#mix input[type=range]")
+    assert page.js("arguments[0].value", slider) == "1"
     before = int(page.data("samples"))
     picture = page.js("document.querySelector('#mixed canvas').toDataURL()")
-    slider = page.driver.find_element("css selector", "#mix input[type=range]")
     page.js("arguments[0].focus()", slider)
     page.press(*[Keys.ARROW_LEFT] * 6)
     waited = page.until(lambda: int(page.data("samples")) > before)
@@ -84,12 +94,13 @@ def test_a_slider_changes_the_samples(page: Browser) -> None:
 
 
 def test_what_was_done_is_undone_by_keys(page: Browser) -> None:
-    before = page.count("#slots canvas")
+    emptied(page)
+    arrange(page)
     page.click("clear")
     page.until(lambda: page.count("#slots canvas") == 0)
     page.js("document.activeElement.blur()")
     page.undo()
-    page.until(lambda: page.count("#slots canvas") == before)
+    page.until(lambda: page.count("#slots canvas") == 1)
 
 
 def test_mistakes_are_told_and_go_away(page: Browser, tmp_path: Path) -> None:
@@ -104,8 +115,7 @@ def test_mistakes_are_told_and_go_away(page: Browser, tmp_path: Path) -> None:
 
 
 def test_demonstrations_come_from_the_library_too(page: Browser) -> None:
-    page.click("clear")
-    page.until(lambda: page.count("#slots canvas") == 0)
+    emptied(page)
     page.js("document.getElementById('ways').open = true")
     page.js("(document.getElementById('library').value = 'circle above square')")
     page.click("draw")

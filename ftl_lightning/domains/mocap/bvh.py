@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.demonstrations.container import Demonstrations, padded
+from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
 from ftl_lightning.domains.mocap.bvh_file import Motion, read_motion
 from ftl_lightning.domains.mocap.export import NODES as EXPORTED
 from ftl_lightning.domains.mocap.normalise import normalised, z_up
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON
-from ftl_lightning.domains.mocap.source import NAME, POSE, pieces
+from ftl_lightning.domains.mocap.source import moving, pieces
 from ftl_lightning.errors import UserError
 
 METRES = INCH / 0.45
@@ -84,18 +84,7 @@ def demonstrated(path: Path) -> Demonstrations:
         raise UserError(
             f"{path}: expected a motion of {HORIZON} frames or more at {FPS} a second, without jumps, found {len(poses)} frames"
         )
-    states, lengths = padded(found)
-    return Demonstrations(
-        states=states,
-        lengths=lengths,
-        domain=NAME,
-        state_names=COLUMNS,
-        state_units=("m",) * len(COLUMNS),
-        concepts=("",) * len(found),
-        observed={POSE: states},
-        per_step=(POSE,),
-        provenance={"generator": "BVH file", "file": path.name},
-    )
+    return moving(found, [""] * len(found), {"generator": "BVH file", "file": path.name})
 
 
 def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:

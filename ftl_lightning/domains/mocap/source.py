@@ -1,6 +1,6 @@
 """Demonstrations from a folder of recordings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -39,6 +39,22 @@ ARMS_DOWN = 0.4
 """Metres at most from a wrist to its hip, sideways and in height, where arms hang down."""
 UPRIGHT = 0.35
 """Metres at least from the hips up to the shoulders, and from the ankles up to the hips twice as many, where someone stands."""
+
+
+def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mapping[str, object]) -> Demonstrations:
+    """Motions ``(frame, 42)`` in metres as demonstrations, with a text each."""
+    states, lengths = padded(motions)
+    return Demonstrations(
+        states=states,
+        lengths=lengths,
+        domain=NAME,
+        state_names=COLUMNS,
+        state_units=("m",) * len(COLUMNS),
+        concepts=tuple(concepts),
+        observed={POSE: states},
+        per_step=(POSE,),
+        provenance=provenance,
+    )
 
 
 @dataclass(frozen=True)
@@ -202,19 +218,9 @@ class Recorded:
         return found
 
     def _demonstrations(self, found: Sequence[Piece], provenance: dict[str, object]) -> Demonstrations:
-        states, lengths = padded([piece.states for piece in found])
         trials = [self.recordings.trial_id[piece.trial] for piece in found]
-        return Demonstrations(
-            states=states,
-            lengths=lengths,
-            domain=NAME,
-            state_names=COLUMNS,
-            state_units=("m",) * len(COLUMNS),
-            concepts=tuple(piece.concept for piece in found),
-            observed={POSE: states},
-            per_step=(POSE,),
-            provenance={"generator": NAME, "trials": trials, **provenance},
-        )
+        told = {"generator": NAME, "trials": trials, **provenance}
+        return moving([piece.states for piece in found], [piece.concept for piece in found], told)
 
 
 def _no_training(every: Recordings, trial: int) -> str:

@@ -1,0 +1,242 @@
+"""What is released: the wheel and the source distribution, built once, what they hold, and the program and types of the wheel."""
+
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import yaml
+from packaging.metadata import Metadata
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+from ftl_lightning.version import __version__
+from tests.checkout import copied
+from tests.conftest import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+LARGEST = 60e6
+"""Bytes of either file."""
+RECORD = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE", "top_level.txt"}
+"""What a wheel holds besides the package."""
+AROUND = {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "PKG-INFO", "README.md", "pyproject.toml"}
+"""What a source distribution holds besides the package and what setuptools keeps for itself."""
+
+
+class Released(NamedTuple):
+    """The two files, and every file of the package in the checkout that they come from, relative to it."""
+
+    wheel: Path
+    source: Path
+    package: set[str]
+
+
+@pytest.fixture(scope="module")
+def released(tmp_path_factory: pytest.TempPathFactory) -> Released:
+    """Built as for an index: the wheel from the source distribution, so that this holds all that is needed."""
+    for name in ("build", "setuptools", "twine"):
+        pytest.importorskip(name, reason="the extra dev builds releases")
+    folder = tmp_path_factory.mktemp("release")
+    source = copied(folder / "checkout")
+    for run in ("logs", "build/lib/ftl_lightning"):  # of earlier work
+        (source / run).mkdir(parents=True)
+        (source / run / "left_over.py").touch()
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder / "dist"), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (wheel,), (archive,) = (folder / "dist").glob("*.whl"), (folder / "dist").glob("*.tar.gz")
+    return Released(wheel, archive, package_files(source))
+
+
+def package_files(checkout: Path) -> set[str]:
+    package = checkout / "ftl_lightning"
+    folders = (package, package / "conf", package / "pretrained")  # links are not followed
+    return {path.relative_to(checkout).as_posix() for folder in folders for path in folder.rglob("*") if path.is_file()}
+
+
+def test_the_wheel_holds_every_file_of_the_package_and_nothing_else(released: Released) -> None:
+    with zipfile.ZipFile(released.wheel) as archive:
+        inside = set(archive.namelist())
+    assert {name for name in inside if name.startswith("ftl_lightning/")} == released.package
+    record = f"ftl_lightning-{__version__}.dist-info/"
+    assert inside - released.package == {record + name for name in RECORD}
+    kinds = {".js", ".html", ".css", ".yaml", ".json", ".md", ".csv", ".safetensors", ".py", ".typed"}
+    assert {Path(name).suffix for name in released.package} == kinds
+    some = ("py.typed", "conf/agent.yaml", "pretrained/strokes/model.safetensors", "domains/mocap/segments.csv", "play/page.js")
+    assert {f"ftl_lightning/{name}" for name in some} <= inside
+
+
+def test_the_source_distribution_holds_what_the_wheel_is_built_from_and_nothing_else(released: Released) -> None:
+    with tarfile.open(released.source) as archive:
+        assert not [member.name for member in archive if not (member.isfile() or member.isdir())]
+        inside = {member.name.partition("/")[2] for member in archive if member.isfile()}
+    own = {name for name in inside if name.startswith("ftl_lightning.egg-info/")} | {"setup.cfg"}
+    assert inside - own == released.package | AROUND
+
+
+def test_releases_are_small(released: Released) -> None:
+    assert 1e6 < released.wheel.stat().st_size < LARGEST
+    assert 1e6 < released.source.stat().st_size < LARGEST
+
+
+def test_an_index_would_take_them(released: Released) -> None:
+    command = [sys.executable, "-m", "twine", "check", "--strict", str(released.wheel), str(released.source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.count("PASSED") == 2
+
+
+def test_the_wheel_says_what_it_is(released: Released) -> None:
+    with zipfile.ZipFile(released.wheel) as archive:
+        record = f"ftl_lightning-{__version__}.dist-info"
+        said = Metadata.from_email(archive.read(f"{record}/METADATA"))
+        entries = archive.read(f"{record}/entry_points.txt").decode()
+    assert (said.name, str(said.version), said.license_expression) == (PROJECT["name"], __version__, PROJECT["license"])
+    assert said.requires_python == SpecifierSet(PROJECT["requires-python"])
+    assert said.description == (ROOT / "README.md").read_text("utf-8")
+    assert said.description_content_type == "text/markdown"
+    assert set(said.provides_extra or ()) == set(PROJECT["optional-dependencies"])
+    needed = {one for one in said.requires_dist or () if one.marker is None}
+    assert needed == set(map(Requirement, PROJECT["dependencies"]))
+    offered = {group: dict(re.findall(r"^(\S+) = (\S+)$", text, re.M)) for group, text in sections(entries).items()}
+    assert offered == {**PROJECT["entry-points"], "console_scripts": PROJECT["scripts"]}
+
+
+def sections(text: str) -> dict[str, str]:
+    """The parts of a file with headings in square brackets."""
+    _, *parts = re.split(r"^\[(.+)\]$", text, flags=re.M)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def test_the_version_stands_in_one_place() -> None:
+    assert "version" not in PROJECT
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))["version"] == __version__
+
+
+def test_the_log_of_changes_tells_of_this_version() -> None:
+    """Keep a Changelog: the newest first, the present version below what is not released yet."""
+    log = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    assert re.findall(r"^## \[?([^\]\s]+)\]?", log, re.M)[:2] == ["Unreleased", __version__]
+    assert set(re.findall(r"^### (.+)$", log, re.M)) <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+
+
+@pytest.fixture(scope="module")
+def environment(released: Released, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An interpreter that has the wheel, and what the wheel needs, but not this checkout."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    with zipfile.ZipFile(released.wheel) as archive:
+        archive.extractall(packages)
+    # A folder that is named here is searched, but what it names in turn, such as a checkout, is not.
+    (packages / "others.pth").write_text(sysconfig.get_path("purelib") + "\n", "utf-8")
+    return folder / "bin" / "python"
+
+
+def test_the_wheel_samples_in_any_folder(environment: Path, tmp_path: Path) -> None:
+    found = [environment, "-c", "import ftl_lightning; print(ftl_lightning.__file__)"]
+    place = subprocess.run(found, capture_output=True, text=True, check=True).stdout.strip()
+    assert Path(place).is_relative_to(environment.parent.parent)
+    command = [environment, "-m", "ftl_lightning", "sample", "--pretrained", "object_rearrangement"]
+    command += ["--compose", "circle above square", "--count", "2", "--out", "samples.safetensors"]
+    subprocess.run(command, check=True, capture_output=True)
+    assert (tmp_path / "samples.safetensors").is_file()
+
+
+USER = """
+from typing import assert_type
+
+import ftl_flow
+import ftl_strokes
+import numpy as np
+import torch
+
+from ftl_lightning import Composition, Concept, Demonstrations, FewShot, list_models
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans
+from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.tasks import few_shot_suites
+from ftl_lightning.errors import UserError
+from ftl_lightning.learned_concept import LearnedConcept
+from ftl_lightning.learning.method import Method
+
+PLANS = Plans(horizon=8, columns=("x", "y"), units=("cm", "cm"))
+
+
+def draw(task: str, count: int, seed: int) -> torch.Tensor:
+    return torch.zeros(count, PLANS.horizon, len(PLANS.columns))
+
+
+def ends(goal: str, states: torch.Tensor, starts: InitialStates | None) -> torch.Tensor:
+    return states[:, -1].norm(dim=1) < 0.1
+
+
+SOURCE = Generated("points", PLANS, ("rest",), draw)
+CONCEPTS = Concepts(("rest",), few_shot_suites(("rest",), ("go",)))
+DOMAIN = Domain("points", PLANS, CONCEPTS, lambda root: SOURCE, metrics={"ends": Metric(ends)})
+assert_type(ftl_strokes.DOMAIN, Domain)
+assert_type(ftl_flow.METHOD, Method)
+assert_type(list_models(), list[str])
+
+model = FewShot.from_pretrained("agent")
+five = Demonstrations.load("five.npz")
+try:
+    concept = model.learn(five.states.numpy(), {"world": np.zeros((5, 8, 52))}, name="go", steps=10)
+except UserError as error:
+    print(error)
+assert_type(concept, LearnedConcept)
+assert_type(concept.concept, Concept)
+mixed = concept + 0.8 * model["go to bowl"]
+assert_type(mixed, Composition)
+plans = model.sample(mixed, 10, observed=model.starts("go", count=10), sampler="ddim", steps=5)
+assert_type(plans, Demonstrations)
+assert_type(model.evaluate(plans, goal="go"), dict[str, float])
+model.render(plans, goal="go").savefig("plans.png")
+"""
+"""What a user writes, with a domain and a method in packages of their own; a type that were ``Any`` would be an error."""
+MYPY = """
+[mypy]
+strict = true
+# As in this project: arithmetic on tensors is Any to torch's own types, some of which are missing.
+warn_return_any = false
+disable_error_code = no-untyped-call
+
+# Packages whose types a user of this one does not meet take most of the time.
+[mypy-fsspec.*,jsonargparse.*,lightning.*,matplotlib.*,omegaconf.*,pandas.*,PIL.*,rich.*,safetensors.*,scipy.*,sympy.*]
+follow_imports = skip
+[mypy-tensorboard.*,torchmetrics.*,transformers.*,torch._dynamo.*,torch._inductor.*,torch.ao.*,torch.distributed.*]
+follow_imports = skip
+[mypy-torch._export.*,torch._functorch.*,torch.export.*,torch.fx.*,torch.onnx.*]
+follow_imports = skip
+"""
+WRONG = """
+from ftl_lightning import FewShot
+
+model = FewShot.from_pretrained("agent")
+model.sample(model["go to bowl"], count="ten")
+model.lern()
+"""
+
+
+def test_programs_of_users_are_checked_against_the_types_of_the_wheel(environment: Path, tmp_path: Path) -> None:
+    """By mypy in its strict mode, which takes the package's types only where it says that it has some."""
+    pytest.importorskip("mypy", reason="the extra dev checks types")
+    (tmp_path / "user.py").write_text(USER, "utf-8")
+    (tmp_path / "wrong.py").write_text(WRONG, "utf-8")
+    for example in ("ftl-flow/ftl_flow.py", "ftl-strokes/ftl_strokes.py"):
+        shutil.copy(ROOT / "examples" / example, tmp_path)
+    (tmp_path / "mypy.ini").write_text(MYPY, "utf-8")
+    command = [sys.executable, "-m", "mypy", "--no-error-summary", "--python-executable", str(environment)]
+    command += sorted(path.name for path in tmp_path.glob("*.py"))
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    found = re.findall(r"^(\w+\.py):(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.M)
+    assert found == [("wrong.py", "5", "arg-type"), ("wrong.py", "6", "attr-defined")], done.stdout
