@@ -151,7 +151,8 @@ def expect_alone(trainer: pl.Trainer, verb: str) -> None:
         UserError: naming the verb.
     """
     if (found := trainer.num_devices * trainer.num_nodes) > 1:
-        raise UserError(f"trainer.devices: expected 1 for {verb}, found {found}; `fit` alone runs in several processes")
+        instead = "use trainer.processes" if verb == "invert" else "`fit` alone runs on several"
+        raise UserError(f"trainer.devices: expected 1 for {verb}, found {found}; {instead}")
 
 
 def expect_exact(trainer: pl.Trainer) -> None:
