@@ -19,7 +19,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
-from ftl_lightning import log_folder, trust
+from ftl_lightning import log_folder, process_group, trust
 from ftl_lightning.configuration import configurations, expanded, load, parts
 from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
@@ -231,13 +231,15 @@ class _Parser(CommandLine):
 
 def run(arguments: list[str]) -> None:
     """Parse and run one of Lightning's verbs or ``invert``."""
-    with log_folder.run():
+    with process_group.one_voice(), log_folder.run():
         _command_line(CommandLine, arguments[0], arguments, run=True)
 
 
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
-    return _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
+    line = _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
+    process_group.expect_alone(line.trainer, "what another program runs")  # whose whole command line other processes would repeat
+    return line
 
 
 def parse(verb: str, options: list[str]) -> dict[str, Any]:

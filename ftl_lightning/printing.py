@@ -6,6 +6,7 @@ into one line of a table, a figure or a message through :func:`line`.
 
 import io
 import sys
+from dataclasses import dataclass
 from unicodedata import category
 
 
@@ -19,6 +20,19 @@ def line(text: str) -> str:
     return plain(" ".join(text.split()))
 
 
+@dataclass
+class _Voice:
+    silent: bool = False
+
+
+_VOICE = _Voice()
+
+
+def silence() -> None:
+    """Print nothing from now on: of several processes of one run the first one speaks."""
+    _VOICE.silent = True
+
+
 def say(*parts: object, error: bool = False) -> None:
     """Print, as :func:`plain` has it, at once.
 
@@ -26,7 +40,8 @@ def say(*parts: object, error: bool = False) -> None:
         parts: printed with a space between two of them.
         error: whether it goes to standard error.
     """
-    print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
+    if not _VOICE.silent:
+        print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def any_terminal() -> None:

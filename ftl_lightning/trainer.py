@@ -11,12 +11,13 @@ import lightning.pytorch as pl
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from ftl_lightning import log_folder
+from ftl_lightning import log_folder, process_group
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.checkpoint import WholeCheckpoints
 from ftl_lightning.learning_rate import LearningRate
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.printing import silence
+from ftl_lightning.ranges import expect_count, expect_range
 
 HARMLESS = {
     "accelerator",
@@ -44,6 +45,8 @@ HARMLESS = {
     "val_check_interval",
 }
 """Options that change no number of a run on one device; every other one does."""
+MOST_PROCESSES = 256
+"""In which concepts are learned."""
 _STARTS = ("`val_check_interval`", "Early stopping conditioned")
 """How messages of Lightning begin that are about options."""
 USUAL = {"max_epochs": 1, "deterministic": True}
@@ -105,11 +108,14 @@ class Trainer(pl.Trainer):
     Attributes:
         verb: what it does, for the progress bar.
         unusual: options that can change what is learned and have not their usual values: these are part of a result's identity.
+        processes: in which ``invert`` learns concepts, each its share of them, see :mod:`ftl_lightning.learning.in_processes`.
     """
 
     verb = "fit"
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
+    def __init__(self, *arguments: Any, processes: int = 1, **options: Any) -> None:
+        expect_count("trainer.processes", processes, 1, MOST_PROCESSES)
+        self.processes = processes
         for name, (least, most) in RANGES.items():
             value = options.get(name)
             value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a text
@@ -138,6 +144,7 @@ class Trainer(pl.Trainer):
             for name, value in options.items()
             if name not in HARMLESS and value != usual.get(name)
         }
+        process_group.take_over(self)
         self.callbacks += [_Begun(), LearningRate()]  # type: ignore[attr-defined]
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # unless it is configured
             self.strategy.checkpoint_io = WholeCheckpoints()
@@ -151,6 +158,9 @@ class Trainer(pl.Trainer):
                 raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
         if self.limit_train_batches == 0:
             raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
+        process_group.expect_exact(self)
+        if self.global_rank:
+            silence()
         with self._restoring():
             try:
                 super().fit(model, *arguments, **options)
@@ -161,12 +171,14 @@ class Trainer(pl.Trainer):
         _expect_monitors(self)
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
-        """As Lightning's."""
+        """As Lightning's, in one process."""
+        process_group.expect_alone(self, "validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
     def test(self, *arguments: Any, **options: Any) -> Any:
-        """As Lightning's."""
+        """As Lightning's, in one process."""
+        process_group.expect_alone(self, self.verb if self.verb == "invert" else "test")
         with self._restoring():
             return super().test(*arguments, **options)
 
@@ -198,6 +210,21 @@ class Trainer(pl.Trainer):
         if ckpt_path and not model.learns:
             raise UserError(f"ckpt_path: expected none for {model.method}, which learns nothing, found {ckpt_path}")
         self.verb = "invert"
-        if model.learns:
+        process_group.expect_alone(self, self.verb)
+        if self.processes > 1:
+            self._expect_plain(model, ckpt_path)
+        elif model.learns:
             self.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
         self.test(model, datamodule=datamodule, verbose=False)
+
+    def _expect_plain(self, model: Adaptation, ckpt_path: str | None) -> None:
+        """Refuse what learning in several processes does not look at: there are no trainer's steps in them."""
+        if not model.learns:
+            told = f"expected 1 for {model.method}, which learns nothing, found {self.processes}"
+        elif ckpt_path:
+            told = f"expected 1 to go on with a checkpoint, found {self.processes}"
+        elif self.unusual:
+            told = f"expected 1 with trainer.{next(iter(self.unusual))}, found {self.processes}"
+        else:
+            return
+        raise UserError(f"trainer.processes: {told}")

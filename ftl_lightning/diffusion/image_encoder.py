@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.errors import UserError, short, shown
+from ftl_lightning.processes import drawn
 from ftl_lightning.ranges import expect_range
 from ftl_lightning.schema import built
 
@@ -226,7 +227,8 @@ class ImageEncoder(nn.Module):
         """``(batch, channels, height, width)`` uint8 to ``(batch, size)``, keypoints told from the image's middle."""
         height, width = (side - self.crop for side in images.shape[2:])
         if self.crop and self.training:
-            top, left = torch.randint(self.crop + 1, (2, len(images), 1), device=images.device)
+            corners = drawn(len(images), lambda n: torch.randint(self.crop + 1, (2, n, 1), device=images.device).movedim(1, 0))
+            top, left = corners.unbind(dim=1)
             rows, columns = (first + torch.arange(side, device=images.device) for first, side in ((top, height), (left, width)))
             every = torch.arange(len(images), device=images.device)[:, None, None]
             images = images[every, :, rows[:, :, None], columns[:, None]].movedim(-1, 1)

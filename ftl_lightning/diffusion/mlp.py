@@ -8,6 +8,7 @@ from ftl_lightning.concepts.branches import Context
 from ftl_lightning.diffusion.conditions import condition_encoder, turned
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
+from ftl_lightning.processes import Dropout
 from ftl_lightning.ranges import expect_range
 
 
@@ -62,7 +63,7 @@ class MLPDenoiser(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(width, hidden_dim) for width in inputs)
         self.time_film = nn.Linear(time_dim, 2 * hidden_dim * depth)
         self.concept_film = nn.Linear(condition_dim, 2 * hidden_dim * depth, bias=False)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
         self.head = nn.Linear(hidden_dim, plan)
 
     def observe(self, vector: Tensor | None) -> Context:

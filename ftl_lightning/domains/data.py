@@ -21,6 +21,7 @@ from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.processes import drawn, rows_of
 from ftl_lightning.ranges import LARGEST, LARGEST_STEP, MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
 
@@ -85,7 +86,7 @@ class PretrainingData(pl.LightningDataModule):
             :class:`~ftl_lightning.domains.domain.Recoveries`.
         more: file of further demonstrations of training concepts, such as corrections of a model; ``None`` for none.
         seed: decides the demonstrations and the order they are seen in.
-        batch_size: windows a step.
+        batch_size: windows a step, in each process.
         steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
         encoder: text encoder, ``'table'`` (shipped embeddings), ``'minilm'``, ``'hashing'``, or the name or path of a language
             model, see :func:`ftl_lightning.concepts.encoder.load_encoder`.
@@ -190,16 +191,17 @@ class PretrainingData(pl.LightningDataModule):
         return None
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step: demonstrations drawn with replacement, and of each a window."""
-        draw = generator("cpu", self.seed, step)
-        if self.balance is None:
-            rows = torch.randint(len(self.training), (self.batch_size,), generator=draw)
-        else:
-            rows = torch.multinomial(self._shares, self.batch_size, replacement=True, generator=draw)
-        return self._windows(self.training, rows, draw)
+        """The batch of a step, or its part of this process: demonstrations drawn with replacement, and of each a window."""
+        draw, count = generator("cpu", self.seed, step), self.batch_size
+        with rows_of(*((0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size))):
+            if self.balance is None:
+                rows = drawn(count, lambda n: torch.randint(len(self.training), (n,), generator=draw))
+            else:
+                rows = drawn(count, lambda n: torch.multinomial(self._shares, n, replacement=True, generator=draw))
+            return self._windows(self.training, rows, draw)
 
     def _windows(self, demonstrations: Demonstrations, rows: Tensor, draw: torch.Generator) -> Batch:
-        share = torch.rand(len(rows), generator=draw)
+        share = drawn(len(rows), lambda n: torch.rand(n, generator=draw))
         starts = demonstrations.starts(rows, share, self.start_exponent, self.horizon, self.domain.plans.at_rest)
         states, observed = demonstrations.windows(rows, starts, self.horizon)
         return Batch(states, self._concepts(demonstrations, rows), observed)

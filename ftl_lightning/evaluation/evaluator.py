@@ -24,6 +24,7 @@ from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import log_projector, log_test, own_rows, setting_means
+from ftl_lightning.learning.checkpoint import Random
 from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_count
 
@@ -125,9 +126,17 @@ class Evaluator(pl.Callback):
         if trainer.sanity_checking:
             return
         module = _evaluable(pl_module)
-        self._generate(module, _data(trainer))
-        by_task = {(behaviour.task.setting, behaviour.task.name): behaviour.values for behaviour in self.judged}
-        pl_module.log_dict({f"val/{name}": value for name, value in setting_means(by_task).items()}, batch_size=1)
+        means: dict[str, float] = {}
+        if trainer.is_global_zero:  # of several processes the first evaluates, and the others wait
+            self._generate(module, _data(trainer))
+            means = setting_means({(one.task.setting, one.task.name): one.values for one in self.judged})
+        # Others go on with its global generators too, from which a domain's evaluation may draw.
+        means, random = trainer.strategy.broadcast((means, Random.now(pl_module.device, 0)))
+        if not trainer.is_global_zero:
+            random.restore(pl_module.device)
+        pl_module.log_dict({f"val/{name}": value for name, value in means.items()}, batch_size=1, sync_dist=True)
+        if not trainer.is_global_zero:
+            return
         for logger in _boards(trainer):
             self._draw(logger, module, trainer.global_step)
             if not self._projected:  # training embeddings do not change while fitting

@@ -85,7 +85,7 @@ class Judged:
 
 def share(values: Tensor) -> float:
     """Share of true values, or the mean of numbers; those that are NaN do not count."""
-    metric = MeanMetric(nan_strategy="ignore")
+    metric = MeanMetric(nan_strategy="ignore", sync_on_compute=False)  # of several processes one evaluates
     metric.update(values.float())
     return float(metric.compute())
 

@@ -124,6 +124,11 @@ class Adaptation(pl.LightningModule, ABC):
         return self
 
     @property
+    def processes(self) -> int:
+        """In which concepts are learned; 1 with a trainer of Lightning's own."""
+        return int(getattr(self.trainer, "processes", 1))
+
+    @property
     def folder(self) -> Path:
         """Where the learned concepts are written."""
         return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
@@ -167,7 +172,7 @@ class Adaptation(pl.LightningModule, ABC):
     def on_test_start(self) -> None:
         if self._found:  # training in the same process has just ended
             return
-        if self.learns:
+        if self.learns and self.processes == 1:
             self._found = self.learned()
         else:
             self.find()

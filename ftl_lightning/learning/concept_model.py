@@ -19,6 +19,7 @@ from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.learning.method import Method
 from ftl_lightning.learning.model_config import ModelConfig, find_view
 from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.processes import drawn
 from ftl_lightning.representation import Shown, counted
 from ftl_lightning.tensor_file import bytes_hash, serialise
 
@@ -241,9 +242,11 @@ class ConceptModel(Shown, nn.Module, ABC):
 
     def _dropped(self, vectors: Tensor) -> Tensor:
         """The same where some of the vectors are hidden."""
+        count, device = len(vectors), vectors.device
         for name, share in self.config.feature_dropout.items():
             kept = torch.ones_like(vectors)
-            kept[:, self.config.columns[name]] = (torch.rand(len(vectors), 1, device=vectors.device) >= share).float()
+            hidden = drawn(count, lambda n: torch.rand(n, 1, device=device)) < share
+            kept[:, self.config.columns[name]] = (~hidden).float()
             vectors = vectors * kept
         return vectors
 

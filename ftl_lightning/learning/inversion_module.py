@@ -12,6 +12,7 @@ from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_M
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.forms import first_settings, formed
+from ftl_lightning.learning.in_processes import learned_in_processes
 from ftl_lightning.learning.inversion import Inversion, check_settings, warn_of_loss
 from ftl_lightning.learning.inversion_settings import (
     ADAPTED,
@@ -200,10 +201,23 @@ class InversionModule(ExactResume, Adaptation):
         self._found = self.inversion.learned() if self.trainer.state.fn == TrainerFn.FITTING else self.learned()
 
     def learned(self) -> dict[str, Concept]:
+        if self.processes > 1:
+            return self._found or self._in_processes()
         if self._formed is None or self._formed[0] != self.global_step:
             first = self.inversion.learned()
             self._formed = self.global_step, formed(self.model, self.demonstrations, self.settings, self._steps, first)
         return self._formed[1]
+
+    def _in_processes(self) -> dict[str, Concept]:
+        devices = [torch.device(self.device.type, number) for number in range(torch.cuda.device_count())]
+        return learned_in_processes(
+            self.hparams["pretrained"],
+            self.demonstrations,
+            self.settings,
+            self._steps,
+            self.processes,
+            devices if self.device.type == "cuda" else [self.device],
+        )
 
     @property
     def _steps(self) -> int:

@@ -31,6 +31,7 @@ from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.resume import ExactResume
 from ftl_lightning.learning.teaching import Teaching
 from ftl_lightning.option_groups import groups_of
+from ftl_lightning.processes import mean, rows_of
 from ftl_lightning.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
 from ftl_lightning.seeding import generator
 
@@ -229,6 +230,10 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         self._validated = True
 
     def training_step(self, batch: Batch) -> Tensor:
+        with rows_of(self.trainer.global_rank, self.trainer.world_size):
+            return self._training_loss(batch)
+
+    def _training_loss(self, batch: Batch) -> Tensor:
         draw = generator(self.device, self.seed, self.global_step)
         looked_at, unseen = self.teaching.apart(self.domain, batch)
         losses, seen = self._perturbed_losses(self.raw, looked_at, draw)
@@ -237,14 +242,15 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             told = unseen._replace(states=states, observed=self.teaching.told(self.domain, observed, draw))
             losses = torch.cat((losses, self.losses(self.raw, told, draw)))
         loss = losses.mean()
-        if not loss.isfinite():
+        whole = mean(loss)
+        if not whole.isfinite():
             raise UserError(
-                f"training: the loss became {loss.item()} at step {self.global_step}; the last checkpoint before it is kept; "
+                f"training: the loss became {whole.item()} at step {self.global_step}; the last checkpoint before it is kept; "
                 "lower model.learning_rate"
             )
-        self.log("train/loss", loss, prog_bar=True)
+        self.log("train/loss", whole, prog_bar=True)
         for name, error in self.teaching.errors(self.domain, seen.observed).items():
-            self.log(f"train/{name}", error)
+            self.log(f"train/{name}", mean(error))
             loss = loss + self.teaching.weights[name] * error
         return loss if self.unused is None else loss + 0 * self.unused
 
@@ -257,9 +263,9 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
-        # The same noise every time, so that the curve shows the model and not the draw.
-        draw = generator(self.device, self.seed)
-        self.log(name, self._perturbed_losses(self.model, batch, draw)[0].mean(), prog_bar=True, batch_size=len(batch.states))
+        # The same noise every time, so that the curve shows the model and not the draw. Each process computes the whole set's.
+        loss = self._perturbed_losses(self.model, batch, generator(self.device, self.seed))[0].mean()
+        self.log(name, loss, prog_bar=True, batch_size=len(batch.states), sync_dist=True)
 
     def validation_step(self, batch: Batch) -> None:
         self._evaluation_step(batch, "val/loss")
@@ -287,7 +293,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     def on_fit_end(self) -> None:
         """Write the averaged model for ``invert`` and ``sample``."""
         folder = self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
-        save_model(self.model, folder)
+        if self.trainer.is_global_zero:
+            save_model(self.model, folder)
 
     @property
     def method(self) -> str:

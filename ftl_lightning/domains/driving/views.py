@@ -8,6 +8,7 @@ from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.motion import drive, speed, turn, turned, way
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.traffic import FEATURES_SEEN, NAMES, SCENARIO, STATE, TRAFFIC, VEHICLES, decision_seconds
+from ftl_lightning.processes import drawn
 
 SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
 """Between two decisions, by the number of the scenario."""
@@ -109,7 +110,7 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
     if draw is None:
         noise = torch.tensor([[0.0, -1.0]], device=states.device).expand(len(states), 2)
     else:
-        noise = torch.randn((len(states), 2), generator=draw, device=draw.device)
+        noise = drawn(len(states), lambda n: torch.randn((n, 2), generator=draw, device=draw.device))
     ego = _vehicles(observed)[:, 0]
     known = _known(observed) & (noise[:, 1:] > 0)
     other = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)

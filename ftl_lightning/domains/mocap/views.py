@@ -11,6 +11,7 @@ from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.mocap.skeleton import L_HIP, R_HIP, RIGID, as_joints
 from ftl_lightning.domains.mocap.source import OBSERVED, POSE
 from ftl_lightning.domains.mocap.standing import drawn_poses
+from ftl_lightning.processes import drawn
 
 SHORTEST = 1e-3
 """Metres: a generated bone shorter than this has no direction and is not changed."""
@@ -81,11 +82,11 @@ def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | 
     if draw is None:
         return states, observed
     count, device = len(states), states.device
-    poses = with_rigid_bones(drawn_poses(count, draw).to(states)[:, None], observed)
+    poses = with_rigid_bones(drawn(count, lambda n: drawn_poses(n, draw)).to(states)[:, None], observed)
     low, high = BLENDED
-    length = torch.randint(low, high + 1, (count, 1, 1), generator=draw, device=draw.device).to(device)
+    length = drawn(count, lambda n: torch.randint(low, high + 1, (n, 1, 1), generator=draw, device=draw.device)).to(device)
     share = torch.arange(states.shape[1], device=device)[None, :, None] / length
-    elsewhere = (torch.rand((count, 1, 1), generator=draw, device=draw.device) < SHARE).to(device)
+    elsewhere = (drawn(count, lambda n: torch.rand((n, 1, 1), generator=draw, device=draw.device)) < SHARE).to(device)
     weight = elsewhere * (1 + torch.cos(torch.pi * share.clamp(max=1))) / 2
     begun = with_rigid_bones(weight * poses + (1 - weight) * states, observed)
     begun = torch.where(weight > 0, begun, states)

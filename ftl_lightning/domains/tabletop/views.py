@@ -11,6 +11,7 @@ from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, PLACES, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
+from ftl_lightning.processes import drawn
 
 HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
@@ -119,19 +120,22 @@ def told(places: Tensor, draw: torch.Generator) -> Tensor:
         as :func:`misplaced` takes it.
     """
     seen, centres = places[..., :1], places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))
-    wrong = torch.randn(centres.shape, generator=draw, device=centres.device) * centres.new_tensor(BLUR)
+    wrong = drawn(len(centres), lambda n: torch.randn((n, *centres.shape[1:]), generator=draw, device=centres.device))
+    wrong = wrong * centres.new_tensor(BLUR)
     return torch.cat((seen * (centres + wrong) / HALF, SURE * (2 * seen - 1)), dim=-1).transpose(1, 2).flatten(1)
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
     if draw is None:  # a new task shows all that a model sees
         return states, observed
-    drawn = torch.rand((len(states), 5), generator=draw, device=states.device)
-    most = torch.where(drawn[:, 1] < 0.5, TURN, math.pi)
-    states, observed = moved(states, observed, drawn[:, 0] < 0.5, most * (2 * drawn[:, 2] - 1), SHIFT * (2 * drawn[:, 3:] - 1))
+    count, device = len(states), states.device
+    way = drawn(count, lambda n: torch.rand((n, 5), generator=draw, device=device))
+    most = torch.where(way[:, 1] < 0.5, TURN, math.pi)
+    states, observed = moved(states, observed, way[:, 0] < 0.5, most * (2 * way[:, 2] - 1), SHIFT * (2 * way[:, 3:] - 1))
     if IMAGE in observed:
         return states, observed
-    return raised(states, observed, RAISED * (2 * torch.rand(len(states), generator=draw, device=states.device) - 1).clamp(min=0))
+    height = drawn(count, lambda n: torch.rand(n, generator=draw, device=device))
+    return raised(states, observed, RAISED * (2 * height - 1).clamp(min=0))
 
 
 def _start(observed: Observed) -> Tensor:

@@ -11,6 +11,7 @@ from ftl_lightning.learning.model_config import ModelConfig
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
+from ftl_lightning.processes import drawn
 from ftl_lightning.ranges import expect_range
 
 
@@ -42,7 +43,7 @@ class VAEPretraining(Pretraining[VAEModel]):
         """The negative evidence lower bound, per number of the behaviour (Kingma & Welling, 2014)."""
         states, seen = batch.states, batch.observed
         mean, log_variance = model.posterior(states, seen)
-        noise = torch.randn(mean.shape, generator=draw, device=mean.device)
+        noise = drawn(len(mean), lambda n: torch.randn((n, *mean.shape[1:]), generator=draw, device=mean.device))
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
         numbers = model.config.horizon * model.config.state_dim
         errors = model.errors(states, seen, mean + (0.5 * log_variance).exp() * noise)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.diffusion.schedule import MOST_STEPS
+from ftl_lightning.processes import drawn, mean
 from ftl_lightning.ranges import expect_count, expect_range
 from ftl_lightning.seeding import generator
 
@@ -56,9 +57,9 @@ class Codes:
         directions = torch.randn(self.size, width, generator=fixed).to(device) / self.size**0.5
         shown = clean[:, times] - clean[:, :1] if self.relative else clean[:, times]
         way = shown @ mixing  # (batch, knot, size)
-        numbers = way / way.square().mean().sqrt().clamp(min=1e-6)
-        numbers = numbers + self.noise * torch.randn(numbers.shape, generator=draw, device=device)
-        told = (torch.rand(count, generator=draw, device=device) < self.share) & ~removed
-        alone = told & (torch.rand(count, generator=draw, device=device) < 0.5)
+        numbers = way / mean(way.square().mean()).sqrt().clamp(min=1e-6)
+        numbers = numbers + self.noise * drawn(count, lambda n: torch.randn((n, *way.shape[1:]), generator=draw, device=device))
+        told = (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < self.share) & ~removed
+        alone = told & (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < 0.5)
         text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
         return text[:, None] + told[:, None, None] * (numbers @ directions)

@@ -18,6 +18,7 @@ from ftl_lightning.learning.pretraining import Pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.option_groups import flat, groups_of
+from ftl_lightning.processes import drawn
 from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.regrouped import PRETRAINING
 
@@ -126,7 +127,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
             context = tuple(part.repeat(draws, *(1,) * (part.dim() - 1)) for part in context)
         count = len(clean)
         dropout = self.loss.condition_dropout if model.training else 0.0
-        removed = torch.rand(count, generator=draw, device=self.device) < dropout
+        removed = drawn(count, lambda n: torch.rand(n, generator=draw, device=self.device)) < dropout
         concepts = torch.cat((model.empty[None], model.training_embeddings))
         index = torch.where(removed, 0, concept + 1)
         if self.codes.share and model.training:
@@ -135,10 +136,10 @@ class PretrainingModule(Pretraining[GenerativeModel]):
             concepts = concepts[:, None]  # one knot
         total, power = self.hparams["diffusion_steps"], self.loss.timestep_power
         if power == 1:
-            t = torch.randint(total, (count,), generator=draw, device=self.device)
+            t = drawn(count, lambda n: torch.randint(total, (n,), generator=draw, device=self.device))
         else:
-            t = timesteps(torch.rand(count, generator=draw, device=self.device), total, power)
-        noise = torch.randn(clean.shape, generator=draw, device=self.device)
+            t = timesteps(drawn(count, lambda n: torch.rand(n, generator=draw, device=self.device)), total, power)
+        noise = drawn(count, lambda n: torch.randn((n, *clean.shape[1:]), generator=draw, device=self.device))
         losses = denoising_loss(
             lambda x, t: model.denoiser(x, t, concepts, index, context),
             clean,

@@ -1,0 +1,172 @@
+"""Several processes of one run: the first alone speaks, and all end when one of them does, with one line that says why."""
+
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import lightning.pytorch as pl
+from lightning.fabric.utilities.distributed import _set_num_threads_if_needed
+from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+from torch import distributed
+
+from ftl_lightning.errors import UserError, mistake_behind, mistake_of_machine, short
+from ftl_lightning.printing import line, say, silence
+from ftl_lightning.tensor_file import write_text
+
+NOTES = "FTL_LIGHTNING_NOTES"
+"""Variable of the environment of processes that the first one starts: the folder in which they write why they end."""
+LOOK = 0.3
+"""Seconds between two looks at whether the others are there."""
+PATIENCE = 5.0
+"""Seconds in which a process that lost another one notices it by itself."""
+_LOST = ("gloo", "NCCL", "Connection closed", "Connection reset", "Broken pipe", "TCPStore", "store->get")
+"""What torch says to a process that waits for another one that is gone."""
+
+
+@contextmanager
+def one_voice() -> Iterator[None]:
+    """Within the block, a process that another one started is silent, writes its mistake down for it, and ends with it."""
+    if NOTES not in os.environ:
+        yield
+        return
+    silence()
+    warnings.simplefilter("ignore")
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    try:
+        yield
+    except Exception as error:
+        told = mistake_behind(error) or mistake_of_machine(error)
+        if told is None and not _is_loss(error):
+            raise
+        if told is not None:
+            write_text(Path(os.environ[NOTES]) / str(os.getpid()), line(str(told)))
+        raise SystemExit(2) from None
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK)
+    os._exit(2)
+
+
+def _is_loss(error: BaseException) -> bool:
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in _LOST)
+
+
+def _grouped(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """What a function returns; after it there is no group, and so nothing for which others would have to be there."""
+    found = function(*arguments, **options)
+    if distributed.is_initialized():
+        distributed.destroy_process_group()
+    return found
+
+
+class Launcher(_SubprocessScriptLauncher):
+    """Starts the other processes. Lightning's own kills the first one within seconds of another one's end, without a word."""
+
+    def launch(self, function: Callable[..., Any], *args: Any, trainer: "pl.Trainer | None" = None, **kwargs: Any) -> Any:
+        """Run a function in all processes.
+
+        Raises:
+            UserError: in the first process, if another one ends before its time.
+        """
+        self.cluster_environment.validate_settings(num_devices=self.num_processes, num_nodes=self.num_nodes)
+        if self.cluster_environment.creates_processes_externally:
+            _set_num_threads_if_needed(num_processes=self.num_processes)
+            return _grouped(function, *args, **kwargs)
+        with tempfile.TemporaryDirectory() as notes:
+            os.environ[NOTES] = notes
+            self._call_children_scripts()
+            del os.environ[NOTES]
+            _set_num_threads_if_needed(num_processes=self.num_processes)
+            ended = threading.Event()
+            threading.Thread(target=self._watch, args=(ended, Path(notes)), daemon=True).start()
+            try:
+                found = _grouped(function, *args, **kwargs)
+                self._wait()
+            except RuntimeError as error:
+                if not _is_loss(error):
+                    raise
+                self._wait()
+                raise UserError(self._told(Path(notes))) from error
+            finally:
+                ended.set()
+                self.kill(signal.SIGKILL)
+            return found
+
+    def _wait(self) -> None:
+        """Wait for the ends of the others, which are near."""
+        end = time.monotonic() + PATIENCE
+        while any(one.poll() is None for one in self.procs) and time.monotonic() < end:
+            time.sleep(0.02)
+
+    def _watch(self, ended: threading.Event, notes: Path) -> None:
+        """End this process where it does not notice by itself that another one is gone, such as within NCCL."""
+        while not ended.wait(LOOK):
+            if any(one.poll() for one in self.procs):
+                if not ended.wait(PATIENCE):
+                    self._end(notes)
+                return
+
+    def _end(self, notes: Path) -> NoReturn:
+        say("error:", self._told(notes), error=True)
+        self.kill(signal.SIGKILL)
+        os._exit(2)
+
+    def _told(self, notes: Path) -> str:
+        """Why the others ended, in one line."""
+        if written := sorted(path for path in notes.iterdir() if path.name.isdecimal()):
+            return written[0].read_text("utf-8")
+        rank, gone = next(((rank, one) for rank, one in enumerate(self.procs, 1) if one.poll()), (0, None))
+        told = "the connection to one was lost" if gone is None else f"process {rank} ended {_how(gone)}"
+        return f"trainer.devices: expected {self.num_processes} processes to the end, {told}; go on with --ckpt_path last"
+
+
+def _how(process: "subprocess.Popen[bytes]") -> str:
+    code = process.returncode
+    return f"with code {code}" if code > 0 else f"by signal {-code} ({signal.Signals(-code).name})"
+
+
+def take_over(trainer: pl.Trainer) -> None:
+    """Let a trainer of several processes start them by a :class:`Launcher`."""
+    launcher = trainer.strategy.launcher
+    if type(launcher) is _SubprocessScriptLauncher:
+        own = Launcher(launcher.cluster_environment, launcher.num_processes, launcher.num_nodes)
+        trainer.strategy._launcher = own
+
+
+def expect_alone(trainer: pl.Trainer, verb: str) -> None:
+    """Refuse several processes where one does the work.
+
+    Raises:
+        UserError: naming the verb.
+    """
+    if (found := trainer.num_devices * trainer.num_nodes) > 1:
+        instead = "use trainer.processes" if verb == "invert" else "`fit` alone runs on several"
+        raise UserError(f"trainer.devices: expected 1 for {verb}, found {found}; {instead}")
+
+
+def expect_exact(trainer: pl.Trainer) -> None:
+    """Refuse several processes that are not started one by one, each with all weights.
+
+    Raises:
+        UserError: naming the strategy.
+    """
+    strategy = trainer.strategy
+    if trainer.num_devices * trainer.num_nodes > 1 and not (
+        isinstance(strategy, DDPStrategy) and isinstance(strategy.launcher, _SubprocessScriptLauncher | None)
+    ):
+        raise UserError(f"trainer.strategy: expected ddp for several processes, found {_name(strategy)}")
+
+
+def _name(strategy: object) -> str:
+    return str(getattr(strategy, "_start_method", None) or short(type(strategy).__name__))
