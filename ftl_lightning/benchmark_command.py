@@ -162,6 +162,7 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.targets import expect_writable_file
 
     out = Path(options.out)
+    work = out.with_name(f"{out.stem}.work")
     expect_writable_file(options.out, "out")
     method = load_method(options.method)
     names = _chosen(options)
@@ -174,7 +175,12 @@ def _run(options: BenchmarkOptions) -> None:
     )
     if out.is_file():
         begun = _resumed(Submission.load(out), begun, out)
-    entry = _entry(options, out.with_name(f"{out.stem}.work"))
+    elif work.exists():
+        raise UserError(f"{work}: expected no models and logs of another run, found some; remove the folder or give another --out")
+    entry = _entry(options, work)
+    for name in names:  # mistakes before any work
+        entry.cells(load_suite(name), _numbers(options)[0])
+    begun.save(out)
     found = run_benchmark(entry, begun, names, out)
     for name, score in found.scores.items():
         error = f" ± {score.error:.2f}" if score.concepts > 1 else ""

@@ -6,10 +6,10 @@ method is the one that the person at the keyboard names.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ftl_lightning.benchmark.run import Entry, scored, temporary
+from ftl_lightning.benchmark.run import SHIPPED, Entry, scored, temporary
 from ftl_lightning.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine
 from ftl_lightning.benchmark.suite import SEEDS, BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.errors import UserError, about, short
@@ -126,7 +126,7 @@ def _expect_rows(rows: Sequence[Row], suite: BenchmarkSuite, where: str, measure
             ", ".join(row.measures),
         )
         for name, value in row.measures.items():
-            rate = suite.measures[name] == "rate"
+            rate = suite.is_rate(name)
             _expect(value >= LEAST and (not rate or value <= MOST), f"{told}: {name}", "0 to 1" if rate else "0 or more", value)
             whole = abs(value * row.n - round(value * row.n)) <= row.n * ROUNDING
             _expect(not rate or whole, f"{told}: {name}", f"a whole number of {row.n} samples", value)
@@ -200,7 +200,7 @@ def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Ite
     """What differs between a run that was submitted and the same run here."""
     if alike and run.configuration != again.configuration:
         yield Difference(run, "configuration", run.configuration, again.configuration)
-    if (alike or run.origin == GIVEN) and run.model != again.model:
+    if (alike or again.origin == GIVEN) and run.model != again.model:
         yield Difference(run, "model", run.model, again.model)
     pairs = [("", run.rows, again.rows), *((name, rows, again.references.get(name, ())) for name, rows in run.references.items())]
     for name, rows, others in pairs:
@@ -211,7 +211,7 @@ def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Ite
                 where = ", ".join(filter(None, (name, row.concept, measure)))
                 if other is None or measure not in other.measures:
                     yield Difference(run, where, value, "none")
-                elif not allowed(value, other.measures[measure], row.n, suite.measures[measure] == "rate", alike):
+                elif not allowed(value, other.measures[measure], row.n, suite.is_rate(measure), alike):
                     yield Difference(run, where, value, other.measures[measure])
 
 
@@ -235,7 +235,9 @@ def recompute(
         say("note: another machine or version: rates may differ by three standard errors, as rounding does", error=True)
     with temporary(entry) as own:
         for run in chosen:
-            again = own.run(suites[run.suite], run.seed)
+            # Where the submitter was given models and nobody names others, they are those that ship.
+            same = replace(own, model=SHIPPED) if run.origin == GIVEN and not own.model else own
+            again = same.run(suites[run.suite], run.seed)
             differ = list(differences(run, again, suites[run.suite], alike))
             say(f"{run.suite}, seed {run.seed}: {f'{len(differ)} numbers differ' if differ else 'the same'}")
             found += differ

@@ -49,8 +49,8 @@ def leaderboard(submissions: Sequence[Submission]) -> str:
 
 def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
     runs = {one.name: [run for run in one.runs if run.suite == suite.name] for one in submissions if suite.name in one.suites}
-    rates = [name for name in suite.measures if name != suite.headline]
-    head = ["method", suite.headline, *rates, "model", "pretraining, s", "learning and evaluation, s"]
+    measures = [name if kind == "rate" else f"{name} (less is better)" for name, kind in suite.measures.items()]
+    head = ["method", *measures, "model", "pretraining, s", "learning and evaluation, s"]
     lines = sorted(_lines(suite, runs), key=lambda line: -line[0])
     table = [_row(head), _row(["---"] * len(head)), *(_row(cells) for _, cells in lines)]
     return f"## {markdown(suite.title)}\n\n" + "\n".join(table) + "\n"

@@ -154,7 +154,7 @@ class Entry:
             "evaluation.suites": f"[{suite.test_suite}]",
             "evaluation.closed_loop": str(suite.closed_loop).lower(),
             "evaluation.references": str(suite.references).lower(),
-            "evaluation.diversity": str("novelty" in suite.measures).lower(),
+            "evaluation.diversity": str("coverage" in suite.measures).lower(),
             "evaluation.environments": "[]",
         }
         done = str(model / CONFIG)

@@ -86,7 +86,8 @@ class BenchmarkSuite:
         samples: of each concept, or episodes.
         closed_loop: whether plans are executed.
         references: whether reference lines are measured, too; somewhere they take long.
-        measures: by name, whether each is a ``rate`` of right samples or a ``distance``; the first is the suite's score.
+        measures: by name, what each is: a ``rate`` of right samples, an ``error rate`` or a ``distance``, of both of which less is
+            better; the first is the suite's score.
         data: prints of the parts, by seed.
     """
 
@@ -103,8 +104,12 @@ class BenchmarkSuite:
     samples: int
     closed_loop: bool = False
     references: bool = True
-    measures: Mapping[str, Literal["rate", "distance"]]
+    measures: Mapping[str, Literal["rate", "error rate", "distance"]]
     data: Mapping[str, Mapping[str, Print]] = field(default_factory=dict)
+
+    def is_rate(self, measure: str) -> bool:
+        """Whether a measure is a share of samples."""
+        return self.measures[measure] != "distance"
 
     @property
     def headline(self) -> str:
