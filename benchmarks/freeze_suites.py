@@ -11,17 +11,17 @@ import dataclasses
 import json
 from pathlib import Path
 
-from ftl_lightning.benchmark.suite import DEMONSTRATIONS, FOLDER, SEEDS, STARTS, TRAINING, load_suite, suite_names
+from ftl_lightning.benchmark.suite import DEMONSTRATIONS, FOLDER, SEEDS, STARTS, TRAINING, VALIDATION, load_suite, suite_names
 from ftl_lightning.tensor_file import write_text
+
+PARTS = (TRAINING, VALIDATION, DEMONSTRATIONS, STARTS)
 
 
 def main() -> None:
     """Draw and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suites", nargs="+", choices=suite_names(), required=True)
-    parser.add_argument(
-        "--parts", nargs="+", choices=(TRAINING, DEMONSTRATIONS, STARTS), default=[TRAINING, DEMONSTRATIONS, STARTS]
-    )
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--root", type=Path, help="folder of your copy of the recordings")
     options = parser.parse_args()

@@ -101,7 +101,9 @@ def benchmark(options: BenchmarkOptions) -> None:
     elif options.method:
         _run(options)
     else:
-        _list(options)
+        from ftl_lightning.benchmark.leaderboard import suite_table
+
+        say(suite_table())
 
 
 def _named(text: str, key: str) -> list[str]:
@@ -143,15 +145,6 @@ def _chosen(options: BenchmarkOptions) -> list[str]:
     if not found:
         raise UserError("suites: expected one or more, found none that can be run here")
     return found
-
-
-def _list(options: BenchmarkOptions) -> None:
-    from ftl_lightning.benchmark.suite import suites
-
-    for suite in suites():
-        needs = suite.needs or ("recordings" if suite.recordings else "")
-        told = f"{len(suite.training.concepts)} training concepts, {len(suite.test)} to learn, {suite.headline}"
-        say(f"{suite.name}: {suite.title}, {told}{f', needs {needs}' if needs else ''}, hash {suite.hash}")
 
 
 def _run(options: BenchmarkOptions) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ftl_lightning.benchmark.run import SHIPPED, Entry, scored, temporary
 from ftl_lightning.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine
-from ftl_lightning.benchmark.suite import SEEDS, BenchmarkSuite, load_suite, suite_names
+from ftl_lightning.benchmark.suite import ASKED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.learning.methods import load_method
 from ftl_lightning.printing import say
@@ -94,7 +94,7 @@ def _expect_run(run: Run, suite: BenchmarkSuite, where: str) -> None:
         _expect(HASH.fullmatch(value) is not None, f"{where}: {key}", "a hash of 16 digits", repr(value))
     _expect(run.origin in (PRETRAINED, GIVEN), f"{where}: origin", f"{PRETRAINED} or {GIVEN}", repr(run.origin))
     known = suite.data.get(str(run.seed), {})
-    parts = [part for part in known if run.origin == PRETRAINED or part != "training"]
+    parts = [part for part in known if part in ((TRAINING, *ASKED) if run.origin == PRETRAINED else ASKED)]
     for part in parts:
         found = run.data.get(part, "none")
         _expect(found == known[part].hash, f"{where}: data.{part}", f"the frozen data's hash {known[part].hash}", found)
@@ -154,7 +154,8 @@ def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
         share: of its rows, 0 for none.
         salt: the word; may be empty.
     """
-    order = sorted(submission.runs, key=lambda run: content_hash([salt, submission.hash, run.suite, run.seed]))
+    whole = submission.hash
+    order = sorted(submission.runs, key=lambda run: content_hash([salt, whole, run.suite, run.seed]))
     wanted = share * sum(len(run.rows) for run in submission.runs)
     found: list[Run] = []
     while sum(len(run.rows) for run in found) < wanted:

@@ -11,12 +11,33 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.escape import markdown
 from ftl_lightning.tensor_file import visible
 
+BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
 HEAD = """# Leaderboard
 
 This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in
 [results/submissions](../results/submissions), each of which passes `benchmark --check`. [The protocol](benchmark.md) says what the
 numbers mean and how to add a line.
 """
+
+
+def suite_table() -> str:
+    """What the suites are, in Markdown, without their hashes."""
+    head = ["suite", "to pretrain on", "to tune on", "in the test", "demonstrations of each", "measures", "needs"]
+    lines = []
+    for suite in map(load_suite, suite_names()):
+        more = f", and up to {suite.training.recoveries} recoveries of each" if suite.training.recoveries else ""
+        lines.append(
+            [
+                f"`{suite.name}`",
+                f"{suite.training.count} of each of {len(suite.training.concepts)} concepts{more}",
+                str(len(suite.validation)),
+                str(len({task.concept for task in suite.test})),
+                str(suite.demonstrations),
+                ", ".join(suite.measures),
+                f"extra `{suite.needs}`" if suite.needs else "your own copy of the recordings" if suite.recordings else "nothing",
+            ]
+        )
+    return "\n".join(_row(cells) for cells in (head, ["---"] * len(head), *lines))
 
 
 def read_submissions(folder: Path) -> list[Submission]:
@@ -41,10 +62,10 @@ def leaderboard(submissions: Sequence[Submission]) -> str:
     """The page, in Markdown."""
     suites = [load_suite(name) for name in suite_names()]
     asked = [suite for suite in suites if any(suite.name in one.suites for one in submissions)]
-    parts = [HEAD, *(_section(suite, submissions) for suite in asked)]
+    parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in asked)]
     if missing := [suite.title for suite in suites if suite not in asked]:
         parts.append(f"No submission has these suites yet: {', '.join(map(markdown, missing))}.\n")
-    return "\n".join(parts)
+    return "\n".join((*parts, END))
 
 
 def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:

@@ -13,7 +13,7 @@ import yaml
 from ftl_lightning.ablation.plan import Cell
 from ftl_lightning.ablation.run import attempt
 from ftl_lightning.benchmark.submission import GIVEN, PRETRAINED, Row, Run, Submission, score
-from ftl_lightning.benchmark.suite import DEMONSTRATIONS, STARTS, TRAINING, BenchmarkSuite, load_suite
+from ftl_lightning.benchmark.suite import ASKED, TRAINING, BenchmarkSuite, load_suite
 from ftl_lightning.configuration import load
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError, short
@@ -167,7 +167,7 @@ class Entry:
         Raises:
             UserError: for data that are not the frozen ones, and for whatever keeps the method from being run.
         """
-        parts = (DEMONSTRATIONS, STARTS) if self.model else (TRAINING, DEMONSTRATIONS, STARTS)
+        parts = ASKED if self.model else (TRAINING, *ASKED)
         if not suite.expect_data(seed, self.root, parts):
             say(f"note: suite {suite.name}, seed {seed}: this processor rounds the data in another way", error=True)
         fit, invert = self.cells(suite, seed)

@@ -23,6 +23,8 @@ CLOSE = 1e-4
 """Data whose mean and mean square differ by less, relatively, are those of another processor, which rounds in another way."""
 TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"
 """Parts of a suite's data."""
+ASKED = (DEMONSTRATIONS, STARTS)
+"""Those that a run draws whether it pretrains or not."""
 
 
 @dataclass(frozen=True, kw_only=True)
