@@ -16,15 +16,13 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
-from ftl_lightning.seeding import DEMONSTRATION_SEED, FRESH_SEED
+from ftl_lightning.seeding import FRESH_SEED
 from ftl_lightning.testing import more_strokes
 from ftl_lightning.testing.families import beats, pictures, reaches
 
 TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
 """Samples of each kind that a judge compares with, from a seed that nobody draws from."""
-FEW = 5
-"""Demonstrations that the reference line replays."""
-REPLAYED, CHANCE, ORACLE = "demonstrations replayed", "random kind (chance)", "generator (oracle)"
+CHANCE, ORACLE = "random kind (chance)", "generator (oracle)"
 Draw = Callable[[str, int, int], NDArray[np.float32]]
 """``(kind, count, seed) -> (count, time, column)``."""
 Kind = Callable[[NDArray[np.float32]], Sequence[str]]
@@ -95,9 +93,6 @@ def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequ
     def tensor(kind: str, count: int, seed: int) -> Tensor:
         return torch.from_numpy(draw(kind, count, seed))
 
-    def replayed(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-        return tensor(goal, FEW, DEMONSTRATION_SEED + seed)[torch.arange(count) % FEW]
-
     def chance(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
         # As many of each kind as possible, so that the line is no draw of luck.
         return torch.cat([tensor(every[index % len(every)], 1, FRESH_SEED + seed + index) for index in range(count)])
@@ -115,7 +110,7 @@ def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequ
         concepts=Concepts(training, {"training": training_suite(training), "validation": new(validation), "paper": new(test)}),
         source=lambda root: source,
         metrics={ACCURACY: Metric(right)},
-        references={REPLAYED: replayed, CHANCE: chance, ORACLE: oracle},
+        references={CHANCE: chance, ORACLE: oracle},
     )
 
 

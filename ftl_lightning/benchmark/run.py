@@ -93,8 +93,6 @@ class Entry:
     def _written(self, suite: BenchmarkSuite) -> Path:
         """The defaults of the method's classes."""
         method, path = self.declared, self.work / f"{suite.name}-{KEPT_CONFIGURATION}"
-        if not method.pretraining and not self.model:
-            raise UserError(f"model: expected models of kind {method.kind}, which {method.name} does not pretrain, found none")
         content: dict[str, Any] = {
             "defaults": ["conf/verb.yaml"],
             "data": {"init_args": {"domain": suite.domain}},
@@ -128,6 +126,9 @@ class Entry:
 
     def cells(self, suite: BenchmarkSuite, seed: int) -> tuple[Cell | None, Cell]:
         """``fit``, unless a model is given, and ``invert``. What the suite freezes is not the method's to choose."""
+        method = self.declared
+        if not method.pretraining and not self.model:
+            raise UserError(f"model: expected models of kind {method.kind}, which {method.name} does not pretrain, found none")
         files, model = self.configurations_of(suite), self.trained(suite, seed)
         name = f"{suite.name}, seed {seed}"
         shared = {
@@ -181,6 +182,7 @@ class Entry:
         rows = outcome.rows
         own = rows[rows["role"] == METHOD]
         measured = _rows(suite, own)
+        asked = {(task.setting, task.concept) for task in suite.test}
         return Run(
             suite=suite.name,
             seed=seed,
@@ -194,9 +196,15 @@ class Entry:
             references={
                 str(name): _rows(suite, some, suite.headline)
                 for name, some in rows[rows["role"] == REFERENCE].groupby("method", sort=True)
-                if set(some["metric"]) & {suite.headline}
+                if asked <= _measured(some, suite.headline)
             },
         )
+
+
+def _measured(table: "pd.DataFrame", measure: str) -> set[tuple[str, str]]:
+    """Settings and concepts of which a measure is there; some reference lines are there for some settings alone."""
+    own = table[table["metric"] == measure]
+    return {*zip(own["setting"], own["task"], strict=True)}
 
 
 def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *least: str) -> list[Row]:
@@ -229,18 +237,26 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
     """Run all suites and seeds of a submission that it does not have yet; the file is written after each.
 
     Raises:
-        UserError: naming suite and seed, where one cannot be run; what was done before is in the file.
+        UserError: at the end, naming suite and seed of the first that could not be run; what was done is in the file.
     """
     submission = begun
+    failed: list[str] = []
     missing = [(suite, seed) for suite in map(load_suite, names) for seed in begun.seeds if begun.run(suite.name, seed) is None]
     with bar("cells", len(missing), lines=False) as advance:
         for number, (suite, seed) in enumerate(missing, 1):
-            run = entry.run(suite, seed)
+            try:
+                run = entry.run(suite, seed)
+            except UserError as error:  # the other suites are run all the same
+                failed.append(str(error))
+                say(f"[{number}/{len(missing)}] failed: {error}")
+                continue
             submission = scored(replace(submission, runs=[*submission.runs, run]))
             submission.save(out)
             shown = ", ".join(f"{row.measures[suite.headline]:.2f}" for row in run.rows)
             say(f"[{number}/{len(missing)}] {suite.name}, seed {seed}: {suite.headline} {shown} ({run.seconds:.0f} s)")
             advance()
+    if failed:
+        raise UserError(f"benchmark: {len(failed)} of {len(missing)} runs failed: {failed[0]}")
     return submission
 
 

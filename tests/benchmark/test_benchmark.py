@@ -257,6 +257,13 @@ def test_the_leaderboard_of_a_folder(copy: Path, capsys: pytest.CaptureFixture[s
     assert "expected a folder of submissions" in line_of(capsys, "--leaderboard", "page.md", "--submissions", "none")
 
 
+def test_the_committed_leaderboard_is_what_the_submissions_say() -> None:
+    submissions = read_submissions(ROOT / "results" / "submissions")
+    page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    assert page == leaderboard(submissions), "run: python -m ftl_lightning benchmark --leaderboard docs/leaderboard.md"
+    assert {"FTL-IGM", "BC", "CVAE", "replay"} <= {one.name for one in submissions}
+
+
 @pytest.mark.parametrize("form", ["npz", "lerobot"])
 def test_data_are_written_with_cards_and_hashes(form: str) -> None:
     pytest.importorskip("pyarrow")
@@ -281,6 +288,7 @@ def test_data_are_written_with_cards_and_hashes(form: str) -> None:
         (["replay", "--suites", "mocap"], "suite mocap: needs your own copy of the recordings (--root FOLDER)"),
         (["replay", "--suites", "beats", "--seeds", "0,x"], "seeds: expected different numbers"),
         (["replay", "--suites", "beats", "--seeds", "1,1"], "seeds: expected different numbers"),
+        (["language", "--suites", "beats"], "model: expected models of kind diffusion, which language does not pretrain"),
         (["nobody", "--suites", "beats"], "method: expected one of ftl_igm"),
         (["replay", "--suites", "beats", "--model", "absent/{suite}"], "expected a pretrained model for suite beats, found none"),
         (["replay", "--suites", "beats", "--configurations", "absent"], "expected beats.yaml or suites.yaml in absent"),
