@@ -18,7 +18,7 @@ class BenchmarkOptions:
     """Run a method through the frozen suites, check a submission, make the leaderboard, or write the data.
 
     Attributes:
-        method: the name under which its package offers it, such as bc; empty to list the suites.
+        method: the name under which its package offers it, such as bc.
         suites: names with commas between them; empty for all that can be run here.
         skip: names of suites to leave out, with commas between them.
         seeds: with commas between them; a submission needs 0,1,2.
@@ -28,6 +28,7 @@ class BenchmarkOptions:
         configurations: folder with SUITE.yaml for each suite, or suites.yaml for all; empty for those of the method's package, or
             the defaults of its classes.
         root: folder of your own copy of recordings, for suites whose demonstrations do not ship.
+        list: print a table of the suites in place of running.
         check: a submission file to check in place of running; with a method, a part of it is run again.
         recompute: share of the rows that is run again.
         salt: a word that decides with the file which part that is.
@@ -45,6 +46,7 @@ class BenchmarkOptions:
     model: str = ""
     configurations: str = ""
     root: str = ""
+    list: bool = False
     check: str = ""
     recompute: float = 0.1
     salt: str = ""
@@ -56,8 +58,10 @@ class BenchmarkOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.recompute <= 1:
             raise UserError(f"recompute: expected a share from 0 to 1, found {self.recompute}")
-        if given := [f"--{name}" for name in ("check", "leaderboard", "data") if getattr(self, name)][1:]:
-            raise UserError(f"benchmark: expected one of --check, --leaderboard and --data, found {given[0]} beside another")
+        if given := [f"--{name}" for name in ("list", "check", "leaderboard", "data") if getattr(self, name)][1:]:
+            raise UserError(
+                f"benchmark: expected one of --list, --check, --leaderboard and --data, found {given[0]} beside another"
+            )
         if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", self.seeds) or len(set(self.seeds.split(","))) <= self.seeds.count(","):
             raise UserError(
                 f"seeds: expected different numbers with commas between them, such as 0,1,2, found {short(self.seeds)!r}"
@@ -82,7 +86,11 @@ def _entry(options: BenchmarkOptions, work: Path) -> "Entry":
 
 def benchmark(options: BenchmarkOptions) -> None:
     """Do what the options say."""
-    if options.check:
+    if options.list:
+        from ftl_lightning.benchmark.leaderboard import suite_table
+
+        say(suite_table())
+    elif options.check:
         _check(options)
     elif options.leaderboard:
         from ftl_lightning.benchmark.leaderboard import leaderboard, read_submissions
@@ -101,9 +109,9 @@ def benchmark(options: BenchmarkOptions) -> None:
     elif options.method:
         _run(options)
     else:
-        from ftl_lightning.benchmark.leaderboard import suite_table
-
-        say(suite_table())
+        raise UserError(
+            "method: expected the name of a method, such as ftl_igm, or --list, --check, --leaderboard or --data, found none"
+        )
 
 
 def _named(text: str, key: str) -> list[str]:

@@ -293,7 +293,7 @@ def test_data_are_written_with_cards_and_hashes(form: str) -> None:
         (["replay", "--suites", "beats", "--model", "absent/{suite}"], "expected a pretrained model for suite beats, found none"),
         (["replay", "--suites", "beats", "--configurations", "absent"], "expected beats.yaml or suites.yaml in absent"),
         (["--data", "data", "--suites", "beats", "--format", "csv"], "format: expected one of npz"),
-        (["--data", "data", "--leaderboard", "page.md"], "expected one of --check, --leaderboard and --data"),
+        (["--data", "data", "--leaderboard", "page.md"], "expected one of --list, --check, --leaderboard and --data"),
         (["--check", "x.json", "--recompute", "2"], "recompute: expected a share from 0 to 1"),
     ],
 )
