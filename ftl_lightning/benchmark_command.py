@@ -147,9 +147,9 @@ def _chosen(options: BenchmarkOptions) -> list[str]:
         if not (missing := missing_of(load_suite(name), root)):
             found.append(name)
         elif asked:
-            raise UserError(f"suite {name}: needs {missing}")
+            raise UserError(missing)
         else:
-            say(line(f"note: suite {name} is left out: it needs {missing}"), error=True)
+            say(line(f"note: left out: {missing}"), error=True)
     if not found:
         raise UserError("suites: expected one or more, found none that can be run here")
     return found

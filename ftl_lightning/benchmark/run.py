@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 SHIPPED = "shipped"
 """In place of a folder: the models that the method's configurations name."""
-FAMILIES = Path(__file__).parent / "configurations"
-"""Our methods' configurations of the families, which have no domain in ``conf``."""
+OURS = Path(__file__).parent / "configurations"
+"""Configurations of our methods for suites of which ``conf`` has none: the families."""
 KEPT_CONFIGURATION = "configuration.yaml"
 
 
@@ -69,7 +69,7 @@ class Entry:
         """
         folder = self.configurations or self.declared.configurations
         places = [Path(folder) / f"{suite.name}.yaml", Path(folder) / "suites.yaml"] if folder else []
-        places += [FAMILIES / f"{self.method}.yaml"] if suite.domain != suite.name and not self.configurations else []
+        places += [] if self.configurations else [OURS / f"{self.method}.yaml"]
         if (found := next((path for place in places if (path := shipped(place)).is_file()), None)) is not None:
             return found
         if self.configurations:
@@ -86,7 +86,7 @@ class Entry:
         expected = self.declared.adaptation.rpartition(":")[2]
         for files in ((path,), (path, added)):
             classes = [str((load(file, "invert").get("model") or {}).get("class_path", "")) for file in files if file.is_file()]
-            if [name for name in classes if name][-1:] and classes[-1].rpartition(".")[2] == expected:
+            if classes[-1].rpartition(".")[2] == expected:
                 return tuple(map(str, files))
         raise UserError(f"{path}: invert: expected model.class_path {expected}, as {self.method} learns, found another")
 
@@ -278,9 +278,9 @@ def temporary(entry: Entry) -> Iterator[Entry]:
 
 
 def missing_of(suite: BenchmarkSuite, root: Path | None) -> str:
-    """What a suite needs that is not here, in words; empty if it can be run."""
+    """Why a suite cannot be run here, in words; empty if it can be."""
     if suite.recordings and root is None:
-        return "your own copy of the recordings (--root FOLDER)"
+        return f"suite {suite.name}: needs your own copy of the recordings (--root FOLDER)"
     try:
         suite.loaded()
     except UserError as error:

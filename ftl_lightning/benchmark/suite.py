@@ -19,7 +19,7 @@ from ftl_lightning.tensor_file import bytes_hash, file_hash
 FOLDER = Path(__file__).parent / "suites"
 SEEDS = (0, 1, 2)
 """Of the protocol."""
-CLOSE = 1e-4
+CLOSE = 1e-3
 """Data whose mean and mean square differ by less, relatively, are those of another processor, which rounds in another way."""
 TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"
 """Parts of a suite's data."""
