@@ -160,6 +160,7 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.benchmark.submission import Submission, machine
     from ftl_lightning.benchmark.suite import SEEDS, load_suite
     from ftl_lightning.learning.methods import load_method
+    from ftl_lightning.representation import counted
     from ftl_lightning.targets import expect_writable_file
 
     out = Path(options.out)
@@ -189,7 +190,7 @@ def _run(options: BenchmarkOptions) -> None:
     told = f"check it with: ftl-lightning benchmark {options.method} --check {options.out}"
     if tuple(_numbers(options)) != SEEDS:
         told = f"a submission needs the seeds {','.join(map(str, SEEDS))}"
-    say(f"{options.out}: {len(found.runs)} runs; {told}")
+    say(f"{options.out}: {counted(len(found.runs), 'run')}; {told}")
 
 
 def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission":
@@ -212,11 +213,12 @@ def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission
 
 def _check(options: BenchmarkOptions) -> None:
     from ftl_lightning.benchmark.check import expect_submission, recompute
+    from ftl_lightning.representation import counted
 
     path = Path(options.check)
     submission, suites = expect_submission(path)
     rows = sum(len(run.rows) for run in submission.runs)
-    counts = f"{len(suites)} suites, {len(submission.runs)} runs, {rows} rows"
+    counts = f"{counted(len(suites), 'suite')}, {counted(len(submission.runs), 'run')}, {counted(rows, 'row')}"
     say(line(f"{path}: {submission.name}, {counts}: whole, and its numbers agree"))
     if not options.method:
         say("nothing was run again: that takes the installed method, too: ftl-lightning benchmark METHOD --check FILE")

@@ -10,11 +10,14 @@ from pathlib import Path
 
 from ftl_lightning.benchmark.suite import BenchmarkSuite
 from ftl_lightning.errors import about
+from ftl_lightning.limits import expect_readable
 from ftl_lightning.schema import built, read_json
 from ftl_lightning.tensor_file import content_hash, write_text
 from ftl_lightning.version import __version__
 
 KIND, FORMAT = "few-shot concepts", 1
+MOST = 4 * 2**20
+"""Bytes of a file; nine suites with three seeds come to a twentieth."""
 PRETRAINED, GIVEN = "pretrained", "given"
 """Where a model is from: pretrained in the run, or given to it."""
 
@@ -124,6 +127,7 @@ class Submission:
         Raises:
             UserError: naming the file and the key, for one that is none.
         """
+        expect_readable(path, "submission", MOST)
         with about(path):
             return built(cls, read_json(path, "a submission"), "")
 

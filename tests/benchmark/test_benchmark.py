@@ -72,7 +72,7 @@ def test_a_strangers_method_gives_a_submission_that_passes(submitted: Path, caps
     assert submission.scores["beats"].mean > 0.9
     assert all(run.references["demonstrations replayed"][0].measures["accuracy"] == 1 for run in submission.runs)
     assert main(["benchmark", "--check", str(submitted)]) == 0
-    assert "replay, 1 suites, 3 runs, 12 rows: whole" in capsys.readouterr().out
+    assert "replay, 1 suite, 3 runs, 12 rows: whole" in capsys.readouterr().out
     assert main(["benchmark", "replay", "--check", str(submitted)]) == 0
     told = capsys.readouterr().out
     assert "running 1 of 3 runs again, 4 of 12 rows" in told
@@ -213,6 +213,8 @@ def test_numbers_that_are_none_or_of_another_type_are_one_line(copy: Path, capsy
 def test_huge_files_devices_and_folders_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with Path("huge.json").open("wb") as file:
         file.truncate(2**31)
+    Path("large.json").write_bytes(b" " * 2**23 + b"{}")
+    assert "expected a submission file of at most 4194304 bytes" in line_of(capsys, "--check", "large.json")
     assert "at most" in line_of(capsys, "--check", "huge.json")
     os.mkfifo("pipe.json")
     assert "a device, pipe or socket" in line_of(capsys, "--check", "pipe.json")
