@@ -94,11 +94,12 @@ def benchmark(options: BenchmarkOptions) -> None:
         _check(options)
     elif options.leaderboard:
         from ftl_lightning.benchmark.leaderboard import leaderboard, read_submissions
+        from ftl_lightning.representation import counted
         from ftl_lightning.tensor_file import write_text
 
         found = read_submissions(Path(options.submissions))
         write_text(Path(options.leaderboard), leaderboard(found))
-        say(f"{options.leaderboard}: {len(found)} submissions")
+        say(f"{options.leaderboard}: {counted(len(found), 'submission')}")
     elif options.data:
         from ftl_lightning.benchmark.data import write_data
         from ftl_lightning.benchmark.suite import load_suite

@@ -14,9 +14,8 @@ from ftl_lightning.tensor_file import visible
 BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
 HEAD = """# Leaderboard
 
-This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in
-[results/submissions](../results/submissions), each of which passes `benchmark --check`. [The protocol](benchmark.md) says what the
-numbers mean and how to add a line.
+This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in `results/submissions`,
+each of which passes `benchmark --check`. [The protocol](benchmark.md) says what the numbers mean and how to add a line.
 """
 
 
