@@ -4,7 +4,6 @@ Paths, pictures and series are data of one's own, pretrained on with ``conf/own.
 object rearrangement, which pretraining does not show. Reaches and beats are looked at once.
 """
 
-import itertools
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from ftl_lightning.domains.object_rearrangement.generation import random_scenes
 from ftl_lightning.domains.object_rearrangement.relations import columns, overlap
+from ftl_lightning.testing.families import beats, pictures, reaches
 
 TEMPLATES, TEMPLATE_SEED = 80, 990
 """Samples of each kind that a judge compares with."""
@@ -89,29 +89,6 @@ def _paths(kind: str, count: int, seed: int) -> NDArray[np.float32]:
     return np.asarray(moved + rng.normal(0, 0.015, points.shape), dtype=np.float32)
 
 
-# Pictures of 8 x 8 grey values: single states of 64 columns.
-
-
-def _pictures(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    rng, shape = _rng("pictures", kind, seed), _rng("picture", _number(kind))
-    corner = shape.uniform(0.12, 0.88, (int(shape.integers(3, 6)), 2))
-    rows, cols = np.mgrid[0:32, 0:32] / 31
-    pixels, drawn = np.stack((cols, rows), axis=-1).reshape(-1, 2), []
-    for _ in range(count):
-        own = corner + rng.normal(0, 0.04, corner.shape)
-        angle, slant, middle = rng.uniform(-0.2, 0.2), rng.uniform(-0.25, 0.25), own.mean(axis=0)
-        change = np.array(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))) @ np.array(((1, slant), (0, 1)))
-        own = (own - middle) @ (change * rng.uniform(0.85, 1.1)).T + middle + rng.normal(0, 0.03, 2)
-        width, far = rng.uniform(0.05, 0.1), np.full(len(pixels), 9.0)
-        for start, end in itertools.pairwise(own):
-            way = end - start
-            along = np.clip(((pixels - start) @ way) / (way @ way + 1e-9), 0, 1)
-            far = np.minimum(far, np.linalg.norm(pixels - start - along[:, None] * way, axis=1))
-        grey = np.clip(1.3 - 0.6 * far / width, 0, 1).reshape(8, 4, 8, 4).mean(axis=(1, 3))
-        drawn.append(np.round(16 * np.clip(1.2 * grey, 0, 1)).reshape(1, 64))
-    return np.asarray(drawn, dtype=np.float32)
-
-
 # Series of five columns in unlike units: rises, decaying swings, and a bump, a step, a ramp or a wave.
 
 UNITS = np.array((1e-3, 1, 250, 4e3, 0.05))
@@ -129,35 +106,6 @@ def _series(kind: str, count: int, seed: int) -> NDArray[np.float32]:
         others = (bump, height * (s > late), sign[2] * height * s, height * np.sin(speed[2] * faster * s))
         values = np.stack((rise, swing, others[third]), axis=-1) @ mixing.T
         drawn.append(values * UNITS + np.array((0.02, 20, 1e3, 1e4, 0)) + rng.normal(0, 0.01, values.shape) * UNITS)
-    return np.asarray(drawn, dtype=np.float32)
-
-
-# Reaches of a hand in space with a gripper, and beats of one column: looked at once.
-
-
-def _reaches(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    shape, rng, s, drawn = _rng("a reach", _number(kind)), _rng("reaches", kind, seed), np.linspace(0, 1, 50), []
-    goals, closing, height = shape.uniform(-0.4, 0.4, (3, 3)), shape.uniform(0.2, 0.8), shape.uniform(0.05, 0.3)
-    for _ in range(count):
-        start, own = rng.normal(0, 0.05, 3), goals + rng.normal(0, 0.03, goals.shape)
-        knots = np.stack((start, *own))
-        smooth = s * s * (3 - 2 * s)
-        way = np.stack([np.interp(smooth, np.linspace(0, 1, 4), knots[:, axis]) for axis in range(3)], axis=-1)
-        way = np.stack([np.convolve(np.pad(column, 4, mode="edge"), np.ones(9) / 9, mode="valid") for column in way.T], axis=-1)
-        way[:, 2] += height * np.sin(np.pi * s)
-        grip = 1 / (1 + np.exp(-(s - closing - rng.uniform(-0.05, 0.05)) * 40))
-        drawn.append(np.column_stack((way + rng.normal(0, 0.001, way.shape), 80 * grip)))
-    return np.asarray(drawn, dtype=np.float32)
-
-
-def _beats(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    shape, rng, s, drawn = _rng("a beat", _number(kind)), _rng("beats", kind, seed), np.linspace(0, 1, 120), []
-    place, width, height = np.sort(shape.uniform(0.1, 0.9, 4)), shape.uniform(0.015, 0.08, 4), shape.normal(0, 1, 4)
-    for _ in range(count):
-        at, pace = place + rng.normal(0, 0.01, 4), rng.uniform(0.9, 1.1)
-        waves = height * rng.uniform(0.8, 1.2) * np.exp(-(((s[:, None] * pace - at) / width) ** 2))
-        wander = 0.1 * np.sin(2 * np.pi * (rng.uniform(0.3, 1) * s + rng.uniform()))
-        drawn.append((waves.sum(axis=1) + wander + rng.normal(0, 0.01, len(s)))[:, None])
     return np.asarray(drawn, dtype=np.float32)
 
 
@@ -256,10 +204,10 @@ def _holds(samples: NDArray[np.float32], kind: str) -> NDArray[np.bool_]:
 FAMILIES: Mapping[str, Family] = {
     "relations": Family((), tuple(RULES), _scenes, _holds, "object_rearrangement"),
     "paths": _own("path", _paths, (8, 6), placed=False),
-    "pictures": _own("picture", _pictures, (8, 4)),
+    "pictures": _own("picture", pictures, (8, 4)),
     "series": _own("series", _series, (8, 4)),
-    "reaches": _own("reach", _reaches, (8, 4)),
-    "beats": _own("beat", _beats, (8, 4)),
+    "reaches": _own("reach", reaches, (8, 4)),
+    "beats": _own("beat", beats, (8, 4)),
 }
 KEPT = ("reaches", "beats")
 """Families that nothing was chosen on."""

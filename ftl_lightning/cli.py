@@ -32,6 +32,7 @@ COMMANDS = {
     "concepts": "list the concepts of a model: training concepts and learned ones",
     "explain": "say in words what a learned concept is made of",
     "ablate": "run every cell of an ablation, those that are missing in the results",
+    "benchmark": "run a method through frozen suites, check a submission, make the leaderboard",
     "report": "tables and figures from results, beside the paper's numbers",
     "prepare": "read your own copy of a domain's recordings, which do not ship",
     "study": "make a web page in which people rate films of generated behaviour",
@@ -40,13 +41,14 @@ COMMANDS = {
 }
 POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study", "view"}
 """Commands whose required arguments are given by position."""
-FIRST = {"play": "pretrained"}
+FIRST = {"play": "pretrained", "benchmark": "method"}
 """Commands with an option that may also be given by position, at the front."""
 SEVERAL = {"study-report": "answers"}
 """Commands that take any number of files by position, with the option that a list of them is."""
 REPEATED = {"concepts": "folder"}
 """Commands with an option that may be given several times."""
 MODULES = {
+    "benchmark": "ftl_lightning.benchmark_command",
     "check": "ftl_lightning.check_command",
     "play": "ftl_lightning.play_command",
     "sample": "ftl_lightning.sampling_command",

@@ -95,6 +95,12 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "encode": {"out": _table},
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
+    "benchmark": {
+        "out": _written("out"),
+        "check": _file("submission", MOST_TEXT),
+        "leaderboard": _written("leaderboard"),
+        "data": _written("data", expect_writable_folder),
+    },
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},
     "play": {"demonstrations": _file("demonstrations"), "static": _written("static", expect_writable_folder)},
     "prepare": _FOLDER,

@@ -19,6 +19,7 @@ LAYERS = (
     ("play",),
     ("lightning_cli",),
     ("ablation",),
+    ("benchmark",),
     ("commands",),
     ("cli",),
 )

@@ -1,0 +1,245 @@
+"""Checking a submission: its form, that it is whole, that its numbers agree, and a part of them by running it again.
+
+A file decides nothing here but numbers and names of suites and concepts, which have to be known. No code that it names is run: the
+method is the one that the person at the keyboard names.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ftl_lightning.benchmark.run import SHIPPED, Entry, scored, temporary
+from ftl_lightning.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine
+from ftl_lightning.benchmark.suite import ASKED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
+from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.learning.methods import load_method
+from ftl_lightning.printing import say
+from ftl_lightning.tensor_file import content_hash
+from ftl_lightning.version import __version__
+
+HASH = re.compile(r"[0-9a-f]{16}")
+NAME = re.compile(r"[\w .+()-]{1,60}")
+"""What a method may be called."""
+ROUNDING = 2e-6
+"""Of values with six decimals, twice."""
+ERRORS = 3
+"""Standard errors that a rate may differ by on another machine, where learning amplifies rounding."""
+LEAST, MOST = 0.0, 1.0
+
+
+def expect_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
+    """Read a submission and refuse one that is not whole or does not agree with itself and the frozen suites.
+
+    Returns:
+        it, and its suites by name.
+
+    Raises:
+        UserError: naming the file, the first thing that is wrong, what was expected and what was found.
+    """
+    submission = Submission.load(path)
+    with about(path):
+        _expect_header(submission)
+        suites = {name: _expect_suite(submission, name) for name in submission.suites}
+        _expect_runs(submission, suites)
+        _expect_scores(submission)
+    return submission, suites
+
+
+def _expect(good: bool, key: str, expected: object, found: object) -> None:
+    if not good:
+        raise UserError(f"{key}: expected {expected}, found {short(str(found), 80)}")
+
+
+def _expect_header(submission: Submission) -> None:
+    _expect(submission.kind == KIND, "kind", repr(KIND), repr(submission.kind))
+    _expect(submission.format == FORMAT, "format", FORMAT, submission.format)
+    for key in ("method", "name"):
+        value = getattr(submission, key)
+        _expect(NAME.fullmatch(value) is not None, key, "letters, digits and a few signs, at most 60", repr(value))
+    _expect(tuple(submission.seeds) == SEEDS, "seeds", list(SEEDS), list(submission.seeds))
+    _expect(bool(submission.suites), "suites", f"some of {', '.join(suite_names())}", "none")
+    for key, value in submission.machine.items():
+        _expect(len(key) + len(value) <= 200, "machine", "short texts", f"{len(key) + len(value)} characters")
+
+
+def _expect_suite(submission: Submission, name: str) -> BenchmarkSuite:
+    suite = load_suite(name)
+    _expect(
+        submission.suites[name] == suite.hash,
+        f"suites.{short(name)}",
+        f"the frozen suite's hash {suite.hash}",
+        submission.suites[name],
+    )
+    return suite
+
+
+def _expect_runs(submission: Submission, suites: Mapping[str, BenchmarkSuite]) -> None:
+    seen = set()
+    for index, run in enumerate(submission.runs):
+        key = f"runs[{index}]"
+        _expect(run.suite in suites, f"{key}.suite", f"one of {', '.join(suites)}", repr(run.suite))
+        _expect(run.seed in submission.seeds, f"{key}.seed", f"one of {list(submission.seeds)}", run.seed)
+        where = f"{run.suite}, seed {run.seed}"
+        _expect((run.suite, run.seed) not in seen, key, f"one run of {where}", "two")
+        seen.add((run.suite, run.seed))
+        _expect_run(run, suites[run.suite], where)
+    for name in suites:
+        for seed in submission.seeds:
+            _expect((name, seed) in seen, "runs", f"one of {name}, seed {seed}", "none")
+
+
+def _expect_run(run: Run, suite: BenchmarkSuite, where: str) -> None:
+    for key, value in (("model", run.model), ("configuration", run.configuration)):
+        _expect(HASH.fullmatch(value) is not None, f"{where}: {key}", "a hash of 16 digits", repr(value))
+    _expect(run.origin in (PRETRAINED, GIVEN), f"{where}: origin", f"{PRETRAINED} or {GIVEN}", repr(run.origin))
+    known = suite.data.get(str(run.seed), {})
+    parts = [part for part in known if part in ((TRAINING, *ASKED) if run.origin == PRETRAINED else ASKED)]
+    for part in parts:
+        found = run.data.get(part, "none")
+        _expect(found == known[part].hash, f"{where}: data.{part}", f"the frozen data's hash {known[part].hash}", found)
+    _expect(set(run.data) == set(parts), f"{where}: data", ", ".join(parts) or "nothing", ", ".join(run.data))
+    for key, seconds in (("seconds", run.seconds), ("pretraining_seconds", run.pretraining_seconds)):
+        _expect(seconds >= 0, f"{where}: {key}", "0 or more", seconds)
+    _expect_rows(run.rows, suite, where, tuple(suite.measures))
+    _expect(len(run.references) <= 20, f"{where}: references", "at most 20", len(run.references))
+    for name, rows in run.references.items():
+        _expect(NAME.fullmatch(name) is not None, f"{where}: references", "names of reference lines", repr(name))
+        _expect_rows(rows, suite, f"{where}, {name}", (suite.headline,))
+
+
+def _expect_rows(rows: Sequence[Row], suite: BenchmarkSuite, where: str, measures: Sequence[str]) -> None:
+    """Every concept of the test once, with the measures, of the suite's number of samples."""
+    asked = [(task.setting, task.concept) for task in suite.test]
+    found = [(row.setting, row.concept) for row in rows]
+    for task in asked:
+        count = found.count(task)
+        _expect(count == 1, f"{where}: rows", f"one of {task[1]!r} ({task[0]})", count or "none")
+    for row in rows:
+        _expect((row.setting, row.concept) in asked, f"{where}: rows", "concepts of the test alone", repr(row.concept))
+        told = f"{where}, {short(row.concept, 40)}"
+        _expect(row.n == suite.samples, f"{told}: n", suite.samples, row.n)
+        _expect(
+            set(measures) <= set(row.measures) <= set(suite.measures),
+            f"{told}: measures",
+            ", ".join(measures),
+            ", ".join(row.measures),
+        )
+        for name, value in row.measures.items():
+            rate = suite.is_rate(name)
+            _expect(value >= LEAST and (not rate or value <= MOST), f"{told}: {name}", "0 to 1" if rate else "0 or more", value)
+            whole = abs(value * row.n - round(value * row.n)) <= row.n * ROUNDING
+            _expect(not rate or whole, f"{told}: {name}", f"a whole number of {row.n} samples", value)
+
+
+def _expect_scores(submission: Submission) -> None:
+    expected = scored(submission).scores
+    _expect(set(submission.scores) == set(expected), "scores", ", ".join(expected), ", ".join(submission.scores))
+    for name, score in expected.items():
+        found = submission.scores[name]
+        _expect(found.concepts == score.concepts, f"scores.{name}.concepts", score.concepts, found.concepts)
+        for key in ("mean", "error"):
+            mine, theirs = getattr(score, key), getattr(found, key)
+            _expect(abs(mine - theirs) <= ROUNDING, f"scores.{name}.{key}", f"{mine}, which the rows come to", theirs)
+
+
+def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
+    """The runs that are run again: at least a share of all rows.
+
+    Which ones a hash of the whole file decides, together with a word of whoever checks: who does not know the word cannot look for
+    a file whose draw suits.
+
+    Args:
+        submission: that is checked.
+        share: of its rows, 0 for none.
+        salt: the word; may be empty.
+    """
+    whole = submission.hash
+    order = sorted(submission.runs, key=lambda run: content_hash([salt, whole, run.suite, run.seed]))
+    wanted = share * sum(len(run.rows) for run in submission.runs)
+    found: list[Run] = []
+    while sum(len(run.rows) for run in found) < wanted:
+        found.append(order[len(found)])
+    return found
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A number that was not found again."""
+
+    run: Run
+    where: str
+    submitted: object
+    found: object
+
+    def __str__(self) -> str:
+        return f"{self.run.suite}, seed {self.run.seed}, {short(self.where, 80)}: submitted {self.submitted}, found {self.found}"
+
+
+def allowed(submitted: float, found: float, n: int, rate: bool, alike: bool) -> bool:
+    """Whether a number was found again: the same, on a machine of the same kind; else about the same.
+
+    Args:
+        submitted, found: the numbers.
+        n: samples behind them.
+        rate: whether they are shares; other numbers may differ by a fifth on another machine.
+        alike: whether processor, versions and threads are the same.
+    """
+    apart = abs(submitted - found)
+    if apart <= ROUNDING:
+        return True
+    if alike:
+        return False
+    if not rate:
+        return apart <= 0.2 * max(submitted, found)
+    # One sample more counts where all are right or wrong, and a deviation of 0 would allow nothing.
+    mean = min(max((submitted + found) / 2, 1 / n), 1 - 1 / n)
+    return apart <= ERRORS * (2 * mean * (1 - mean) / n) ** 0.5
+
+
+def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Iterator[Difference]:
+    """What differs between a run that was submitted and the same run here."""
+    if alike and run.configuration != again.configuration:
+        yield Difference(run, "configuration", run.configuration, again.configuration)
+    if (alike or again.origin == GIVEN) and run.model != again.model:
+        yield Difference(run, "model", run.model, again.model)
+    pairs = [("", run.rows, again.rows), *((name, rows, again.references.get(name, ())) for name, rows in run.references.items())]
+    for name, rows, others in pairs:
+        known = {(row.setting, row.concept): row for row in others}
+        for row in rows:
+            other = known.get((row.setting, row.concept))
+            for measure, value in row.measures.items():
+                where = ", ".join(filter(None, (name, row.concept, measure)))
+                if other is None or measure not in other.measures:
+                    yield Difference(run, where, value, "none")
+                elif not allowed(value, other.measures[measure], row.n, suite.is_rate(measure), alike):
+                    yield Difference(run, where, value, other.measures[measure])
+
+
+def recompute(
+    entry: Entry, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
+) -> list[Difference]:
+    """Run a part of a submission again and say what differs.
+
+    Raises:
+        UserError: where the method is another, or cannot be run here.
+    """
+    method = load_method(entry.method)
+    if method.name != submission.name:
+        raise UserError(f"method: expected {submission.name!r}, which the submission is of, found {method.name!r}")
+    alike = dict(submission.machine) == machine() and submission.version == __version__
+    chosen = drawn(submission, share, salt)
+    found: list[Difference] = []
+    count, total = (sum(len(run.rows) for run in runs) for runs in (chosen, submission.runs))
+    say(f"running {len(chosen)} of {len(submission.runs)} runs again, {count} of {total} rows")
+    if not alike:
+        say("note: another machine or version: rates may differ by three standard errors, as rounding does", error=True)
+    with temporary(entry) as own:
+        for run in chosen:
+            # Where the submitter was given models and nobody names others, they are those that ship.
+            same = replace(own, model=SHIPPED) if run.origin == GIVEN and not own.model else own
+            again = same.run(suites[run.suite], run.seed)
+            differ = list(differences(run, again, suites[run.suite], alike))
+            say(f"{run.suite}, seed {run.seed}: {f'{len(differ)} numbers differ' if differ else 'the same'}")
+            found += differ
+    return found

@@ -1,0 +1,139 @@
+"""Four families of behaviour as a user's own data are: no simulator, no initial states, concepts that are words or numbers.
+
+Each is a domain. A sample is right if, of many samples of every kind, the nearest is one of the goal.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans
+from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
+from ftl_lightning.seeding import FRESH_SEED
+from ftl_lightning.testing import more_strokes
+from ftl_lightning.testing.families import beats, pictures, reaches
+
+TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
+"""Samples of each kind that a judge compares with, from a seed that nobody draws from."""
+CHANCE, ORACLE = "random kind (chance)", "generator (oracle)"
+Draw = Callable[[str, int, int], NDArray[np.float32]]
+"""``(kind, count, seed) -> (count, time, column)``."""
+Kind = Callable[[NDArray[np.float32]], Sequence[str]]
+"""The kind of each of some samples ``(sample, time, column)``."""
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Tells of which kind samples are, by the nearest template; columns are scaled by their spread.
+
+    Attributes:
+        draw: makes templates.
+        kinds: that it knows.
+    """
+
+    draw: Draw
+    kinds: tuple[str, ...]
+
+    @functools.cached_property
+    def _templates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Templates ``(kind * template, time * column)`` in units of their spread, and the spread ``(column,)``."""
+        known = np.concatenate([self.draw(kind, TEMPLATES, TEMPLATE_SEED) for kind in self.kinds]).astype(np.float64)
+        # Of single states all columns share a scale: some never change.
+        scale = known.reshape(-1, known.shape[2]).std(axis=0) if known.shape[1] > 1 else np.ones(known.shape[2])
+        return (known / scale).reshape(len(known), -1), scale
+
+    def __call__(self, samples: NDArray[np.float32]) -> Sequence[str]:
+        """The kind of each sample ``(sample, time, column)``; empty for one that is not finite."""
+        templates, scale = self._templates
+        flat = (samples / scale).reshape(len(samples), -1)
+        return [self._nearest(templates, one) if np.isfinite(one).all() else "" for one in flat]
+
+    def _nearest(self, templates: NDArray[np.float64], one: NDArray[np.float64]) -> str:
+        return self.kinds[int(np.square(templates - one).sum(axis=1).argmin()) // TEMPLATES]
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Tells of which kind pen strokes are, whatever their place and size."""
+
+    @functools.cached_property
+    def _judge(self) -> more_strokes.Judge:
+        return more_strokes.Judge.of()
+
+    def __call__(self, samples: NDArray[np.float32]) -> Sequence[str]:
+        """The kind of each stroke ``(sample, 40, 2)``; empty for one that is not finite."""
+        finite = [bool(np.isfinite(one).all()) for one in samples]
+        found = self._judge.kind(np.nan_to_num(samples, nan=0, posinf=0, neginf=0))
+        return [kind if good else "" for kind, good in zip(found, finite, strict=True)]
+
+
+def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequence[str], Sequence[str]], judge: Kind) -> Domain:
+    """The domain of a family.
+
+    Args:
+        name: of the domain.
+        plans: columns and horizon of what ``draw`` makes.
+        draw: makes behaviour of a kind.
+        kinds: of training, of validation and of the test.
+        judge: of which kind samples are.
+    """
+    training, validation, test = (tuple(some) for some in kinds)
+    every = (*training, *validation, *test)
+
+    def right(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+        return torch.tensor([kind == goal for kind in judge(states.numpy())], dtype=torch.bool)
+
+    def tensor(kind: str, count: int, seed: int) -> Tensor:
+        return torch.from_numpy(draw(kind, count, seed))
+
+    def chance(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+        # As many of each kind as possible, so that the line is no draw of luck.
+        return torch.cat([tensor(every[index % len(every)], 1, FRESH_SEED + seed + index) for index in range(count)])
+
+    def oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
+        return tensor(goal, count, 2 * FRESH_SEED + seed)
+
+    def new(kinds: Sequence[str]) -> Suite:
+        return Suite(tuple(EvaluationTask("new concept", kind, (kind,)) for kind in kinds))
+
+    source = Generated(name, plans, training, tensor)
+    return Domain(
+        name=name,
+        plans=plans,
+        concepts=Concepts(training, {"training": training_suite(training), "validation": new(validation), "paper": new(test)}),
+        source=lambda root: source,
+        metrics={ACCURACY: Metric(right)},
+        references={CHANCE: chance, ORACLE: oracle},
+    )
+
+
+def _numbered(name: str, word: str, plans: Plans, draw: Draw) -> Domain:
+    """Eight kinds for training, four to tune on and four for the test."""
+    training, validation, test = (
+        [f"{word} {number}" for number in numbers] for numbers in (range(8), range(200, 204), range(100, 104))
+    )
+    return family(name, plans, draw, (training, validation, test), Nearest(draw, (*training, *validation, *test)))
+
+
+STROKES = family(
+    "benchmark_strokes",
+    Plans(40, ("x", "y"), ("cm", "cm")),
+    more_strokes.drawn,
+    (more_strokes.KNOWN, more_strokes.VALIDATION, more_strokes.TEST),
+    Strokes(),
+)
+PICTURES = _numbered(
+    "benchmark_pictures",
+    "picture",
+    Plans(1, tuple(f"row {row} column {column}" for row in range(8) for column in range(8)), ("grey",) * 64),
+    pictures,
+)
+REACHES = _numbered("benchmark_reaches", "reach", Plans(50, ("x", "y", "z", "opening"), ("m", "m", "m", "mm")), reaches)
+BEATS = _numbered("benchmark_beats", "beat", Plans(120, ("potential",), ("mV",)), beats)

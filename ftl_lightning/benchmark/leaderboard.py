@@ -1,0 +1,107 @@
+"""The leaderboard: a page made of a folder of submissions, and of nothing else."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from ftl_lightning.benchmark.check import expect_submission
+from ftl_lightning.benchmark.run import references_of
+from ftl_lightning.benchmark.submission import GIVEN, Row, Run, Score, Submission, score
+from ftl_lightning.benchmark.suite import BenchmarkSuite, load_suite, suite_names
+from ftl_lightning.errors import UserError
+from ftl_lightning.escape import markdown
+from ftl_lightning.tensor_file import visible
+
+BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
+HEAD = """# Leaderboard
+
+This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in `results/submissions`,
+each of which passes `benchmark --check`. [The protocol](benchmark.md) says what the numbers mean and how to add a line.
+"""
+
+
+def suite_table() -> str:
+    """What the suites are, in Markdown, without their hashes."""
+    head = ["suite", "to pretrain on", "to tune on", "in the test", "demonstrations of each", "measures", "needs"]
+    lines = []
+    for suite in map(load_suite, suite_names()):
+        more = f", and up to {suite.training.recoveries} recoveries of each" if suite.training.recoveries else ""
+        lines.append(
+            [
+                f"`{suite.name}`",
+                f"{suite.training.count} of each of {len(suite.training.concepts)} concepts{more}",
+                str(len(suite.validation)),
+                str(len({task.concept for task in suite.test})),
+                str(suite.demonstrations),
+                ", ".join(suite.measures),
+                f"extra `{suite.needs}`" if suite.needs else "your own copy of the recordings" if suite.recordings else "nothing",
+            ]
+        )
+    return "\n".join(_row(cells) for cells in (head, ["---"] * len(head), *lines))
+
+
+def read_submissions(folder: Path) -> list[Submission]:
+    """Every submission of a folder, checked, in the order of names.
+
+    Raises:
+        UserError: naming the first file that does not pass, or two that are of the same method; or for a folder without any.
+    """
+    files = visible(folder, "*.json") if folder.is_dir() else []
+    if not files:
+        raise UserError(f"{folder}: expected a folder of submissions (.json), found none")
+    found: dict[str, Submission] = {}
+    for path in files:
+        submission, _ = expect_submission(path)
+        if submission.name in found:
+            raise UserError(f"{path}: expected one submission of {submission.name!r}, found two; remove one")
+        found[submission.name] = submission
+    return [found[name] for name in sorted(found)]
+
+
+def leaderboard(submissions: Sequence[Submission]) -> str:
+    """The page, in Markdown."""
+    suites = [load_suite(name) for name in suite_names()]
+    asked = [suite for suite in suites if any(suite.name in one.suites for one in submissions)]
+    parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in asked)]
+    if missing := [suite.title for suite in suites if suite not in asked]:
+        parts.append(f"No submission has these suites yet: {', '.join(map(markdown, missing))}.\n")
+    return "\n".join((*parts, END))
+
+
+def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
+    runs = {one.name: [run for run in one.runs if run.suite == suite.name] for one in submissions if suite.name in one.suites}
+    measures = [name if kind == "rate" else f"{name} (less is better)" for name, kind in suite.measures.items()]
+    head = ["method", *measures, "model", "pretraining, s", "learning and evaluation, s"]
+    lines = sorted(_lines(suite, runs), key=lambda line: -line[0])
+    table = [_row(head), _row(["---"] * len(head)), *(_row(cells) for _, cells in lines)]
+    return f"## {markdown(suite.title)}\n\n" + "\n".join(table) + "\n"
+
+
+def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]]) -> Iterator[tuple[float, list[str]]]:
+    """Cells of each line with its score: methods, then reference lines of the first submission that has them."""
+    others = [name for name in suite.measures if name != suite.headline]
+    for name, some in runs.items():
+        rows = [run.rows for run in some]
+        own = score(suite, rows)
+        model = "given" if some[0].origin == GIVEN else "pretrained"
+        times = [f"{sum(getattr(run, key) for run in some) / len(some):.0f}" for key in ("pretraining_seconds", "seconds")]
+        times[0] = "-" if some[0].origin == GIVEN else times[0]
+        yield (
+            own.mean,
+            [f"**{markdown(name)}**", _shown(own), *(_shown(score(suite, rows, other)) for other in others), model, *times],
+        )
+    lines: dict[str, Sequence[Sequence[Row]]] = {}
+    for found in references_of(runs).values():
+        lines = found | lines
+    for name, known in lines.items():
+        own = score(suite, known)
+        measured = set.intersection(*({*row.measures} for rows_of_seed in known for row in rows_of_seed))
+        cells = [_shown(score(suite, known, other)) if other in measured else "-" for other in others]
+        yield own.mean, [f"*{markdown(name)}*", _shown(own), *cells, "-", "-", "-"]
+
+
+def _shown(one: Score) -> str:
+    return f"{one.mean:.2f} ± {one.error:.2f}" if one.concepts > 1 else f"{one.mean:.2f}"
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
