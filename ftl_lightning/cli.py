@@ -15,6 +15,7 @@ from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_of_machine
 from ftl_lightning.parse_error import one_line
 from ftl_lightning.printing import any_terminal, line, say
+from ftl_lightning.starting import imported
 from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
@@ -123,9 +124,7 @@ def _dispatch(arguments: list[str]) -> None:
             function(found)
     elif verb in TRAINER_VERBS:
         inputs.check_inputs(verb, arguments[1:], inputs.TRAINER)
-        from ftl_lightning.lightning_cli import run
-
-        run(arguments)
+        imported("ftl_lightning.lightning_cli").run(arguments)
     else:
         raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
 
