@@ -20,7 +20,7 @@ from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
     "fit": "pretrain a model on a domain's training concepts",
-    "invert": "learn new concepts from a few demonstrations through a pretrained model",
+    "invert": "learn new concepts from a few demonstrations through a pretrained model; invert MODEL FILE needs no trainer",
     "validate": "validation loss and accuracy of a checkpoint",
     "test": "evaluate a checkpoint and write the results file",
 }
@@ -39,7 +39,7 @@ COMMANDS = {
     "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study", "view"}
+POSITIONAL = {"check", "concepts", "generate", "encode", "invert", "prepare", "study", "view"}
 """Commands whose required arguments are given by position."""
 FIRST = {"play": "pretrained"}
 """Commands with an option that may also be given by position, at the front."""
@@ -49,6 +49,7 @@ REPEATED = {"concepts": "folder"}
 """Commands with an option that may be given several times."""
 MODULES = {
     "check": "ftl_lightning.check_command",
+    "invert": "ftl_lightning.invert_command",
     "play": "ftl_lightning.play_command",
     "sample": "ftl_lightning.sampling_command",
     "view": "ftl_lightning.play_command",
@@ -108,7 +109,7 @@ def _dispatch(arguments: list[str]) -> None:
         say(_overview())
     elif verb == "--version":
         say(__version__)
-    elif verb in COMMANDS:
+    elif verb in COMMANDS or (verb == "invert" and _by_position(arguments[1:])):
         inputs.check_inputs(verb, arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli
 
@@ -127,6 +128,11 @@ def _dispatch(arguments: list[str]) -> None:
         imported("ftl_lightning.lightning_cli").run(arguments)
     else:
         raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
+
+
+def _by_position(arguments: Sequence[str]) -> bool:
+    """Whether arguments of ``invert`` name a model and a file, for which it needs no trainer."""
+    return bool(arguments) and not arguments[0].startswith("-")
 
 
 def _gathered(arguments: list[str], option: str) -> list[str]:

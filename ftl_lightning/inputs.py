@@ -93,6 +93,7 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
     "check": {"figure": _written("figure")},
     "encode": {"out": _table},
+    "invert": _FOLDER,
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},
