@@ -10,7 +10,7 @@ def imported(name: str) -> ModuleType:
     """A module that imports large libraries, imported without looking for garbage between their objects.
 
     Modules, classes and functions stay until the process ends. Python would look through all of them again and again while their
-    number grows, which takes a fifth of the time that Lightning takes to import, and in every full collection afterwards.
+    number grows, which takes a sixth of the time that Lightning takes to import, and again in every full collection afterwards.
 
     Args:
         name: of the module; one that is imported already is returned as it is.
