@@ -172,6 +172,9 @@ class FewShot(Shown):
         Only ``concept.safetensors`` is read of a folder, as numbers and texts. The Hub is asked where nothing of the name is here,
         and needs a network.
 
+        Args:
+            path: of the file or folder, or the name on the Hub.
+
         Raises:
             UserError: naming the file, if it is none or belongs to another model.
         """
@@ -189,6 +192,9 @@ class FewShot(Shown):
 
         A learned concept is named by its file, or by its name in the :meth:`library`; training concepts go first. After an ``@``
         the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
+
+        Args:
+            text: of the composition.
 
         Raises:
             UserError: for a part that is neither, a name of several concepts, or nothing at all.
@@ -375,6 +381,11 @@ class FewShot(Shown):
     def starts(self, goal: str, count: int = 10, seed: int = 0) -> InitialStates:
         """New initial states of a task, with scenes where there is an environment.
 
+        Args:
+            goal: the task.
+            count: of initial states.
+            seed: decides them.
+
         Raises:
             UserError: in domains without initial states.
         """
@@ -497,6 +508,10 @@ class FewShot(Shown):
     def push_to_hub(self, repository: str, private: bool = False) -> str:
         """Upload the model to the Hugging Face Hub as ``owner/name``; needs a network and a login.
 
+        Args:
+            repository: its name.
+            private: whether only you see it, if it is new.
+
         Returns:
             Where it is.
 
@@ -507,6 +522,10 @@ class FewShot(Shown):
 
     def publish(self, concept: LearnedConcept, repository: str, private: bool = False, demonstrations: bool = False) -> str:
         """Upload a concept that was learned with this model, see :meth:`LearnedConcept.push_to_hub`; :meth:`load` takes its name.
+
+        Args:
+            concept: to upload.
+            repository, private, demonstrations: see there.
 
         Returns:
             Where it is.

@@ -225,6 +225,9 @@ class Concept(Shown):
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.
 
+        Args:
+            path: of the file; it is written whole or not at all.
+
         Raises:
             UserError: for numbers that are not finite.
         """

@@ -256,6 +256,9 @@ class OwnData(PretrainingData):
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
         horizon, start_exponent: see :class:`Windows`.
+
+    Raises:
+        UserError: for a value out of its range, or a file that holds no such demonstrations.
     """
 
     def __init__(
