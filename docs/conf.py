@@ -49,7 +49,7 @@ html_show_sourcelink = False
 
 # Links are written for readers of the repository. Pages below are links to files outside this folder, which Sphinx would not find.
 OUTSIDE = ((r"(?:\.\./)+notebooks/([\w/]+)\.ipynb", "/notebooks"), (r"(?:\.\./)+pretrained/(\w+)/README\.md", "/cards"))
-BACK, BESIDE = re.compile(r"\]\((?:\.\./)+docs/([^)]*\.md(?:#[^)]*)?)\)"), re.compile(r"\[([^][\n]*)\]\((\w+)\.ipynb\)")
+BACK, BESIDE = re.compile(r"\]\((?:\.\./)+docs/([^)]*\.md(?:#[^)]*)?)\)"), re.compile(r"\[([^][\n]*)\]\(([\w/]+)\.ipynb\)")
 """Notebooks' links to pages of this folder, and to one another."""
 DOWNLOADS = re.compile(r"\]\(((?:\.\./)+(?:(?:results|ftl_lightning|examples|conf)/[^)]*|CHANGELOG|CONTRIBUTING)\.md)\)")
 

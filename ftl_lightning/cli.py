@@ -15,11 +15,12 @@ from ftl_lightning.configuration import expanded
 from ftl_lightning.errors import UserError, mistake_of_machine
 from ftl_lightning.parse_error import one_line
 from ftl_lightning.printing import any_terminal, line, say
+from ftl_lightning.starting import imported
 from ftl_lightning.version import __version__
 
 TRAINER_VERBS = {
     "fit": "pretrain a model on a domain's training concepts",
-    "invert": "learn new concepts from a few demonstrations through a pretrained model",
+    "invert": "learn new concepts from a few demonstrations through a pretrained model; invert MODEL FILE needs no trainer",
     "validate": "validation loss and accuracy of a checkpoint",
     "test": "evaluate a checkpoint and write the results file",
 }
@@ -39,7 +40,7 @@ COMMANDS = {
     "study-report": "the table of what they answered",
     "encode": "make a domain's table of concept embeddings with a language model",
 }
-POSITIONAL = {"check", "concepts", "generate", "encode", "prepare", "study", "view"}
+POSITIONAL = {"check", "concepts", "generate", "encode", "invert", "prepare", "study", "view"}
 """Commands whose required arguments are given by position."""
 FIRST = {"play": "pretrained", "benchmark": "method"}
 """Commands with an option that may also be given by position, at the front."""
@@ -50,6 +51,7 @@ REPEATED = {"concepts": "folder"}
 MODULES = {
     "benchmark": "ftl_lightning.benchmark_command",
     "check": "ftl_lightning.check_command",
+    "invert": "ftl_lightning.invert_command",
     "play": "ftl_lightning.play_command",
     "sample": "ftl_lightning.sampling_command",
     "view": "ftl_lightning.play_command",
@@ -109,7 +111,7 @@ def _dispatch(arguments: list[str]) -> None:
         say(_overview())
     elif verb == "--version":
         say(__version__)
-    elif verb in COMMANDS:
+    elif verb in COMMANDS or (verb == "invert" and _by_position(arguments[1:])):
         inputs.check_inputs(verb, arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli
 
@@ -125,11 +127,14 @@ def _dispatch(arguments: list[str]) -> None:
             function(found)
     elif verb in TRAINER_VERBS:
         inputs.check_inputs(verb, arguments[1:], inputs.TRAINER)
-        from ftl_lightning.lightning_cli import run
-
-        run(arguments)
+        imported("ftl_lightning.lightning_cli").run(arguments)
     else:
         raise UserError(f"verb: expected one of {', '.join((*TRAINER_VERBS, *COMMANDS))}, found {verb!r}")
+
+
+def _by_position(arguments: Sequence[str]) -> bool:
+    """Whether arguments of ``invert`` name a model and a file, for which it needs no trainer."""
+    return bool(arguments) and not arguments[0].startswith("-")
 
 
 def _gathered(arguments: list[str], option: str) -> list[str]:

@@ -59,6 +59,9 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
         encoder: "minilm" (the extra), or the name or path of a T5 or BERT-like model.
         revision: of a Hugging Face model.
         out: file to write; empty for the table that ships with the domain.
+
+    Raises:
+        UserError: for a domain that names no table of its own, where no file is named.
     """
     from ftl_lightning.concepts.encoder import load_encoder, write_table
     from ftl_lightning.domains.registry import load_domain
@@ -79,6 +82,9 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
         domain: name of a domain.
         root: folder of your copy; nothing is downloaded.
         out: folder to write; empty for the same.
+
+    Raises:
+        UserError: for a domain whose demonstrations need no preparation.
     """
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.errors import UserError
@@ -258,6 +264,9 @@ def study_report(answers: list[str] = [], key: str = "", all_raters: bool = Fals
         answers: files that raters saved, or folders of files answers*.json.
         key: the study's key; empty for key.json beside the first file.
         all_raters: also count raters who failed attention checks.
+
+    Raises:
+        UserError: where no file is named, or one is no rater's.
     """
     from ftl_lightning.errors import UserError
     from ftl_lightning.evaluation.summary import show

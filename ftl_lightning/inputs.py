@@ -9,7 +9,7 @@ from ftl_lightning.data_names import INFO, read_from, written_to
 from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.extras import expect_extra
 from ftl_lightning.limits import MOST_TEXT, expect_readable
-from ftl_lightning.shipped import missing_model, pretrained_folder
+from ftl_lightning.shipped import missing_model, pretrained_folder, shipped
 from ftl_lightning.targets import expect_new_folder, expect_writable_file, expect_writable_folder
 
 Check = Callable[[str], None]
@@ -34,6 +34,10 @@ def _demonstrations(path: str) -> None:
         expect_readable(Path(name) / INFO, "LeRobot info", MOST_TEXT)
     elif kind == "file":
         expect_readable(name, "demonstrations")
+
+
+def _concept(path: str) -> None:
+    expect_readable(shipped(path), "concept")
 
 
 def _file(kind: str, most: int | None = None) -> Check:
@@ -86,13 +90,14 @@ TRAINER: Mapping[str, Check] = {
     "evaluation.films": _written("evaluation.films"),
 }
 """Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
-_COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _file("concept"), "initial": _demonstrations}
+_COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _concept, "initial": _demonstrations}
 _OUT: Mapping[str, Check] = {"out": _written_demonstrations}
 _FOLDER: Mapping[str, Check] = {"out": _written("out", expect_writable_folder)}
 _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
     "check": {"figure": _written("figure")},
     "encode": {"out": _table},
+    "invert": _FOLDER,
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
     "ablate": {"results": _added("results")},
     "benchmark": {

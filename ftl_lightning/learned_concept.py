@@ -70,7 +70,14 @@ class LearnedConcept(Composition):
         return inspected(self.model, self.judging, self.demonstrations, self.concept, 0)
 
     def explain(self, nearest: int = 3) -> Explanation:
-        """What its weighted sum is made of, in words of the training concepts; of several knots, their mean."""
+        """What its weighted sum is made of, in words of the training concepts; of several knots, their mean.
+
+        Args:
+            nearest: how many of the nearest training concepts are told, 1 or more.
+
+        Raises:
+            UserError: for another number.
+        """
         expect_whole("nearest", nearest, 1)
         embedding = self.concept.weighted_sum.mean(dim=0)
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)

@@ -172,7 +172,7 @@ def _export_files(export: str, count: int) -> list[Path]:
 def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
     """Initial states of a file's demonstrations or of the goal; ``None`` where behaviour has none."""
     if options.initial:
-        from ftl_lightning.domains.data import read_demonstrations
+        from ftl_lightning.domains.from_file import read_demonstrations
 
         return read_demonstrations(options.initial, domain).initial_states
     task = _start_task(options, domain)

@@ -28,7 +28,7 @@ def shipped(path: str | Path) -> Path:
         The path as given where nothing is found either way, so that errors name what the user wrote.
     """
     path = Path(path)
-    if not path.exists() and not path.is_absolute() and path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts:
+    if path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts and not path.exists():
         inside = _PACKAGE / path
         if inside.exists():
             return inside

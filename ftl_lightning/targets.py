@@ -36,7 +36,11 @@ def expect_writable_file(path: str | Path, key: str = "") -> None:
 
 
 def expect_new_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`expect_folder`, and refuse a folder that holds something."""
+    """As :func:`expect_folder`, and refuse a folder that holds something.
+
+    Raises:
+        UserError: naming the path and its key.
+    """
     expect_folder(path, key)
     if Path(path).is_dir() and any(Path(path).iterdir()):
         name = short(f"{key}: {path}" if key else str(path), 150)

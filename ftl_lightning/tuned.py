@@ -32,6 +32,9 @@ class Tuned:
     def read(cls, path: str | Path) -> Self:
         """From a configuration file of ``invert``.
 
+        Args:
+            path: of the file, in the current folder or among those that ship.
+
         Raises:
             UserError: naming the file, if it is none or a value is not allowed.
         """
@@ -61,6 +64,9 @@ class Tuned:
         """The domain ``module:ATTRIBUTE`` that a configuration file names, if its module is installed or a person vouches for it.
 
         A model's folder may ask for the same one.
+
+        Args:
+            path: of the file.
 
         Raises:
             UserError: naming the file, if it is none.

@@ -11,6 +11,8 @@ them in the same way and compares. What a cell shows is to be the same to the di
     computed with a model: on another processor the last digit of a number may differ.
 ``varies``
     learned or simulated: on another processor numbers may differ. The cell asserts what must hold.
+``skip-execution``
+    not run here, such as an installation; nbclient, which runs the others, knows this tag.
 """
 
 import base64
@@ -32,7 +34,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 READ = ("conf", "pretrained", "results")
 """Folders of the checkout that notebooks read."""
-TAGS = ("rounding", "varies")
+TAGS = ("rounding", "varies", "skip-execution")
 COLOURS = 128
 LONGEST = 600
 """Seconds that a cell may take."""

@@ -195,6 +195,14 @@ def test_the_table_of_settings_is_what_the_configurations_say() -> None:
     assert settings["written"](page) == page, "run docs/settings.py"
 
 
+def test_the_table_of_starts_is_what_was_measured() -> None:
+    imports = runpy.run_path(str(ROOT / "benchmarks" / "imports.py"))
+    page = imports["PAGE"].read_text(encoding="utf-8")
+    found = json.loads((ROOT / "results" / "imports.json").read_text(encoding="utf-8"))
+    assert imports["written"](page, found) == page, "run benchmarks/imports.py --page"
+    assert set(found["help"]) <= TRAINER_VERBS.keys() | COMMANDS.keys(), "run benchmarks/imports.py"
+
+
 def test_the_page_of_the_paper_is_what_the_results_say() -> None:
     page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     assert runpy.run_path(str(ROOT / "docs" / "paper.py"))["page"]() == page, "run docs/paper.py"

@@ -4,6 +4,7 @@ import base64
 import io
 import re
 import runpy
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from PIL import Image
 from tests.conftest import ROOT
 from tests.test_docs import targets
 
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 EXECUTE = runpy.run_path(str(ROOT / "notebooks" / "execute.py"))
 PATHS: list[Path] = EXECUTE["notebooks"]()
 TUTORIALS = ROOT / "notebooks" / "tutorial"
@@ -91,7 +93,7 @@ def test_a_notebook_shows_what_it_shows_when_it_is_run_again(path: Path, tmp_pat
 def test_a_notebook_is_small_and_as_the_command_writes_it(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     assert path.stat().st_size <= (LARGEST_TUTORIAL if path.parent == TUTORIALS else LARGEST)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    code = [cell for cell in notebook.cells if cell.cell_type == "code" and "skip-execution" not in cell.metadata.get("tags", [])]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), AGAIN
     assert {tag for cell in notebook.cells for tag in cell.metadata.get("tags", [])} <= set(EXECUTE["TAGS"])
     assert set(notebook.metadata) == {"kernelspec", "language_info"}, AGAIN
@@ -122,6 +124,16 @@ def test_tutorials_link_to_the_next_and_end_with_exercises() -> None:
 def test_a_notebook_holds_no_logic(path: Path) -> None:
     code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     assert not any(word in source for source in code for word in ("def ", "class ", ".mean(", ".std("))
+
+
+def test_five_cells_are_five_and_the_first_installs_this_package() -> None:
+    cells = [
+        cell for cell in nbformat.read(ROOT / "notebooks" / "five_cells.ipynb", as_version=4).cells if cell.cell_type == "code"
+    ]
+    assert [cell.source.split()[1].rstrip(":") for cell in cells] == ["Install", "Load", "Learn", "Mix", "Film"]
+    assert f"%pip install --quiet {PROJECT['name']}" in cells[0].source
+    assert not cells[0].outputs
+    assert [kind for kind, _ in parts(cells[-1])] == ["image/gif", "text/plain"]
 
 
 def shown(text: str, tag: str = "", kind: str = "text/plain") -> NotebookNode:

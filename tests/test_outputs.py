@@ -26,7 +26,8 @@ from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.line_plots import picture
 from ftl_lightning.escape import figure_text, latex, latex_row, markdown
 from ftl_lightning.evaluation.animation import captioned
-from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.evaluation.results import append_rows
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.printing import line, plain, say
 from ftl_lightning.study.answers import read_key
 from tests.conftest import ROOT

@@ -1,6 +1,9 @@
 """What is released: the wheel and the source distribution, built once, what they hold, and the program and types of the wheel."""
 
+import json
+import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -151,6 +154,86 @@ def test_the_wheel_samples_in_any_folder(environment: Path, tmp_path: Path) -> N
     assert (tmp_path / "samples.safetensors").is_file()
 
 
+README = (ROOT / "README.md").read_text("utf-8")
+BLOCK = re.compile(r"^```python\n(?P<program>.*?)^```$|^ {4}(?P<command>python -m ftl_lightning (?:[^\n\\]|\\\n)+)$", re.M | re.S)
+QUICK = ["--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.references=false", "--evaluation.diversity=false"]
+SHORT = {
+    "generate": ["--count=1"],  # of several, invert would look at the quality
+    "fit": ["--trainer.max_steps=2", "--data.steps_per_epoch=2", *QUICK],
+    "invert": ["--data.steps=2", "--model.form=paper", "--evaluation.closed_loop=false", "--evaluation.figures=0", *QUICK],
+    "sample": ["--count=1", "--sampler=ddim", "--steps=2", "--replan=32"],
+}
+"""Options that make the README's commands a matter of seconds. ``play`` serves until it is stopped."""
+FEWER = {
+    "count=10": "count=1",
+    'name="go to red bowl")': 'name="go to red bowl", steps=2, form="paper")',
+    "observed=starts)": 'observed=starts, sampler="ddim", steps=2)',
+    'starts, goal="go to red bowl")': 'starts, goal="go to red bowl", replan=32, sampler="ddim", steps=2)',
+}
+"""The same in its programs."""
+RUN = """
+import json, sys, time
+import ftl_lightning
+from ftl_lightning.cli import main
+for kind, content in json.load(sys.stdin):
+    print(round(time.monotonic()), kind, content, file=sys.stderr)
+    if kind == "program":
+        exec(compile(content, "README.md", "exec"), {})
+    else:
+        assert main(content) == 0, content
+print(ftl_lightning.__file__)
+"""
+
+
+def test_the_blocks_of_the_readme_run_from_the_wheel(environment: Path, tmp_path: Path) -> None:
+    """In the order in which they stand, each with what the ones before have left, in one process."""
+    pytest.importorskip("pybullet", reason="the README's drive runs in the simulator of the extra navigation")
+    blocks: list[tuple[str, str | list[str]]] = []
+    for found in BLOCK.finditer(README):
+        if program := found["program"]:
+            for text, shorter in FEWER.items():
+                assert text in README, text
+                program = program.replace(text, shorter)
+            blocks.append(("program", program))
+        else:
+            verb, *options = shlex.split(found["command"].replace("\\\n", " "))[3:]
+            blocks.append(("command", [verb, *options, *SHORT.get(verb, [])]))
+    commands = [block for block in blocks if block[1][0] != "play"]
+    assert [kind for kind, _ in commands].count("program") == README.count("```python") == 2
+    assert len(commands) == 9
+    done = subprocess.run(
+        [environment, "-c", RUN], input=json.dumps(commands), capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert Path(done.stdout.splitlines()[-1]).is_relative_to(environment.parent.parent)
+    written = {"demos.safetensors", "concepts", "go_to_red_bowl.gif", "red_bowl.gif", "strokes.npz", "five.npz", "samples.png"}
+    assert written | {"jumping_jacks.gif"} <= {path.name for path in tmp_path.iterdir()}
+
+
+NOTEBOOK = """
+import sys
+import nbformat
+from nbclient import NotebookClient
+notebook = nbformat.read(sys.argv[1], as_version=4)
+notebook.cells.append(nbformat.v4.new_code_cell("import ftl_lightning\\nprint(ftl_lightning.__file__)"))
+NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
+print([cell.execution_count for cell in notebook.cells if cell.cell_type == "code"])
+print(notebook.cells[-1].outputs[0].text)
+"""
+
+
+def test_the_notebook_of_five_cells_runs_from_the_wheel(environment: Path, tmp_path: Path) -> None:
+    """All but its installation."""
+    pytest.importorskip("nbclient", reason="the extra dev runs notebooks")
+    own = os.environ | {"JUPYTER_PREFER_ENV_PATH": "1", "JUPYTER_DATA_DIR": str(tmp_path), "IPYTHONDIR": str(tmp_path)}
+    command = [environment, "-c", NOTEBOOK, ROOT / "notebooks" / "five_cells.ipynb"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=own)
+    assert done.returncode == 0, done.stderr[-3000:]
+    ran, place = done.stdout.split("\n", 1)
+    assert ran == "[None, 1, 2, 3, 4, 5]"
+    assert Path(place.strip()).is_relative_to(environment.parent.parent)
+
+
 USER = """
 from typing import assert_type
 
@@ -191,7 +274,7 @@ five = Demonstrations.load("five.npz")
 try:
     concept = model.learn(five.states.numpy(), {"world": np.zeros((5, 8, 52))}, name="go", steps=10)
 except UserError as error:
-    print(error)
+    raise SystemExit(str(error)) from error
 assert_type(concept, LearnedConcept)
 assert_type(concept.concept, Concept)
 mixed = concept + 0.8 * model["go to bowl"]
@@ -226,16 +309,36 @@ model.lern()
 """
 
 
-def test_programs_of_users_are_checked_against_the_types_of_the_wheel(environment: Path, tmp_path: Path) -> None:
-    """By mypy in its strict mode, which takes the package's types only where it says that it has some."""
-    pytest.importorskip("mypy", reason="the extra dev checks types")
+@pytest.fixture
+def programs(tmp_path: Path) -> list[str]:
+    """Files in the current folder: what users write, and something wrong."""
     (tmp_path / "user.py").write_text(USER, "utf-8")
     (tmp_path / "wrong.py").write_text(WRONG, "utf-8")
     for example in ("ftl-flow/ftl_flow.py", "ftl-strokes/ftl_strokes.py"):
         shutil.copy(ROOT / "examples" / example, tmp_path)
+    return sorted(path.name for path in tmp_path.glob("*.py"))
+
+
+def test_programs_of_users_are_checked_by_pyright_against_the_types_of_the_wheel(environment: Path, programs: list[str]) -> None:
+    """By basedpyright, the same with a node of its own, in pyright's standard mode."""
+    pytest.importorskip("basedpyright", reason="the extra dev checks types")
+    Path("pyrightconfig.json").write_text(json.dumps({"typeCheckingMode": "standard"}), "utf-8")
+    command = [sys.executable, "-m", "basedpyright", "--outputjson", "--pythonpath", str(environment), "--project", "."]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    told = json.loads(done.stdout)
+    assert told["summary"]["filesAnalyzed"] == len(programs)
+    errors = [one for one in told["generalDiagnostics"] if one["severity"] == "error"]
+    found = [(Path(one["file"]).name, one["range"]["start"]["line"] + 1, one["rule"]) for one in errors]
+    assert sorted(found) == [("wrong.py", 5, "reportArgumentType"), ("wrong.py", 6, "reportAttributeAccessIssue")], errors
+
+
+def test_programs_of_users_are_checked_against_the_types_of_the_wheel(
+    environment: Path, programs: list[str], tmp_path: Path
+) -> None:
+    """By mypy in its strict mode, which takes the package's types only where it says that it has some."""
+    pytest.importorskip("mypy", reason="the extra dev checks types")
     (tmp_path / "mypy.ini").write_text(MYPY, "utf-8")
-    command = [sys.executable, "-m", "mypy", "--no-error-summary", "--python-executable", str(environment)]
-    command += sorted(path.name for path in tmp_path.glob("*.py"))
+    command = [sys.executable, "-m", "mypy", "--no-error-summary", "--python-executable", str(environment), *programs]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stderr == ""
     found = re.findall(r"^(\w+\.py):(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.M)

@@ -103,7 +103,11 @@ def _text(value: Any, names: Mapping[str, str]) -> str:
 
 
 def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
-    """Every n-th cell of each stage, for shard i of n (``'i/n'``); counting goes on from stage to stage."""
+    """Every n-th cell of each stage of a plan, for shard i of n (``'i/n'``); counting goes on from stage to stage.
+
+    Raises:
+        UserError: for another text.
+    """
     found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if not found or int(found[1]) > int(found[2]):
         raise UserError(f"shard: expected 'number/shards' such as 3/8, found {shard!r}")

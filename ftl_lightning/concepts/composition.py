@@ -27,7 +27,12 @@ class Adapter(Protocol):
 
 
 def space_of(domain: str, model_hash: str) -> str:
-    """The concept space of a model, in words."""
+    """The concept space of a model, in words.
+
+    Args:
+        domain: name of the model's domain.
+        model_hash: of the model.
+    """
     return f"{domain} (hash {model_hash})"
 
 
@@ -196,7 +201,7 @@ class Composition(Shown):
         return self._with(embeddings=embeddings, weights=weights, modes=None, columns=columns, adapter=adapter), row
 
     def row(self, number: int) -> "Composition":
-        """One ``(K, ...)`` of several compositions ``(row, K, ...)`` without modes."""
+        """One ``(K, ...)`` of several compositions ``(row, K, ...)`` without modes, by its number from 0."""
         return self._with(
             embeddings=self.embeddings[number],
             weights=self.weights[number],
@@ -205,7 +210,7 @@ class Composition(Shown):
         )
 
     def drawn(self, generator: torch.Generator) -> "Composition":
-        """The composition ``(K, ...)`` of a single sample, without modes."""
+        """The composition ``(K, ...)`` of a single sample, without modes; of several modes the generator draws one."""
         if self.uncomposed.modes is None:
             return self.uncomposed
         rows, row = self.uncomposed.draw(1, generator)

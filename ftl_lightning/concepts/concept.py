@@ -16,6 +16,7 @@ from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor, expect_range
 from ftl_lightning.representation import Shown, counted, numbers
 from ftl_lightning.schema import built, expect_type
+from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
 
 KIND = "concept"
@@ -224,6 +225,9 @@ class Concept(Shown):
     def save(self, path: str | Path) -> None:
         """Write a safetensors file with a JSON header.
 
+        Args:
+            path: of the file; it is written whole or not at all.
+
         Raises:
             UserError: for numbers that are not finite.
         """
@@ -253,10 +257,13 @@ class Concept(Shown):
     def load(cls, path: str | Path) -> Self:
         """Read a concept.
 
+        Args:
+            path: of its file; ``pretrained/...`` is looked for in the current folder, then among the files that ship.
+
         Raises:
             UserError: for a file that is missing, damaged or not a concept.
         """
-        tensors, header = load_tensors(path, KIND, VERSIONS)
+        tensors, header = load_tensors(shipped(path), KIND, VERSIONS)
         form = header["format"]
         several = form == 2 or "mixed" in header
         keys = [*(field.name for field in fields(Origin)), *(("axes",) if form in AXES else ()), *(("mixed",) if several else ())]

@@ -30,7 +30,9 @@ class Encoder(Protocol):
     """Maps texts to embeddings ``(text, n)``. ``identity`` tells two encoders apart: name, revision, hash of the weights."""
 
     @property
-    def identity(self) -> str: ...
+    def identity(self) -> str:
+        """Name, revision and hash of the weights in one text."""
+        ...
 
     def __call__(self, texts: Sequence[str]) -> Tensor: ...
 
@@ -43,6 +45,7 @@ class TableEncoder:
 
     @property
     def identity(self) -> str:
+        """Of the encoder that made the table."""
         return str(load_tensors(self.path, KIND)[1]["encoder"])
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
@@ -74,6 +77,7 @@ class TransformerEncoder:
 
     @property
     def identity(self) -> str:
+        """The Hub's name with its revision, or the folder's label with a hash of its weights."""
         folder = Path(self.name)
         weights = visible(folder, "*.safetensors") if folder.is_dir() else []
         # A folder is known by its weights, so that the same model at another path is the same encoder.

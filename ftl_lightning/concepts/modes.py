@@ -72,6 +72,10 @@ class Modes(Shown):
         row ``(count,)``.
 
         A mixture is ``mean + stretch * sum_m share_m (mode_m - mean)``, the shares even on the simplex (Dirichlet(1)).
+
+        Args:
+            count: of samples.
+            generator: decides their modes, or shares.
         """
         if not self.mixed:
             chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)

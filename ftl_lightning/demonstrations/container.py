@@ -125,7 +125,7 @@ class Demonstrations(Shown):
         return self.rows([index for index, text in enumerate(self.concepts) if text == concept])
 
     def rows(self, chosen: Sequence[int]) -> Self:
-        """Some of the demonstrations."""
+        """Some of the demonstrations, chosen by their numbers from 0."""
         return replace(
             self,
             states=self.states[chosen],
@@ -240,6 +240,9 @@ class Demonstrations(Shown):
         An ``.npz`` needs ``states`` ``(demo, time, state)``; ``concepts`` (texts, or one for all), ``lengths`` (all full),
         ``state_names``, ``state_units``, ``domain``, ``scenes`` and observed features as ``observed/NAME`` are optional. Names
         listed in ``per_step`` are observed at every time.
+
+        Args:
+            path: of the file or folder, or the data set's name.
 
         Raises:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.

@@ -97,7 +97,11 @@ def read_lerobot(folder: str | Path, part: str = "", observed: Sequence[str] | N
 
 
 def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """The same before it is looked at whether values fit each other, see :func:`read_lerobot`."""
+    """The same before it is looked at whether values fit each other, see :func:`read_lerobot`, with the same arguments.
+
+    Raises:
+        UserError: naming the file, if it is none, is damaged or has other parts.
+    """
     root = Path(folder)
     info = _info(root)
     own = (root / BESIDE).is_file()

@@ -55,7 +55,11 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
 
 
 def read_contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """The same before it is looked at whether values fit each other, see :func:`read_minari`."""
+    """The same before it is looked at whether values fit each other, see :func:`read_minari`, with the same arguments.
+
+    Raises:
+        UserError: naming the data set, if it is none, is damaged or has other parts.
+    """
     try:
         found = minari.load_dataset(name)
         metadata = found.storage.metadata

@@ -115,7 +115,8 @@ class EntityEncoder(ConditionEncoder):
         # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
         # Adam turns the query a little (with norm 20, as it is, it would flip it).
         self.query = nn.Linear(sizes.concept_dim, len(self.attributes))
-        nn.init.normal_(self.query.weight, std=0.2)
+        if not self.query.weight.is_meta:  # where there are sizes alone, torch would import its compiler to draw nothing
+            nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + len(self.rest), inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
         # Where the attended entity is gets through without a bend: a plan ends there.
@@ -194,7 +195,9 @@ class PointEncoder(ConditionEncoder):
         self.count, self.turns = sizes.image_dim // POINT, bool(sizes.plane)
         self.choice = nn.Linear(sizes.concept_dim, CHOSEN * self.count)
         with torch.no_grad():  # every choice starts with a favourite of its own
-            self.choice.bias.copy_(torch.eye(self.count)[torch.arange(CHOSEN) % self.count].flatten())
+            # The device is said, wherever a network is being made: arithmetic on none (meta) makes torch import its compiler.
+            favourites = functional.one_hot(torch.arange(CHOSEN, device="cpu") % self.count, self.count)
+            self.choice.bias.copy_(favourites.flatten())
         vectors = CHOSEN * (CHOSEN + 1) // 2
         inputs = sizes.measured_dim + 5 * vectors + 2 * CHOSEN + POINT * self.count
         self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))

@@ -28,6 +28,9 @@ class MLPDenoiser(nn.Module):
         initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'``, ``'set'`` or ``'points'``,
             see :mod:`ftl_lightning.diffusion.conditions`.
         initial_dim: features of what is observed.
+
+    Raises:
+        UserError: for a size out of its range.
     """
 
     over_time = False

@@ -23,7 +23,9 @@ def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999)
     Returns:
         ``(T,)`` float32, the product of ``1 - beta`` up to and including each step; index 0 is the least noisy.
     """
-    edges = torch.cos((torch.arange(steps + 1, dtype=torch.float64) / steps + offset) / (1 + offset) * math.pi / 2) ** 2
+    # The device is said, wherever a network is being made: arithmetic on none (meta) makes torch import its compiler.
+    share = torch.arange(steps + 1, dtype=torch.float64, device="cpu") / steps
+    edges = torch.cos((share + offset) / (1 + offset) * math.pi / 2) ** 2
     beta = (1 - edges[1:] / edges[:-1]).clamp(max=beta_max)
     return torch.cumprod(1 - beta, dim=0).float()
 

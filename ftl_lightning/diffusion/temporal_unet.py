@@ -13,6 +13,9 @@ from ftl_lightning.diffusion.conditions import condition_encoder
 from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
 
+MOST_CLOCK = 256
+"""Channels that tell a state's place: more are waves that single precision cannot tell."""
+
 KERNEL, GROUPS = 5, 8
 
 
@@ -130,13 +133,13 @@ class TemporalUNet(nn.Module):
             )
         if width < GROUPS or width % GROUPS:
             raise UserError(f"denoiser_args.width: expected a multiple of {GROUPS}, found {width}")
-        if clock % 2:
-            raise UserError(f"denoiser_args.clock: expected an even number, found {clock}")
+        if clock % 2 or not 0 <= clock <= MOST_CLOCK:
+            raise UserError(f"denoiser_args.clock: expected an even number up to {MOST_CLOCK}, found {clock}")
         self.smooth = smooth
         self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
-        rates = 2.0 ** torch.arange(-1, clock // 2 - 1)[:, None]
-        # The device is said: transformers replaces linspace by one that overlooks where a model is built.
-        angle = torch.linspace(0, math.pi, sizes.horizon, device=rates.device) * rates
+        # The device is said, wherever a network is being made: arithmetic on none (meta) makes torch import its compiler.
+        rates = 2.0 ** torch.arange(-1, clock // 2 - 1, device="cpu")[:, None]
+        angle = torch.linspace(0, math.pi, sizes.horizon, device="cpu") * rates
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
         self.time = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, 4 * width), nn.Mish(), nn.Linear(4 * width, width))

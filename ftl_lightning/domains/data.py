@@ -18,9 +18,9 @@ from ftl_lightning.concepts.encoder import Encoder, load_encoder
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.demonstrations.features import expect_features
 from ftl_lightning.domains.domain import Domain, Recoveries
-from ftl_lightning.domains.from_file import OWN, domain_from_file, read_own
+from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
-from ftl_lightning.errors import UserError, about, short
+from ftl_lightning.errors import UserError, short
 from ftl_lightning.processes import drawn, rows_of
 from ftl_lightning.ranges import LARGEST, LARGEST_STEP, MOST_TOGETHER, expect_count, expect_factor, expect_range
 from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
@@ -258,6 +258,9 @@ class OwnData(PretrainingData):
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
         horizon, start_exponent: see :class:`Windows`.
+
+    Raises:
+        UserError: for a value out of its range, or a file that holds no such demonstrations.
     """
 
     def __init__(
@@ -374,19 +377,3 @@ def shares(demonstrations: Demonstrations, balance: float) -> Tensor:
     states = torch.zeros(len(texts), dtype=torch.double).index_add(0, concepts, lengths)
     weights = lengths * states[concepts] ** (balance - 1)
     return weights / weights.sum()
-
-
-def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
-    """A file or data set of a domain's demonstrations; those without a text are named after it.
-
-    Raises:
-        UserError: naming it, if it does not fit the domain.
-    """
-    demonstrations = read_own(path)
-    columns = len(domain.plans.columns)
-    if demonstrations.domain not in ("", domain.name):
-        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {short(demonstrations.domain)!r}")
-    if demonstrations.states.shape[2] != columns:
-        raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(demonstrations.states.shape)}")
-    with about(path):
-        return demonstrations.fitted(domain.observed)

@@ -35,7 +35,7 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.domains.hand_drawn import drawn_by_hand
 from ftl_lightning.domains.recognition import Recognition
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.seeding import generator
 
 OWN = "own"
@@ -158,6 +158,22 @@ def read_own(path: str) -> Demonstrations:
         UserError: naming it, if it is missing or damaged.
     """
     return Demonstrations.load(path).named(Path(path).stem)
+
+
+def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
+    """A file or data set of a domain's demonstrations; those without a text are named after it.
+
+    Raises:
+        UserError: naming it, if it does not fit the domain.
+    """
+    demonstrations = read_own(path)
+    columns = len(domain.plans.columns)
+    if demonstrations.domain not in ("", domain.name):
+        raise UserError(f"{path}: key 'domain': expected {domain.name!r}, found {short(demonstrations.domain)!r}")
+    if demonstrations.states.shape[2] != columns:
+        raise UserError(f"{path}: key 'states': expected shape (demo, time, {columns}), found {tuple(demonstrations.states.shape)}")
+    with about(path):
+        return demonstrations.fitted(domain.observed)
 
 
 def _scaled(examples: Demonstrations, states: Tensor) -> tuple[Tensor, Tensor]:

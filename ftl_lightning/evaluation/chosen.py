@@ -7,7 +7,7 @@ import lightning.pytorch as pl
 
 from ftl_lightning.errors import short
 from ftl_lightning.evaluation.evaluable import Evaluable
-from ftl_lightning.evaluation.results import Row
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import public
 
 USUAL = "usual"

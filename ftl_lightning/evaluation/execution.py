@@ -85,7 +85,14 @@ class Execution(Shown):
         return {name: float(values.float().mean()) for name, values in judged.items()}
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
-        """Pictures ``(height, width, 3)`` of an episode."""
+        """Pictures ``(height, width, 3)`` of an episode.
+
+        Args:
+            episode: its number from 0.
+
+        Raises:
+            UserError: for an episode that did not begin, or a domain that films none.
+        """
         plans = self.followed.get(episode) if isinstance(episode, int) else None
         if not plans:
             raise UserError(f"episode: expected one of {len(self.rollout.failed)} that began, found {shown(episode)}")
@@ -94,7 +101,15 @@ class Execution(Shown):
         return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
 
     def save(self, path: str | Path, episode: int = 0) -> None:
-        """Write an episode as an animated .gif."""
+        """Write an episode as an animated .gif.
+
+        Args:
+            path: of the file.
+            episode: its number from 0.
+
+        Raises:
+            UserError: for another ending of the file's name, an episode that did not begin, or a domain that films none.
+        """
         if Path(path).suffix != ".gif":
             raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")
         outcomes = self.domain.judge(self.goal, self.rollout) if self.goal else {}

@@ -6,7 +6,6 @@ from typing import Self
 
 import torch
 from torch import Tensor
-from torchmetrics import MeanMetric
 
 from ftl_lightning.demonstrations.features import InitialStates, join
 from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy, closed_loop_of
@@ -85,6 +84,8 @@ class Judged:
 
 def share(values: Tensor) -> float:
     """Share of true values, or the mean of numbers; those that are NaN do not count."""
+    from torchmetrics import MeanMetric  # two seconds of import, which tables and films of what was judged do not need
+
     metric = MeanMetric(nan_strategy="ignore", sync_on_compute=False)  # of several processes one evaluates
     metric.update(values.float())
     return float(metric.compute())

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.summary import OWN, show, summary_table
 from ftl_lightning.printing import say
 
@@ -21,6 +21,8 @@ def record(rows: Sequence[Row], results: str | None, folder: str | Path) -> None
     """
     if not rows:
         return
+    from ftl_lightning.evaluation.results import append_rows  # pandas, which nothing needs before
+
     path = results or Path(folder) / "results.csv"
     append_rows(path, list(rows))
     show(summary_table(rows, [row.task for row in rows if row.setting == OWN]))

@@ -22,7 +22,7 @@ from ftl_lightning.board import RESULTS
 from ftl_lightning.concepts.point import Part, Point
 from ftl_lightning.evaluation.animation import captioned, gif
 from ftl_lightning.evaluation.judged import LOST, WON
-from ftl_lightning.evaluation.results import METHOD, Row
+from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.printing import line
 

@@ -38,6 +38,9 @@ class Adaptation(pl.LightningModule, ABC):
         pretrained: folder of the pretrained model.
         omega: guidance weight of training concepts that are generated or composed with a learned one.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
+
+    Raises:
+        UserError: for a folder that holds no model, or one of a kind that this does not adapt.
     """
 
     learns = False
@@ -78,7 +81,11 @@ class Adaptation(pl.LightningModule, ABC):
         """The concepts by name."""
 
     def configure_model(self) -> None:
-        """Take the demonstrations over and check that they fit the model."""
+        """Take the demonstrations over and check that they fit the model.
+
+        Raises:
+            UserError: naming the option, where they do not, or concepts cannot be written.
+        """
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, InversionData):
             raise UserError(f"data.class_path: expected InversionData, found {type(data).__name__}")

@@ -42,6 +42,9 @@ class ConceptModel(Shown, nn.Module, ABC):
     Args:
         prepared: sizes and names, domain, normalisation, and embeddings in the model's concept space.
 
+    Raises:
+        UserError: for options that do not go with the domain.
+
     Attributes:
         empty: the empty concept ``(n,)`` in the model's concept space.
         training_embeddings: ``(training concept, n)`` in the model's concept space.

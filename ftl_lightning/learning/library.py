@@ -132,7 +132,11 @@ class Library(Shown):
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Concepts in aligned columns, under :data:`HEADINGS`."""
+    """Concepts, an entry each, in aligned columns under :data:`HEADINGS`.
+
+    Args:
+        entries: of a :class:`Library`.
+    """
     rows = [HEADINGS, *(entry.cells for entry in entries)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)

@@ -23,10 +23,14 @@ class TextConceptModel(ConceptModel):
 
     def __init__(self, prepared: Prepared[ModelConfig]) -> None:
         embeddings = prepared.embeddings
-        centre = embeddings[1:].mean(dim=0)
-        spread = (embeddings[1:] - centre).square().mean().sqrt()
-        spread = torch.where(spread > 0, spread, 1)  # of a single training concept
-        super().__init__(prepared.embedded((embeddings - centre) / spread))
+        if embeddings.is_meta:  # sizes alone: arithmetic on nothing would make torch import its compiler, which takes a second
+            centre, spread = embeddings.new_empty(embeddings.shape[1]), embeddings.new_empty(())
+        else:
+            centre = embeddings[1:].mean(dim=0)
+            spread = (embeddings[1:] - centre).square().mean().sqrt()
+            spread = torch.where(spread > 0, spread, 1)  # of a single training concept
+            embeddings = (embeddings - centre) / spread
+        super().__init__(prepared.embedded(embeddings))
         self.register_buffer("centre", centre)
         self.register_buffer("spread", spread)
 

@@ -2,15 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import READ, Observed
-from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import ModelConfig
+
+if TYPE_CHECKING:  # it comes with Lightning, which models do without
+    from ftl_lightning.domains.data import PretrainingData
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +47,7 @@ class StepConfig(ModelConfig):
         return min(self.horizon, 2)
 
 
-def expect_window(config: StepConfig, data: PretrainingData) -> None:
+def expect_window(config: StepConfig, data: "PretrainingData") -> None:
     """Refuse windows that do not hold a transition.
 
     Raises:

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS, PAPERS_METHOD
 from ftl_lightning.errors import UserError, shown
-from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, METHOD, read_rows, read_study, replaced
+from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, read_rows, read_study, replaced
+from ftl_lightning.evaluation.row import METHOD
 from ftl_lightning.limits import read_text
 from ftl_lightning.printing import say
 from ftl_lightning.reporting.changes import changes_table

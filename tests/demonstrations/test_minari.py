@@ -10,8 +10,8 @@ import torch
 
 from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.data import OwnData, read_demonstrations
-from ftl_lightning.domains.from_file import read_own
+from ftl_lightning.domains.data import OwnData
+from ftl_lightning.domains.from_file import read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 

@@ -155,7 +155,7 @@ def test_navigation_is_recorded(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pybullet", reason="the extra 'navigation' is not installed")
     from ftl_lightning.domains.agent.environment import AgentEnvironment
     from ftl_lightning.domains.agent.scenes import STATE
-    from ftl_lightning.domains.data import read_demonstrations
+    from ftl_lightning.domains.from_file import read_demonstrations
     from ftl_lightning.domains.registry import load_domain
 
     domain = load_domain("agent")

@@ -27,7 +27,8 @@ from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, standard_error
-from ftl_lightning.evaluation.results import COLUMNS, Row, append_rows, label, labels, read_rows
+from ftl_lightning.evaluation.results import COLUMNS, append_rows, labels, read_rows
+from ftl_lightning.evaluation.row import Row, label
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel

@@ -3,7 +3,7 @@ import io
 import pytest
 from rich.console import Console
 
-from ftl_lightning.evaluation.results import Row
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.summary import plain, show, summary_table
 
 

@@ -11,7 +11,8 @@ from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept, Origin
 from ftl_lightning.domains.paper import Compared
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
+from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.colours import COLOURS, OF_METHODS, colours

@@ -9,7 +9,8 @@ from ftl_lightning.cli import main
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
-from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.evaluation.results import append_rows
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.reporting.figures import frontier
 from ftl_lightning.reporting.frontier import frontier_table, read_frontier, write_frontier
 

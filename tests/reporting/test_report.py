@@ -5,7 +5,8 @@ import pytest
 
 from ftl_lightning.cli import main
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.evaluation.results import Row, append_rows, read_rows, read_study
+from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.reporting.comparison import comparison_table
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END

@@ -12,7 +12,8 @@ import torch
 from ftl_lightning.cli import main
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.results import Row, append_rows
+from ftl_lightning.evaluation.results import append_rows
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel

@@ -15,7 +15,7 @@ from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
 from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.diffusion.schedule import cosine_alpha_bar, denoising_loss, timesteps
+from ftl_lightning.diffusion.schedule import MOST_STEPS, cosine_alpha_bar, denoising_loss, timesteps
 from ftl_lightning.diffusion.spectrum import Spectrum
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.concept_model import Draws
@@ -23,6 +23,7 @@ from ftl_lightning.learning.model_config import ModelConfig
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.methods.ftl_igm import METHOD
+from ftl_lightning.ranges import expect_range
 from ftl_lightning.schema import built
 
 
@@ -42,6 +43,10 @@ class DiffusionConfig(ModelConfig):
     denoiser_args: Mapping[str, Any] = field(default_factory=dict)
     diffusion_steps: int = 100
     prediction: str = "epsilon"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expect_range("diffusion_steps", self.diffusion_steps, 1, MOST_STEPS)
 
 
 def build_denoiser(config: DiffusionConfig) -> nn.Module:

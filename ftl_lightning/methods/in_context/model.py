@@ -51,6 +51,9 @@ class InContextModel(ConceptModel):
 
     Args:
         prepared: what it is built for.
+
+    Raises:
+        UserError: for a width that is no multiple of the heads.
     """
 
     method = METHOD

@@ -28,6 +28,9 @@ class InContextPretraining(Pretraining[InContextModel]):
         images: folder of a trained model of any method, whose image encoders are used as they are, where images are observed:
             demonstrations are read before training.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+
+    Raises:
+        UserError: for a value out of its range, or images of a model that observes none.
     """
 
     def __init__(

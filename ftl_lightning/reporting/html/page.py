@@ -15,7 +15,8 @@ from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.domains.paper import OURS, Compared
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.films import FORMAT
-from ftl_lightning.evaluation.results import COMPARISON, CURVES, METHOD, REFERENCE, label, latest, read_rows, read_study
+from ftl_lightning.evaluation.results import COMPARISON, CURVES, latest, read_rows, read_study
+from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.printing import say
 from ftl_lightning.reporting.colours import COLOURS, colours

@@ -1,0 +1,80 @@
+"""The verb ``invert`` with a model and a file: its options, and what it does without a trainer. Its imports are inside."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ftl_lightning.printing import line, say
+from ftl_lightning.ranges import LARGEST_STEP, expect_count, expect_range
+
+if TYPE_CHECKING:
+    from ftl_lightning.learned_concept import LearnedConcept
+
+
+@dataclass(frozen=True)
+class InvertOptions:
+    """Learn the concepts of a file of demonstrations through a pretrained model, without a trainer.
+
+    The concepts are those that "invert --config" learns from the same file, with the settings of the model's domain. Nothing is
+    logged, evaluated or resumed.
+
+    Attributes:
+        pretrained: folder of the pretrained model, or the name of one that ships.
+        demonstrations: file of demonstrations (.npz or .safetensors), the folder of a LeRobot data set, or the name of a Minari
+            data set; each of its concepts is learned, and those without a text are one concept named after the file.
+        out: folder to write, a file for each concept.
+        steps: of gradient descent; 0 for what the settings name.
+        seed: decides starts, noise and timesteps.
+        form: of the concepts, such as "paper" or "modes"; empty for the one that the demonstrations ask for.
+        settings: configuration file of invert that says how to learn; empty for that of the domain.
+    """
+
+    pretrained: str
+    demonstrations: str
+    out: str = "concepts"
+    steps: int = 0
+    seed: int = 0
+    form: str = ""
+    settings: str = ""
+
+    def __post_init__(self) -> None:
+        expect_count("steps", self.steps, 0, LARGEST_STEP)
+        expect_range("seed", self.seed, 0)
+
+
+def invert(options: InvertOptions) -> None:
+    """Learn the concepts of the file together and write each."""
+    from ftl_lightning.concepts.concept import file_name
+    from ftl_lightning.domains.from_file import read_own
+    from ftl_lightning.errors import UserError, about, short
+    from ftl_lightning.few_shot import FewShot
+    from ftl_lightning.targets import expect_writable_file
+
+    model = FewShot.from_pretrained(options.pretrained, options.settings or None)
+    found = read_own(options.demonstrations)
+    with about(options.demonstrations):
+        found = model.demonstrations(found)
+    names = tuple(dict.fromkeys(found.concepts))
+    paths = [Path(options.out) / f"{file_name(name)}.safetensors" for name in names]
+    if len(set(paths)) < len(paths):
+        raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(names), 150)}")
+    for path in paths:
+        expect_writable_file(path, "out")
+    changes = {"form": options.form} if options.form else {}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        learned = model.learn_all(found, steps=options.steps or None, seed=options.seed, progress=True, **changes)
+    for note in told:
+        say("note:", line(str(note.message)), error=True)
+    for path, concept in zip(paths, learned.values(), strict=True):
+        concept.save(path)
+        _tell(path, concept)
+
+
+def _tell(path: Path, learned: "LearnedConcept") -> None:
+    concept = learned.concept
+    weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
+    say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
+    if concept.choice is not None:
+        say(f"  form: {concept.choice}")
