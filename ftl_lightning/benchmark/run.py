@@ -17,7 +17,7 @@ from ftl_lightning.benchmark.suite import ASKED, TRAINING, BenchmarkSuite, load_
 from ftl_lightning.configuration import load
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError, short
-from ftl_lightning.evaluation.results import METHOD, REFERENCE
+from ftl_lightning.evaluation.row import METHOD, REFERENCE
 from ftl_lightning.learning.method import Method
 from ftl_lightning.learning.methods import load_method
 from ftl_lightning.learning.model_config import CONFIG
