@@ -15,6 +15,7 @@ def test_it_listens_on_this_machine_alone_and_ends_with_control_c(tmp_path: Path
     with served(tmp_path, ["object_rearrangement"]) as server:
         assert server.host.startswith("127.0.0.1:")
         assert not [line for line in server.told if "warning" in line]
+        assert server.get("/api/state")  # before it answers, Ctrl-C interrupts a program that starts
         server.process.send_signal(signal.SIGINT)
         assert server.process.wait(20) == 0
     assert "ended\n" in server.told
