@@ -166,6 +166,9 @@ def ablate(
     shard: str = "1/1",
     executor: Literal["local", "ray"] = "local",
     root: str = "",
+    address: str = "",
+    only: list[int] = [],  # noqa: B006 (never changed)
+    status: bool = False,
 ) -> None:
     """Run every cell of an ablation that the results do not hold yet.
 
@@ -176,10 +179,16 @@ def ablate(
         shard: "3/8" for the third of eight parts; models that it needs and does not make itself must be there.
         executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
         root: folder of recordings, of domains that read one: data.root of every cell.
+        address: of the Ray cluster's head, HOST:PORT; empty for RAY_ADDRESS, or else a cluster that runs on this machine.
+        only: numbers of the stages to run, from 1; empty for all.
+        status: run nothing; print the table of what became of each cell, also while another process runs them.
     """
-    from ftl_lightning.ablation.run import run_ablation
+    from ftl_lightning.ablation.run import planned, run_ablation, show_cells
 
-    run_ablation(stages, seeds, results, shard, executor, root)
+    if status:
+        show_cells(results, [cell for cells in planned(stages, seeds, root, only) for cell in cells])
+        return
+    run_ablation(stages, seeds, results, shard, executor, root, address, only)
 
 
 def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
