@@ -94,7 +94,7 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "check": {"figure": _written("figure")},
     "encode": {"out": _table},
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
-    "ablate": {"results": _added("results")},
+    "ablate": {"results": _added("results"), "slurm": _written("slurm")},
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},
     "play": {"demonstrations": _file("demonstrations"), "static": _written("static", expect_writable_folder)},
     "prepare": _FOLDER,

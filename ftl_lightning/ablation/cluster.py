@@ -21,6 +21,8 @@ from ftl_lightning.tensor_file import alone, write_text
 
 POLL = 0.5
 """Seconds between two looks at what runs."""
+LOOK = 5.0
+"""Seconds between two looks at the cluster itself."""
 HEAD_WAIT = 20.0
 """Seconds that the head may be silent. Ray ends the whole process after 60, without a word that would help."""
 NODE_WAIT = 60.0
@@ -141,7 +143,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                     send(one.cell, one.runs + 1)
                 else:
                     yield one.cell, outcome
-            if ready or now - looked < 10 * POLL:
+            if ready or now - looked < LOOK:
                 continue
             looked = now
             if _answers(address):

@@ -63,9 +63,7 @@ def read_resources(asked: Mapping[str, Any], key: str = "resources") -> Resource
     """
     for name, amount in asked.items():
         if not _NAME.fullmatch(name):
-            raise UserError(
-                f"{key}: expected {CPUS}, {GPUS}, {MEMORY} or the name of a cluster's own resource, found {shown(name)}"
-            )
+            raise UserError(f"{key}: expected {CPUS}, {GPUS}, {MEMORY} or a resource of the cluster's own, found {shown(name)}")
         number = isinstance(amount, int | float) and not isinstance(amount, bool) and math.isfinite(amount) and amount >= 0
         if not number or (name != MEMORY and amount > 1 and amount % 1):
             expected = "a number of 0 or more" if name == MEMORY else "a whole number of 0 or more, or a fraction of 1"

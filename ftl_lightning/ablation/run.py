@@ -6,7 +6,7 @@ import time
 import traceback
 from argparse import ArgumentError
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 from ftl_lightning import log_folder
 from ftl_lightning.ablation.check import check
 from ftl_lightning.ablation.cluster import cluster
+from ftl_lightning.ablation.estimate import estimate
 from ftl_lightning.ablation.outcome import Outcome, Run, State, Tell
 from ftl_lightning.ablation.plan import Cell, Stage, part
 from ftl_lightning.ablation.record import by_node, read_record, table, tell
@@ -57,7 +58,7 @@ def run_ablation(
     """
     from ftl_lightning.evaluation.results import add_rows
 
-    plan = part(planned(stages, seeds, root, only), shard)
+    plan = part(list(planned(stages, seeds, root, only).values()), shard)
     every = [cell for cells in plan for cell in cells]
     check(every)
     read_record(results)  # a damaged one is told before anything runs
@@ -85,8 +86,8 @@ def run_ablation(
         raise UserError(f"ablation: {len(failed)} of {total} cells failed: " + "; ".join(failed))
 
 
-def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only: Sequence[int] = ()) -> list[list[Cell]]:
-    """The cells of each stage, for all seeds.
+def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only: Sequence[int] = ()) -> dict[int, list[Cell]]:
+    """The cells of each stage by its number, for all seeds.
 
     Args:
         stages: in order.
@@ -102,9 +103,46 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
     if wrong := [number for number in only if not 1 <= number <= len(stages)]:
         raise UserError(f"only: expected numbers of stages from 1 to {len(stages)}, found {wrong[0]}")
     shared = {"data.root": root} if root else {}
-    chosen = [stage for number, stage in enumerate(stages, 1) if not only or number in only]
-    every = [replace(stage, options={**shared, **stage.options}) for stage in chosen]
-    return [[cell for seed in seeds for cell in stage.cells(seed)] for stage in every]
+    every = {number: replace(stage, options={**shared, **stage.options}) for number, stage in enumerate(stages, 1)}
+    chosen = {number: stage for number, stage in every.items() if not only or number in only}
+    return {number: [cell for seed in seeds for cell in stage.cells(seed)] for number, stage in chosen.items()}
+
+
+def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
+    """Print how many cells are to be run and for how many hours, as far as that was measured; nothing runs.
+
+    Args:
+        plan: the cells of each stage.
+        results: results file.
+        workers: cells that run side by side; 0 for several numbers of them.
+
+    Raises:
+        UserError: for cells that cannot run.
+    """
+    every = [cell for cells in plan for cell in cells]
+    check(every)
+    known = known_hashes(results)
+    with bar("cells looked at", len(every), lines=False) as advance:
+
+        def needed(cell: Cell) -> bool:
+            advance()
+            return not _is_done(cell, known)
+
+        left = [[cell for cell in cells if needed(cell)] for cells in plan]
+    say("\n".join(estimate(left, read_record(results), len(every), workers)))
+
+
+def _is_done(cell: Cell, known: set[str]) -> bool:
+    """Whether a cell need not be run. One whose pretrained model another cell is yet to make must."""
+    if cell.done and Path(cell.done).is_file():
+        return True
+    if cell.verb == "fit" or not known:
+        return False
+    from ftl_lightning.lightning_cli import build
+
+    with log_folder.run(), suppress(UserError, ArgumentError):
+        return _hash(build(cell.verb, [*cell.arguments, *_log(cell)])) in known
+    return False
 
 
 def show_cells(results: str, cells: Sequence[Cell]) -> None:

@@ -70,7 +70,7 @@ def write_plan(path: Path, *stages: dict[str, Any], results: str = "r.csv") -> P
 def begin(folder: Path, plan: Path, address: str, *options: str) -> "subprocess.Popen[str]":
     """Start a grid in a folder; what it says goes to ``said.txt`` there."""
     program = "import sys; from ftl_lightning.ablation import cluster; from ftl_lightning.cli import main; "
-    program += "cluster.HEAD_WAIT = 1.0; sys.exit(main())"  # nobody waits for a head that a test has killed
+    program += "cluster.HEAD_WAIT = cluster.LOOK = 1.0; sys.exit(main())"  # nobody waits for a head that a test has killed
     command = [sys.executable, "-c", program, "ablate", "--config", str(plan), "--executor", "ray", *options]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_ADDRESS": address, "OMP_NUM_THREADS": "1"}
     with (folder / "said.txt").open("w", encoding="utf-8") as said:
@@ -97,5 +97,3 @@ def node_of(entry: Entry, made: Any) -> Any:
     """The node of a cluster that a cell runs on."""
     begins = entry.node.rpartition("/")[2]
     return next((node for node in (made.head_node, *made.worker_nodes) if node.node_id.startswith(begins)), None)
-
-
