@@ -7,7 +7,7 @@ from statistics import mean
 from ftl_lightning.ablation.plan import Cell
 from ftl_lightning.ablation.record import Entry, without_seed
 
-HOUR = 3600.0
+MINUTE, HOUR = 60.0, 3600.0
 
 
 def seconds_of(cell: Cell, entries: Mapping[str, Entry]) -> float | None:
@@ -65,14 +65,18 @@ def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, Entry], total
     count = sum(map(len, known))
     itself = sum(entries[cell.name].seconds > 0 for cell in cells if cell.name in entries)
     if not count:
-        return [
-            *lines,
-            "hours: not known, for no cell like them was measured; run one of them, for example with --shard, and ask again",
-        ]
+        return [*lines, "hours: not known, as no cell like them was measured; run one, for example with --shard, and ask again"]
     if count < len(cells):
         names = [cell.name for cell, one in zip(cells, (one for stage in found for one in stage), strict=True) if one is None]
         lines.append(f"not known: {len(names)} cells, of which none like them was measured, such as {names[0]}; they come on top")
     lines.append(f"measured: {itself} of them before, {count - itself} estimated from other seeds or options of the same files")
     counts = [workers] if workers else [2**power for power in range((len(cells) - 1).bit_length() + 1)]
-    lines += [f"{number} at a time: {makespan(known, number) / HOUR:.2g} hours" for number in counts]
+    lines += [f"{number} at a time: {_told(makespan(known, number))}" for number in counts]
     return lines
+
+
+def _told(seconds: float) -> str:
+    """A time in the unit that it has a few of."""
+    if seconds >= HOUR:
+        return f"{seconds / HOUR:.1f} hours"
+    return f"{seconds / MINUTE:.0f} minutes" if seconds >= 2 * MINUTE else f"{seconds:.0f} seconds"
