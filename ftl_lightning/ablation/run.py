@@ -18,7 +18,7 @@ from ftl_lightning.ablation.cluster import cluster
 from ftl_lightning.ablation.estimate import estimate
 from ftl_lightning.ablation.outcome import Outcome, Run, State, Tell
 from ftl_lightning.ablation.plan import Cell, Stage, part
-from ftl_lightning.ablation.record import by_node, read_record, table, tell
+from ftl_lightning.ablation.record import by_node, counted, read_record, table, tell
 from ftl_lightning.configuration import load
 from ftl_lightning.errors import UserError
 from ftl_lightning.printing import say
@@ -65,21 +65,30 @@ def run_ablation(
     total, number, failed = len(every), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
+    states: dict[str, State] = {cell.name: "queued" for cell in every}
+
+    def told_state(cell: Cell, state: State, node: str, note: str) -> None:
+        noted([cell], state, node, note)
+        states[cell.name] = state
+        advance(0, counted(list(states.values())))
+        if state == "again":
+            say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
+
     with _executor(executor, address) as run, bar("cells", total, lines=False) as advance:
         noted(every, "queued")
         for cells in plan:
-            for cell, outcome in run(cells, known_hashes(results), _teller(results)):
+            for cell, outcome in run(cells, known_hashes(results), told_state):
                 number += 1
                 left = (time.monotonic() - start) / number * (total - number) / 60
                 told = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
                 say(f"[{number}/{total}, about {left:.0f} min left] {cell}: {told}")
-                advance()
                 if outcome.rows is not None:
                     add_rows(results, outcome.rows)
                 if outcome.error:
                     failed.append(f"{cell}: {outcome.error}")
-                state: State = "failed" if outcome.error else "done"
-                noted([cell], state, outcome.node, outcome.error or outcome.note, outcome.seconds)
+                states[cell.name] = "failed" if outcome.error else "done"
+                noted([cell], states[cell.name], outcome.node, outcome.error or outcome.note, outcome.seconds)
+                advance(1, counted(list(states.values())))
     if failed or executor == "ray":
         show_cells(results, every)
     if failed:
@@ -152,15 +161,6 @@ def show_cells(results: str, cells: Sequence[Cell]) -> None:
     entries = read_record(results)
     show(table(entries, cells))
     say("\n".join(by_node(entries, cells)))
-
-
-def _teller(results: str) -> Tell:
-    def told(cell: Cell, state: State, node: str, note: str) -> None:
-        tell(results, [cell], state, node, note)
-        if state == "again":
-            say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
-
-    return told
 
 
 @contextmanager
