@@ -72,7 +72,8 @@ def _connect(address: str) -> None:
     os.environ.setdefault("RAY_worker_niceness", "0")  # by default workers stand back for everything else
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
-        ray.init(address=here or address or "local", log_to_driver=False, include_dashboard=False)
+        # By "auto" Ray also finds the token of a cluster that asks for one.
+        ray.init(address="auto" if here else address or "local", log_to_driver=False, include_dashboard=False)
     except (ConnectionError, RuntimeError, ValueError) as error:  # also for other versions of Ray or Python
         raise UserError(f"address: expected a Ray cluster at {here or address}, found: {short(str(error), 150)}") from error
 

@@ -68,7 +68,7 @@ def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, Entry], total
         return [*lines, "hours: not known, as no cell like them was measured; run one, for example with --shard, and ask again"]
     if count < len(cells):
         names = [cell.name for cell, one in zip(cells, (one for stage in found for one in stage), strict=True) if one is None]
-        lines.append(f"not known: {len(names)} cells, of which none like them was measured, such as {names[0]}; they come on top")
+        lines.append(f"not known: {len(names)} of them, none like which was measured, such as {names[0]}; their time comes on top")
     lines.append(f"measured: {itself} of them before, {count - itself} estimated from other seeds or options of the same files")
     counts = [workers] if workers else [2**power for power in range((len(cells) - 1).bit_length() + 1)]
     lines += [f"{number} at a time: {_told(makespan(known, number))}" for number in counts]

@@ -126,7 +126,8 @@ def table(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> Table:
 def counted(states: Sequence[str]) -> str:
     """Cells by state, in one line: ``'4 cells: 1 queued, 3 done'``."""
     parts = [f"{states.count(state)} {state}" for state in get_args(State) if state in states]
-    return f"{len(states)} cells: {', '.join(parts)}" if parts else "no cells"
+    cells = f"{len(states)} {'cell' if len(states) == 1 else 'cells'}"
+    return f"{cells}: {', '.join(parts)}" if parts else cells
 
 
 def by_node(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> list[str]:

@@ -47,7 +47,7 @@ def test_an_estimate_says_what_it_does_not_know() -> None:
     lines = estimate([[other], plan], {first.name: Entry("done", first.configs, seconds=3600)}, 9)
     assert lines == [
         "9 cells: 4 need not be run, 5 to run",
-        "not known: 1 cells, of which none like them was measured, such as fit a, seed 0; they come on top",
+        "not known: 1 of them, none like which was measured, such as fit a, seed 0; their time comes on top",
         "measured: 1 of them before, 3 estimated from other seeds or options of the same files",
         "1 at a time: 4.0 hours",
         "2 at a time: 2.0 hours",
