@@ -33,16 +33,17 @@ _FOLDER = ".cells."
 
 
 @contextmanager
-def cluster(address: str, attempt: Attempt) -> Iterator[Run]:
+def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Iterator[Run]:
     """Connect to a Ray cluster for the length of the block; one that the caller is connected to already is used and left as it is.
 
     Args:
         address: ``'HOST:PORT'`` of its head; ``'auto'`` for the one that this machine is a node of; ``'local'`` for this machine's
             processors alone; empty for Ray's way: ``RAY_ADDRESS``, else a cluster that runs on this machine, else its processors.
         attempt: runs a cell on a machine of the cluster, in the current folder.
+        cells: that are to be run.
 
     Raises:
-        UserError: where Ray is missing or no cluster answers.
+        UserError: where Ray is missing, no cluster answers, or no machine of it has room for one of the cells.
     """
     try:
         import ray
@@ -52,6 +53,7 @@ def cluster(address: str, attempt: Attempt) -> Iterator[Run]:
     if started:
         _connect(address or os.environ.get("RAY_ADDRESS", ""))
     try:
+        _expect_room(cells)
         yield partial(_run, attempt)
     finally:
         if started:
@@ -116,7 +118,6 @@ class _Sent:
 def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -> Iterator[tuple[Cell, Outcome]]:
     import ray
 
-    expect_room(cells)
     address = ray.get_runtime_context().gcs_address
     remote = ray.remote(max_retries=0)(_attempt_in)  # Ray would run a lost cell again without a word
     with _begun_folder() as folder:
@@ -143,7 +144,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                     tell(one.cell, "again", one.node, outcome.error)
                     send(one.cell, one.runs + 1)
                 else:
-                    yield one.cell, outcome
+                    yield one.cell, replace(outcome, node=outcome.node or one.node)
             if ready or now - looked < LOOK:
                 continue
             looked = now
@@ -157,7 +158,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                 )
 
 
-def expect_room(cells: Sequence[Cell]) -> None:
+def _expect_room(cells: Sequence[Cell]) -> None:
     """Refuse cells that no machine of the cluster has room for, which would wait for ever.
 
     Raises:

@@ -74,14 +74,17 @@ def run_ablation(
         if state == "again":
             say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
 
-    with _executor(executor, address) as run, bar("cells", total, lines=False) as advance:
+    with (
+        _executor(executor, address, [cell for cell in every if not _is_made(cell)]) as run,
+        bar("cells", total, lines=False) as advance,
+    ):
         noted(every, "queued")
         for cells in plan:
             for cell, outcome in run(cells, known_hashes(results), told_state):
                 number += 1
-                left = (time.monotonic() - start) / number * (total - number) / 60
+                minutes = (time.monotonic() - start) / number * (total - number) / 60
                 told = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
-                say(f"[{number}/{total}, about {left:.0f} min left] {cell}: {told}")
+                say(f"[{number}/{total}, about {minutes:.0f} min left] {cell}: {told}")
                 if outcome.rows is not None:
                     add_rows(results, outcome.rows)
                 if outcome.error:
@@ -141,9 +144,14 @@ def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0
     say("\n".join(estimate(left, read_record(results), len(every), workers)))
 
 
+def _is_made(cell: Cell) -> bool:
+    """Whether the file is there that says that a cell need not be run."""
+    return bool(cell.done) and Path(cell.done).is_file()
+
+
 def _is_done(cell: Cell, known: set[str]) -> bool:
     """Whether a cell need not be run. One whose pretrained model another cell is yet to make must."""
-    if cell.done and Path(cell.done).is_file():
+    if _is_made(cell):
         return True
     if cell.verb == "fit" or not known:
         return False
@@ -164,13 +172,13 @@ def show_cells(results: str, cells: Sequence[Cell]) -> None:
 
 
 @contextmanager
-def _executor(name: str, address: str) -> Iterator[Run]:
+def _executor(name: str, address: str, cells: Sequence[Cell]) -> Iterator[Run]:
     if name == "local":
         if address:
             raise UserError(f"address: expected none without --executor ray, found {address!r}")
         yield _one_after_another
         return
-    with cluster(address, attempt) as run:
+    with cluster(address, attempt, cells) as run:
         yield run
 
 
@@ -182,7 +190,7 @@ def _one_after_another(cells: Sequence[Cell], known: set[str], tell: Tell) -> It
 
 def attempt(cell: Cell, known: set[str]) -> Outcome:
     """Run a cell, unless its results are known; an error of any kind becomes its outcome."""
-    if cell.done and Path(cell.done).is_file():
+    if _is_made(cell):
         return Outcome(note="done before")
     from ftl_lightning.evaluation.results import read_rows
     from ftl_lightning.lightning_cli import build  # seconds of import that parsing the plan does not need

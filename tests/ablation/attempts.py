@@ -4,7 +4,6 @@ import os
 import signal
 import time
 from dataclasses import asdict
-from pathlib import Path
 
 import pandas as pd
 
@@ -15,15 +14,13 @@ from ftl_lightning.evaluation.results import Row
 
 def attempt(cell: Cell, known: set[str]) -> Outcome:
     """Do what the cell's name says."""
-    before = Path(f"{cell.folder}.begun").exists()
-    Path(f"{cell.folder}.begun").touch()
     if cell.name == "fails":
         raise ValueError("the third concept has no demonstrations")
-    if cell.name == "kills its process twice" or (cell.name == "kills its process once" and not before):
+    if cell.name == "kills its process":
         os.kill(os.getpid(), signal.SIGKILL)
     if cell.name == "takes long":
         time.sleep(600)
-    return Outcome(note="second" if before else "first")
+    return Outcome(note="done")
 
 
 def rows(cell: Cell, known: set[str]) -> Outcome:

@@ -3,6 +3,7 @@
 import os
 import shlex
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import yaml
 
 from ftl_lightning.ablation.plan import Stage
 from ftl_lightning.ablation.record import read_record
-from ftl_lightning.ablation.slurm import Wave, script, waves
+from ftl_lightning.ablation.slurm import Wave, script, waves, write_scripts
 from ftl_lightning.cli import main
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
@@ -141,11 +142,12 @@ def test_the_jobs_of_an_array_run_a_grid_between_them(tmp_path: Path, capsys: py
     assert capsys.readouterr().out.count("in the results already") == 2
 
 
-def test_several_scripts_are_submitted_one_after_another(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ablate", "--config", "conf/ablation/smoke.yaml", "--slurm", "grid.sh", "--workers", "3"]) == 0
-    first, second = capsys.readouterr().out.splitlines()
+def test_several_scripts_are_submitted_one_after_another() -> None:
+    first, second = write_scripts("grid.sh", STAGES, PLAN, {"results": "r.csv", "seeds": [0, 1], "root": ""}, 3)
     assert first == "job1=$(sbatch --parsable grid.1.sh)"
     assert second == "job2=$(sbatch --parsable --dependency=afterok:${job1%%;*} grid.2.sh)"
     assert shlex.split(Path("grid.2.sh").read_text().splitlines()[-1])[-1] == "$SLURM_ARRAY_TASK_ID/3"
     for name in ("grid.1.sh", "grid.2.sh"):
         subprocess.run(["bash", "-n", name], check=True)
+    frozen = yaml.safe_load(Path("grid.sh.yaml").read_text())
+    assert [Stage(**stage) for stage in frozen["stages"]] == [replace(stage, seeds=[]) for stage in STAGES]
