@@ -127,7 +127,8 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
             begun = folder / f"{len(sent)}"
             sent.append(cell)
             task = remote.options(name=cell.folder, **cell.resources.ray())
-            waiting[task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun))] = _Sent(cell, runs, begun)
+            sent_task = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            waiting[sent_task] = _Sent(cell, runs, begun)
 
         sent: list[Cell] = []
         for cell in cells:
@@ -245,16 +246,19 @@ def _held(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _attempt_in(folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str) -> Outcome:
+def _attempt_in(
+    folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str, again: bool
+) -> Outcome:
     """Run a cell in the folder that all machines of a cluster share, with the modules that a person vouches for."""
     node = _node_name()
     if not Path(begun).parent.is_dir():
         told = f"{folder}: expected a folder that all machines share, found that {node} does not have it; call ablate in one"
         return Outcome(error=told, node=node)
     os.chdir(folder)
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # as the command line has it; checkpoints may be read
     write_text(begun, node)
     with trust.vouching(vouched):
-        return replace(attempt(cell, known), node=node)
+        return replace(attempt(cell, known, again), node=node)
 
 
 def _node_name() -> str:

@@ -36,5 +36,5 @@ Tell = Callable[[Cell, State, str, str], None]
 """Is told that a cell is in a state from now on, the machine, and a note."""
 Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
 """Runs cells, given the configuration hashes that need not be run; yields each with its outcome as it ends."""
-Attempt = Callable[[Cell, set[str]], Outcome]
-"""Runs one cell, unless its configuration hash is among those."""
+Attempt = Callable[[Cell, set[str], bool], Outcome]
+"""Runs one cell, unless its configuration hash is among those; for the second time, if it was lost before."""

@@ -188,11 +188,18 @@ def _one_after_another(cells: Sequence[Cell], known: set[str], tell: Tell) -> It
         yield cell, replace(attempt(cell, known), node=node)
 
 
-def attempt(cell: Cell, known: set[str]) -> Outcome:
-    """Run a cell, unless its results are known; an error of any kind becomes its outcome."""
+def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
+    """Run a cell, unless its results are known; an error of any kind becomes its outcome.
+
+    Args:
+        cell: of a plan.
+        known: configuration hashes that need not be run.
+        again: whether it was begun before and lost: a pretraining then goes on from its last checkpoint, if it has one.
+    """
     if _is_made(cell):
         return Outcome(note="done before")
     from ftl_lightning.evaluation.results import read_rows
+    from ftl_lightning.learning.checkpoint import last_checkpoint
     from ftl_lightning.lightning_cli import build  # seconds of import that parsing the plan does not need
 
     say(cell)
@@ -203,7 +210,8 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
             if cell.verb == "invert" and _hash(line) in known:
                 return Outcome(note="in the results already")
             start = time.monotonic()
-            getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule)
+            more = {"ckpt_path": last_checkpoint(line.trainer)} if again and cell.verb == "fit" else {}
+            getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule, **more)
         except (UserError, ArgumentError) as error:
             return Outcome(error=str(error))
         except Exception as error:  # a fault of ours or of the machine must not cost the other cells

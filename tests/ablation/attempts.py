@@ -12,7 +12,7 @@ from ftl_lightning.ablation.plan import Cell
 from ftl_lightning.evaluation.results import Row
 
 
-def attempt(cell: Cell, known: set[str]) -> Outcome:
+def attempt(cell: Cell, known: set[str], again: bool) -> Outcome:
     """Do what the cell's name says."""
     if cell.name == "fails":
         raise ValueError("the third concept has no demonstrations")
@@ -23,7 +23,7 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
     return Outcome(note="done")
 
 
-def rows(cell: Cell, known: set[str]) -> Outcome:
+def rows(cell: Cell, known: set[str], again: bool) -> Outcome:
     """Take a second and give three rows, unless they are known."""
     if cell.name in known:
         return Outcome(note="in the results already")
