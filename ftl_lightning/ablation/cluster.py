@@ -6,7 +6,7 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -87,7 +87,12 @@ def _here() -> str:
     """
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
     file = Path(folder, "ray", "ray_current_cluster")
-    address = file.read_text("utf-8").strip() if file.is_file() else ""
+    try:
+        if file.stat().st_uid not in (os.getuid(), 0):  # anyone may write there, and who runs a cluster runs code on its machines
+            return ""
+        address = file.read_text("utf-8").strip()
+    except OSError:
+        return ""
     return address if _answers(address) else ""
 
 
@@ -133,7 +138,7 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
         sent: list[Cell] = []
         for cell in cells:
             send(cell, 1)
-        heard = looked = time.monotonic()
+        looked, silent = time.monotonic(), 0.0
         while waiting:
             ready, _ = ray.wait(list(waiting), num_returns=1, timeout=POLL)
             now = time.monotonic()
@@ -150,9 +155,11 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
                 continue
             looked = now
             if _answers(address):
-                heard = now
+                silent = 0.0
                 yield from _without_home(waiting, now)
-            elif now - heard > HEAD_WAIT:
+                continue
+            silent = silent or now
+            if now - silent > HEAD_WAIT:
                 raise UserError(
                     f"address: the head of the cluster at {address} no longer answers; start it again, and give the same command: "
                     "cells that are done stay done"
@@ -180,7 +187,7 @@ def _nodes() -> list[dict[str, Any]]:
     return [node for node in ray.nodes() if node["Alive"]]
 
 
-def _tell_begun(waiting: Any, tell: Tell) -> None:
+def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
     for one in waiting:
         if not one.node and one.begun.is_file():
             one.node = one.begun.read_text("utf-8") or "?"
