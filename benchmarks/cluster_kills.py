@@ -87,6 +87,8 @@ class Nodes:
             cell: name of its folder, which is also that of the process.
             node: the machine, as the record has it.
         """
+        if self.made is None:  # the command has not missed it yet
+            return False
         workers = [one for one in self.made.worker_nodes if one.node_id.startswith(node.rpartition("/")[2])]
         if kind == "process":
             found = _process(f"ray::{cell}")
