@@ -99,7 +99,7 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "encode": {"out": _table},
     "invert": _FOLDER,
     "sample": {**_OUT, **{key: _written(key) for key in ("figure", "animation", "export")}},
-    "ablate": {"results": _added("results")},
+    "ablate": {"results": _added("results"), "slurm": _written("slurm")},
     "benchmark": {
         "out": _written("out"),
         "check": _file("submission", MOST_TEXT),

@@ -183,7 +183,7 @@ def test_a_ray_cluster_of_two_workers_measures_the_same(quick: dict[str, object]
     monkeypatch.setenv("RAY_worker_niceness", "0")  # else they starve beside the other tests
     stage = quick | {"grid": {"model.omega": [1.0, 1.2]}}
     assert main(["ablate", "--config", plan("a.yaml", stage)]) == 0
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
         Path("b.yaml").write_text(Path("a.yaml").read_text().replace("r.csv", "s.csv"))
         failing = with_options(quick, **{"model.budget.learning_rate": 1e30, "data.steps": 20})

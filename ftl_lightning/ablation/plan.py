@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from ftl_lightning.ablation.resources import Resources, read_resources
 from ftl_lightning.errors import UserError
 
 
@@ -26,6 +27,8 @@ class Stage:
         done: a file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content
             is not looked at: remove it after a change of the stage's configuration.
         seeds: of the ablation's seeds those that the stage runs for; empty for all.
+        resources: that each of its cells books on a cluster: ``cpus`` (1 if it is not named), ``gpus``, ``memory_gb``, and any
+            resource that the nodes of a Ray cluster were started with.
     """
 
     verb: Literal["fit", "invert"]
@@ -36,6 +39,7 @@ class Stage:
     done: str = ""
     name: str = ""
     seeds: Sequence[int] = ()
+    resources: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def configs(self) -> list[str]:
@@ -62,18 +66,20 @@ class Stage:
                 said = [*added, *(text for text in texts if text not in (first, *added))]
                 varied = [f"{key.partition('.')[2]} {texts_of[key]}" for key in self.grid]
                 parts = [f"{self.verb} {first}", *said, _text(self.name, names), *varied, f"seed {seed}"]
-                yield Cell(self.verb, configs, texts_of, _text(self.done, names), ", ".join(filter(None, parts)))
+                name = ", ".join(filter(None, parts))
+                yield Cell(self.verb, configs, texts_of, _text(self.done, names), name, read_resources(self.resources))
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One run: a verb, its configuration files, options, the file that says that it need not run, and what it is called."""
+    """One run: a verb, its configuration files, options, the file that says that it need not run, its name, and what it books."""
 
     verb: Literal["fit", "invert"]
     configs: tuple[str, ...]
     options: Mapping[str, str]
     done: str
     name: str
+    resources: Resources = field(default_factory=Resources)
 
     @property
     def arguments(self) -> list[str]:

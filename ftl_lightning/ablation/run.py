@@ -1,37 +1,31 @@
 """Running a plan, here or on a cluster, cell by cell in the same way."""
 
-import os
+import socket
 import tempfile
 import time
 import traceback
 from argparse import ArgumentError
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ftl_lightning import log_folder, trust
+from ftl_lightning import log_folder
 from ftl_lightning.ablation.check import check
+from ftl_lightning.ablation.cluster import cluster
+from ftl_lightning.ablation.estimate import estimate
+from ftl_lightning.ablation.outcome import Outcome, Run, State, Tell
 from ftl_lightning.ablation.plan import Cell, Stage, part
+from ftl_lightning.ablation.record import by_node, counted, read_record, table, tell
 from ftl_lightning.configuration import load
 from ftl_lightning.errors import UserError
 from ftl_lightning.printing import say
 from ftl_lightning.progress import bar
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ftl_lightning.lightning_cli import CommandLine
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of a cell: rows of results (``None`` for none), a note, and the error, if it failed."""
-
-    rows: "pd.DataFrame | None" = None
-    note: str = ""
-    error: str = ""
 
 
 def run_ablation(
@@ -41,8 +35,12 @@ def run_ablation(
     shard: str = "1/1",
     executor: Literal["local", "ray"] = "local",
     root: str = "",
+    address: str = "",
+    only: Sequence[int] = (),
 ) -> None:
     """Run all cells of all seeds, stage after stage. A cell that fails does not stop the others; failures are listed at the end.
+
+    What becomes of each cell is put down beside the results, see :mod:`~ftl_lightning.ablation.record`.
 
     Args:
         stages: in order; a later one may read what an earlier one wrote.
@@ -50,81 +48,158 @@ def run_ablation(
         results: results file.
         shard: ``'3/8'`` for the third of eight parts of the plan, for as many machines or processes.
         executor: ``'local'``, one cell after another in this process; ``'ray'``, as many side by side as a cluster has room for,
-            the one that ``RAY_ADDRESS`` names, whose machines share this folder, or one of this machine's processors.
+            whose machines share this folder. A cell that is lost with its process or machine runs again, once.
         root: ``data.root`` of every cell; empty for what their configurations say.
+        address: of the Ray cluster, see :func:`~ftl_lightning.ablation.cluster.cluster`.
+        only: numbers of the stages to run, from 1; empty for all.
 
     Raises:
         UserError: before anything runs, for cells that cannot; at the end, naming the cells that failed.
     """
     from ftl_lightning.evaluation.results import add_rows
 
-    if not seeds:
-        raise UserError("seeds: expected one or more, found none")
-    shared = {"data.root": root} if root else {}
-    every = [replace(stage, options={**shared, **stage.options}) for stage in stages]
-    plan = [[cell for seed in seeds for cell in stage.cells(seed)] for stage in every]
-    plan = part(plan, shard)
-    check([cell for cells in plan for cell in cells])
-    total, number, failed = sum(map(len, plan)), 0, []
+    plan = part(list(planned(stages, seeds, root, only).values()), shard)
+    every = [cell for cells in plan for cell in cells]
+    check(every)
+    read_record(results)  # a damaged one is told before anything runs
+    total, number, failed = len(every), 0, []
     start = time.monotonic()
-    with _executor(executor) as run, bar("cells", total, lines=False) as advance:
+    noted = partial(tell, results)
+    states: dict[str, State] = {cell.name: "queued" for cell in every}
+
+    def told_state(cell: Cell, state: State, node: str, note: str) -> None:
+        noted([cell], state, node, note)
+        states[cell.name] = state
+        advance(0, counted(list(states.values())))
+        if state == "again":
+            say(f"{cell}: runs again, lost on {node or 'its machine'}: {note}")
+
+    with (
+        _executor(executor, address, [cell for cell in every if not _is_made(cell)]) as run,
+        bar("cells", total, lines=False) as advance,
+    ):
+        noted(every, "queued")
         for cells in plan:
-            for cell, outcome in run(cells, _known(results)):
+            for cell, outcome in run(cells, known_hashes(results), told_state):
                 number += 1
-                left = (time.monotonic() - start) / number * (total - number) / 60
+                minutes = (time.monotonic() - start) / number * (total - number) / 60
                 told = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
-                say(f"[{number}/{total}, about {left:.0f} min left] {cell}: {told}")
-                advance()
+                say(f"[{number}/{total}, about {minutes:.0f} min left] {cell}: {told}")
                 if outcome.rows is not None:
                     add_rows(results, outcome.rows)
                 if outcome.error:
                     failed.append(f"{cell}: {outcome.error}")
+                states[cell.name] = "failed" if outcome.error else "done"
+                noted([cell], states[cell.name], outcome.node, outcome.error or outcome.note, outcome.seconds)
+                advance(1, counted(list(states.values())))
+    if failed or executor == "ray":
+        show_cells(results, every)
     if failed:
         raise UserError(f"ablation: {len(failed)} of {total} cells failed: " + "; ".join(failed))
 
 
-Run = Callable[[Sequence[Cell], set[str]], Iterator[tuple[Cell, Outcome]]]
-"""Runs cells, given the configuration hashes that need not be run; yields each with its outcome as it ends."""
+def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only: Sequence[int] = ()) -> dict[int, list[Cell]]:
+    """The cells of each stage by its number, for all seeds.
+
+    Args:
+        stages: in order.
+        seeds: each stage runs once a seed.
+        root: ``data.root`` of every cell; empty for what their configurations say.
+        only: numbers of the stages, from 1; empty for all.
+
+    Raises:
+        UserError: for no seeds, or a number that no stage has.
+    """
+    if not seeds:
+        raise UserError("seeds: expected one or more, found none")
+    if wrong := [number for number in only if not 1 <= number <= len(stages)]:
+        raise UserError(f"only: expected numbers of stages from 1 to {len(stages)}, found {wrong[0]}")
+    shared = {"data.root": root} if root else {}
+    every = {number: replace(stage, options={**shared, **stage.options}) for number, stage in enumerate(stages, 1)}
+    chosen = {number: stage for number, stage in every.items() if not only or number in only}
+    return {number: [cell for seed in seeds for cell in stage.cells(seed)] for number, stage in chosen.items()}
+
+
+def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
+    """Print how many cells are to be run and for how many hours, as far as that was measured; nothing runs.
+
+    Args:
+        plan: the cells of each stage.
+        results: results file.
+        workers: cells that run side by side; 0 for several numbers of them.
+
+    Raises:
+        UserError: for cells that cannot run.
+    """
+    every = [cell for cells in plan for cell in cells]
+    check(every)
+    known = known_hashes(results)
+    with bar("cells looked at", len(every), lines=False) as advance:
+
+        def needed(cell: Cell) -> bool:
+            advance()
+            return not _is_done(cell, known)
+
+        left = [[cell for cell in cells if needed(cell)] for cells in plan]
+    say("\n".join(estimate(left, read_record(results), len(every), workers)))
+
+
+def _is_made(cell: Cell) -> bool:
+    """Whether the file is there that says that a cell need not be run."""
+    return bool(cell.done) and Path(cell.done).is_file()
+
+
+def _is_done(cell: Cell, known: set[str]) -> bool:
+    """Whether a cell need not be run. One whose pretrained model another cell is yet to make must."""
+    if _is_made(cell):
+        return True
+    if cell.verb == "fit" or not known:
+        return False
+    from ftl_lightning.lightning_cli import build
+
+    with log_folder.run(), suppress(UserError, ArgumentError):
+        return _hash(build(cell.verb, [*cell.arguments, *_log(cell)])) in known
+    return False
+
+
+def show_cells(results: str, cells: Sequence[Cell]) -> None:
+    """Print the table of what became of cells, and their states by machine."""
+    from ftl_lightning.evaluation.summary import show
+
+    entries = read_record(results)
+    show(table(entries, cells))
+    say("\n".join(by_node(entries, cells)))
 
 
 @contextmanager
-def _executor(name: str) -> Iterator[Run]:
+def _executor(name: str, address: str, cells: Sequence[Cell]) -> Iterator[Run]:
     if name == "local":
-        yield lambda cells, known: ((cell, attempt(cell, known)) for cell in cells)
+        if address:
+            raise UserError(f"address: expected none without --executor ray, found {address!r}")
+        yield _one_after_another
         return
-    try:
-        import ray
-    except ImportError as error:
-        raise UserError("executor: 'ray' needs its extra; run: pip install 'ftl-lightning[cluster]'") from error
-
-    def run(cells: Sequence[Cell], known: set[str]) -> Iterator[tuple[Cell, Outcome]]:
-        remote = ray.remote(num_cpus=1, max_retries=0)(_attempt_in)
-        waiting = {remote.remote(str(Path.cwd()), cell, known, trust.vouched()): cell for cell in cells}
-        while waiting:
-            (ready, *_), _ = ray.wait(list(waiting), num_returns=1)
-            try:
-                outcome = ray.get(ready)
-            except ray.exceptions.RayError as error:  # the worker died
-                outcome = Outcome(error=str(error).splitlines()[0])
-            yield waiting.pop(ready), outcome
-
-    started = not ray.is_initialized()  # else it runs on the cluster that the caller is connected to
-    if started:
-        os.environ.setdefault("RAY_worker_niceness", "0")  # by default workers stand back for everything else
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        ray.init(log_to_driver=False, include_dashboard=False)
-    try:
+    with cluster(address, attempt, cells) as run:
         yield run
-    finally:
-        if started:
-            ray.shutdown()
 
 
-def attempt(cell: Cell, known: set[str]) -> Outcome:
-    """Run a cell, unless its results are known; an error of any kind becomes its outcome."""
-    if cell.done and Path(cell.done).is_file():
+def _one_after_another(cells: Sequence[Cell], known: set[str], tell: Tell) -> Iterator[tuple[Cell, Outcome]]:
+    for cell in cells:
+        tell(cell, "running", node := socket.gethostname(), "")
+        yield cell, replace(attempt(cell, known), node=node)
+
+
+def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
+    """Run a cell, unless its results are known; an error of any kind becomes its outcome.
+
+    Args:
+        cell: of a plan.
+        known: configuration hashes that need not be run.
+        again: whether it was begun before and lost: a pretraining then goes on from its last checkpoint, if it has one.
+    """
+    if _is_made(cell):
         return Outcome(note="done before")
     from ftl_lightning.evaluation.results import read_rows
+    from ftl_lightning.learning.checkpoint import last_checkpoint
     from ftl_lightning.lightning_cli import build  # seconds of import that parsing the plan does not need
 
     say(cell)
@@ -134,14 +209,17 @@ def attempt(cell: Cell, known: set[str]) -> Outcome:
             line = build(cell.verb, [*cell.arguments, *_log(cell), f"--evaluation.results={path}"])
             if cell.verb == "invert" and _hash(line) in known:
                 return Outcome(note="in the results already")
-            getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule)
+            start = time.monotonic()
+            more = {"ckpt_path": last_checkpoint(line.trainer)} if again and cell.verb == "fit" else {}
+            getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule, **more)
         except (UserError, ArgumentError) as error:
             return Outcome(error=str(error))
         except Exception as error:  # a fault of ours or of the machine must not cost the other cells
             traceback.print_exc()
             return Outcome(error=repr(error))
         rows = read_rows(path) if path.is_file() else None
-    return Outcome(rows, note="done" if rows is None else f"{len(rows)} rows")
+        seconds = time.monotonic() - start
+    return Outcome(rows, "done" if rows is None else f"{len(rows)} rows", seconds=seconds)
 
 
 def _log(cell: Cell) -> list[str]:
@@ -153,13 +231,6 @@ def _log(cell: Cell) -> list[str]:
     return [] if named else [f"--{option}={cell.folder}"]
 
 
-def _attempt_in(folder: str, cell: Cell, known: set[str], vouched: frozenset[str]) -> Outcome:
-    """Run a cell in the folder that all machines of a cluster share, with the modules that a person vouches for."""
-    os.chdir(folder)
-    with trust.vouching(vouched):
-        return attempt(cell, known)
-
-
 def _hash(line: "CommandLine") -> str:
     from ftl_lightning.evaluation.evaluator import Evaluator
 
@@ -168,7 +239,8 @@ def _hash(line: "CommandLine") -> str:
     return evaluator.config_hash(line.model, line.datamodule, line.trainer)
 
 
-def _known(results: str) -> set[str]:
+def known_hashes(results: str) -> set[str]:
+    """The configuration hashes of a results file's rows; none where there is no file."""
     from ftl_lightning.evaluation.results import read_rows
 
     return set(read_rows(results)["config_hash"]) if Path(results).is_file() else set()
