@@ -13,8 +13,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.ranges import expect_range
 
 FEW = 8
-"""Rows from which on a matrix product gives a row the same bits however many others there are: of fewer, libraries multiply in
-another order."""
+"""Rows that are multiplied at least: of fewer, libraries add up in another order."""
 
 
 class MLPDenoiser(nn.Module):
@@ -121,10 +120,10 @@ class MLPDenoiser(nn.Module):
         """
         parts = 2 * len(self.layers)
         by_concept = self.concept_film(self.concept(concepts))
-        if not torch.is_grad_enabled() and not self.training:
+        if len(t) > 2 * FEW and not torch.is_grad_enabled() and not self.training:
             times, own = t.unique(return_inverse=True)
             if len(times) * len(concepts) <= len(t):
-                few = times[:1].expand(max(min(len(t), FEW) - len(times), 0))
+                few = times[:1].expand(max(FEW - len(times), 0))
                 by_time = self.time_film(self.time(sinusoidal_embedding(torch.cat((times, few)), self.time_dim)))[: len(times)]
                 pairs = (by_time[:, None] + by_concept).flatten(0, 1).chunk(parts, dim=-1)
                 pair = own * len(concepts) + index

@@ -11,7 +11,7 @@ SIZES = Sizes(1, 21, 48)
 
 @pytest.mark.parametrize(
     ("times", "concepts", "plans", "computed"),
-    [(1, 1, 1, 1), (1, 2, 3, 3), (1, 3, 50, 8), (1, 21, 600, 8), (32, 1, 32, 32), (32, 3, 100, 32), (7, 5, 9, 9)],
+    [(1, 1, 1, 1), (1, 2, 3, 3), (1, 3, 50, 8), (1, 21, 600, 8), (32, 1, 32, 32), (32, 3, 100, 32), (7, 5, 9, 9), (2, 9, 17, 17)],
 )
 def test_plans_of_a_timestep_and_concept_share_what_these_make_to_the_bit(
     times: int, concepts: int, plans: int, computed: int
