@@ -96,13 +96,11 @@ class MLPDenoiser(nn.Module):
         if self.initial is not None:
             hidden = torch.cat((hidden, self.initial.attend(context, concepts[index])), dim=-1)
         for depth, layer in enumerate(self.layers):
-            scale, shift = film(2 * depth), film(2 * depth + 1)
-            if torch.is_grad_enabled():
-                update = self.dropout(functional.silu(layer(hidden) * (1 + scale) + shift))
-                hidden = hidden + update if depth else update
-            else:  # the same numbers in place: memory costs as much time as the products
-                update = self.dropout(functional.silu(layer(hidden).mul_(scale.add_(1)).add_(shift), inplace=True))
-                hidden = hidden.add_(update) if depth else update
+            scale, shift = film(2 * depth).add_(1), film(2 * depth + 1)
+            # In place wherever no gradient needs what was there: memory costs nearly as much time as the products.
+            changed = layer(hidden) * scale if torch.is_grad_enabled() else layer(hidden).mul_(scale)
+            update = self.dropout(functional.silu(changed.add_(shift)))
+            hidden = update.add_(hidden) if depth else update
         out: Tensor = self.head(hidden).unflatten(-1, x.shape[1:])
         return out if direction is None else turned(out, direction, self.plane, back=True)
 
@@ -131,4 +129,4 @@ class MLPDenoiser(nn.Module):
         # Summed layer by layer: all layers at once would not fit into the processor's cache.
         of_times = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(parts, dim=-1)
         of_concepts = by_concept.chunk(parts, dim=-1)
-        return lambda part: of_times[part] + of_concepts[part][index]
+        return lambda part: of_concepts[part][index].add_(of_times[part])
