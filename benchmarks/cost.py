@@ -4,10 +4,10 @@
 
 Weights are random: cost does not depend on them. In the grid one quantity varies at a time, the others keep the shipped values.
 
-The model is ``time = operations / rate + bytes / bandwidth + calls x overhead``: a sum over what ``counting.py`` counts, with factors
-of zero or more (least squares of relative errors). It is fitted on grids of sizes, of the temporal U-Net and of the MLP, and checked
-on configurations that it has not seen: every step of the models that ship, and steps of networks of the paper's size. Seconds are
-of processor time, the fastest of some steps.
+The model is ``time = operations / rate + bytes / bandwidth + calls x overhead``: a sum over what ``counting.py`` counts, with
+factors of zero or more (least squares of relative errors). It is fitted on grids of sizes, of the temporal U-Net and of the MLP,
+and checked on configurations that it has not seen: every step of the models that ship, and steps of networks of the paper's size.
+Seconds are of processor time, the fastest of some steps.
 """
 
 import argparse

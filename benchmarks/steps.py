@@ -86,7 +86,7 @@ class Made:
 
     @property
     def updated(self) -> int:
-        """Bytes that the optimiser reads and writes: number, gradient and two moments in, number and moments out; and the average."""
+        """Bytes that the optimiser moves: number, gradient and two moments in, number and moments out; and those of the average."""
         return (7 + 3 * self.averaged) * FLOAT * self.learned
 
     @property
@@ -164,7 +164,8 @@ def made(step: Step, device: str = "cpu") -> Made:
             torch.add(alpha_bar[before] * x, alpha_bar[now] * noise)
 
         return Made(denoise, lambda: None, parameters, 0, False)
-    group, found = Group(embeddings, 0.0), []
+    group = Group(embeddings, 0.0)
+    found: list[Tensor] = []
 
     def invert() -> None:
         context = observed()
