@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -85,7 +86,8 @@ class _Calls(TorchDispatchMode):
     ) -> Any:
         found = function(*arguments, **(options or {}))
         returns = function._schema.returns
-        if any(one.alias_info is not None and not one.alias_info.is_write for one in returns) or "detach" in str(function):
+        view = any(one.alias_info is not None and not one.alias_info.is_write for one in returns)
+        if view or function is torch.ops.aten._unsafe_view.default:
             return found
         tensors = [*_tensors(arguments), *_tensors((options or {}).values()), *_tensors([found])]
         size = sum(one.numel() * one.element_size() for one in tensors)
@@ -131,7 +133,7 @@ def counted(work: Callable[[], Any], parameters: Iterable[Tensor] = ()) -> Count
 
     with FlopCounterMode(display=False) as operations, _Calls() as calls, saved_tensors_hooks(keep, lambda value: value):
         work()
-    by_name = {str(name): float(count) for name, count in operations.get_flop_counts()["Global"].items()}
+    by_name = {str(name): float(count) for name, count in operations.get_flop_counts().get("Global", {}).items()}
     backward = sum(count for name, count in by_name.items() if "convolution_backward" in name)
     forward = sum(count for name, count in by_name.items() if "convolution" in name) - backward
     return Counted(

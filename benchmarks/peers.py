@@ -236,7 +236,7 @@ def equality(work: Work) -> dict[str, float]:
     for name, scheduler in (("ddpm", ddpm_scheduler(work.model)), ("ddim", ddim_scheduler(work.model))):
         chosen = work.compositions[:1]
         theirs = their_plans(Conditional(work.model), scheduler, work.branches(chosen), generator("cpu", 3, 0), PLANS, work.shape)
-        own = work.model.encode(work.ours(name, chosen)[0], {})
+        own, theirs = (work.model.encode(plans, {}) for plans in (work.ours(name, chosen)[0], work.model.decode(theirs, {})))
         found[name] = float((own - theirs).abs().max()) / 2
     return found
 

@@ -3,8 +3,8 @@
     python benchmarks/product_rate.py [--out results/product_rate.json] [--threads 1]
 
 The rate is measured by ``torch.mm`` at the sizes that occur and at others; the best of all counts. Operations are torch's own
-count of the whole call, ``invert`` or ``sample``, with all that is not products in its time. Where the rest goes is told by operator,
-from a profile of the same call.
+count of the whole call, ``invert`` or ``sample``, with all that is not products in its time. Where the rest goes is told by
+operator, from a profile of the same call.
 """
 
 import argparse

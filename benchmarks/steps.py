@@ -6,6 +6,7 @@ logging are left out.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,7 @@ from ftl_lightning.concepts.guidance import composed_epsilon
 from ftl_lightning.diffusion import PAPER_SIZE
 from ftl_lightning.diffusion.image_encoder import RESNET18, ImageEncoders
 from ftl_lightning.diffusion.samplers import timesteps
-from ftl_lightning.diffusion.schedule import clean_from_epsilon, cosine_alpha_bar, denoising_loss
+from ftl_lightning.diffusion.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.learning.adam import Group
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel, build_denoiser
@@ -35,7 +36,7 @@ PAPER_INVERSION, ACCUMULATED = 50_000, 2
 """Steps of the published inversion of a concept, and noised demonstrations of each, one after another."""
 FLOAT = 4
 
-Kind = Literal["pretraining", "inversion", "sampling"]
+Kind = Literal["pretraining", "inversion", "sampling", "published inversion"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class Step:
     """What is computed at once.
 
     Attributes:
-        kind: of the step.
+        kind: of the step; the published inversion evaluates branches one after another, as often as its demonstrations
+            accumulate.
         config: of the network.
         batch: windows of a step of pretraining, noised demonstrations or plans of each concept in the others.
         concepts: learned or sampled together.
@@ -138,7 +140,7 @@ def made(step: Step, device: str = "cpu") -> Made:
             concepts = torch.randn(together if step.knots > 1 else 5, step.knots, config.concept_dim)
             index = index if step.knots > 1 else index % 5
 
-        def learn() -> None:
+        def fit() -> None:
             context = observed()
             losses = denoising_loss(lambda x, t: network(x, t, concepts, index, context), clean, noise, t, alpha_bar)
             optimiser.zero_grad()
@@ -148,7 +150,7 @@ def made(step: Step, device: str = "cpu") -> Made:
             optimiser.step()
             torch._foreach_lerp_(average, [parameter.detach() for parameter in parameters], 0.01)
 
-        return Made(learn, follow, parameters, sum(parameter.numel() for parameter in parameters), True)
+        return Made(fit, follow, parameters, sum(parameter.numel() for parameter in parameters), True)
     modules.requires_grad_(False).eval()
     with torch.device(device):
         embeddings = nn.Parameter(torch.randn(step.concepts, step.components, step.knots, config.concept_dim))
@@ -167,6 +169,15 @@ def made(step: Step, device: str = "cpu") -> Made:
     group = Group(embeddings, 0.0)
     found: list[Tensor] = []
 
+    def one_by_one() -> None:
+        concept = embeddings[0]
+        for _ in range(ACCUMULATED):
+            context = observed()
+            noisy = add_noise(clean, noise, alpha_bar[t])
+            estimates = [network(noisy, t, one[None], torch.zeros_like(t), context) for one in (empty.expand(1, -1), *concept)]
+            guided = estimates[0] + sum(estimate - estimates[0] for estimate in estimates[1:])
+            found[:] = torch.autograd.grad((guided - noise).square().mean(), [embeddings])
+
     def invert() -> None:
         context = observed()
         losses = denoising_loss(
@@ -174,7 +185,8 @@ def made(step: Step, device: str = "cpu") -> Made:
         )
         found[:] = torch.autograd.grad(losses.sum() / step.batch, [embeddings])
 
-    return Made(invert, lambda: group.step(found[0], None), parameters, embeddings.numel(), False)
+    learn = one_by_one if step.kind == "published inversion" else invert
+    return Made(learn, lambda: group.step(found[0], None), parameters, embeddings.numel(), False)
 
 
 @dataclass(frozen=True)
@@ -201,6 +213,7 @@ class Published:
         return f"{self.domain}, {self.form}"
 
 
+@cache
 def ours(domain: str) -> Published:
     """A model that ships."""
     config = read_model(GenerativeModel, ROOT / "pretrained" / domain).config
@@ -230,6 +243,7 @@ def ours(domain: str) -> Published:
     )
 
 
+@cache
 def paper(domain: str) -> Published:
     """The same domain with the paper's network at its size, its text encoder, K, and numbers of steps.
 
@@ -256,7 +270,7 @@ def paper(domain: str) -> Published:
         domain=domain,
         form="the paper",
         pretraining=Step("pretraining", config, PAPER_BATCH),
-        inversion=Step("inversion", config, 1),
+        inversion=Step("published inversion", config, 1),
         sampling=Step("sampling", config, 50),
         pretraining_steps=PAPER_STEPS,
         learning_steps=PAPER_INVERSION,
