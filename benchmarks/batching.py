@@ -2,9 +2,10 @@
 
     python benchmarks/batching.py [--domain object_rearrangement] [--most 256] [--out results/batching.json] [--threads 2]
 
-Concepts are those of the domain's suite with other demonstrations each. Every number is of whole calls of ``invert``, to their end,
-where a concept stops by itself; of few concepts the mean over several disjoint groups. What was measured is kept after each number
-of concepts, and a run that is started again goes on from there.
+Concepts are those of the domain's suite with other demonstrations each (of driving, whose episodes take long to simulate, with
+the same ones), of strokes training concepts, five demonstrations each. Every number is of whole calls of ``invert``, to their end,
+where a concept stops by itself, or of ``--steps`` steps; of few concepts the mean over several disjoint groups. What was measured is
+kept after each number of concepts, and a run that is started again goes on from there.
 
 A curve ``rate(n) = limit n / (n + half)`` is fitted to the rates: a call costs a fixed time and a time for each concept. Its error
 is the largest of those of rates that were left out one at a time; that of the limit is by the jackknife.
@@ -30,19 +31,29 @@ from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import Tuned, settings_of
 
-SUITES = {"object_rearrangement": "validation", "agent": "paper"}
+SUITES = {"object_rearrangement": "validation", "agent": "paper", "driving": "paper", "strokes": ""}
+"""Of each domain; none where concepts are those of the demonstrations beside the model."""
+SLOW = ("driving",)
+"""Domains whose demonstrations take long to simulate."""
+FEW = 5
 GROUPS = 8
 """Concepts that are learned at least, in groups of the number that is measured."""
 
 
-def concepts(domain: str) -> Iterator[Demonstrations]:
-    """Without end: those of a suite, again and again with other demonstrations, under names of their own."""
+def concepts(domain: str, examples: Demonstrations | None) -> Iterator[Demonstrations]:
+    """Without end: a domain's concepts, again and again with other demonstrations, under names of their own."""
     for seed in count():
-        data = InversionData(domain, suite=SUITES[domain], seed=seed).demonstrations
+        data = (
+            InversionData(domain, suite=SUITES[domain], seed=0 if domain in SLOW else seed).demonstrations
+            if examples is None
+            else examples
+        )
         for name in dict.fromkeys(data.concepts):
             own = data.select(name)
+            if examples is not None:
+                own = own.rows([(FEW * seed + row) % len(own) for row in range(FEW)])
             yield replace(own, concepts=(f"{name} ({seed})",) * len(own))
 
 
@@ -88,6 +99,7 @@ def main() -> None:
     parser.add_argument("--most", type=int, default=256)
     parser.add_argument("--out", default="results/batching.json")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--steps", type=int, help="of learning, at most, in place of the configuration's")
     parser.add_argument("--again", action="store_true", help="measure what is in the file already, too")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -97,10 +109,12 @@ def main() -> None:
     if own and own["threads"] != options.threads:
         parser.error(f"{path}: expected {own['threads']} threads, as what is there was measured with, found {options.threads}")
     rows = {int(row["concepts"]): row for row in own.get("rows", [])}
-    model, tuned = read_model(GenerativeModel, f"pretrained/{options.domain}"), Tuned.read(f"conf/{options.domain}.yaml")
-    endless = concepts(options.domain)
+    model = read_model(GenerativeModel, f"pretrained/{options.domain}")
+    tuned = Tuned.read(settings_of(model.config.domain))
+    most = options.steps or tuned.learning_steps
+    endless = concepts(options.domain, model.examples)
     known = [next(endless) for _ in range(max(options.most, GROUPS))]
-    settings = tuned.inversion.changed(modes=1)
+    settings = tuned.inversion.changed(modes=1, knots=1)
     invert(model, known[0], settings, 3)  # torch loads much when it is first used
     for number in (2**power for power in range(options.most.bit_length())):
         if number in rows:
@@ -109,7 +123,7 @@ def main() -> None:
         for first in range(0, max(GROUPS, number), number):
             group, losses = concatenate(known[first : first + number]), list[float]()
             start = time.perf_counter()
-            invert(model, group, settings, tuned.learning_steps, losses.append)
+            invert(model, group, settings, most, losses.append)
             durations.append(time.perf_counter() - start)
             steps.append(len(losses))
         rows[number] = {
@@ -122,6 +136,7 @@ def main() -> None:
         print(rows[number], flush=True)
         kept[options.domain] = {
             "threads": options.threads,
+            "steps at most": most,
             "torch": torch.__version__,
             "capability": torch.backends.cpu.get_cpu_capability(),
             "rows": [rows[known] for known in sorted(rows)],
