@@ -3,9 +3,9 @@
     python benchmarks/batching.py [--domain object_rearrangement] [--most 256] [--out results/batching.json] [--threads 2]
 
 Concepts are those of the domain's suite with other demonstrations each (of driving, whose episodes take long to simulate, with
-the same ones), of strokes training concepts, five demonstrations each. Every number is of whole calls of ``invert``, to their end,
-where a concept stops by itself, or of ``--steps`` steps; of few concepts the mean over several disjoint groups. What was measured is
-kept after each number of concepts, and a run that is started again goes on from there.
+the same ones), of strokes training concepts, five demonstrations each. Every number is of whole calls of ``invert``, to their
+end, where a concept stops by itself, or of ``--steps`` steps; of few concepts the mean over several disjoint groups. What was
+measured is kept after each number of concepts, and a run that is started again goes on from there.
 
 A curve ``rate(n) = limit n / (n + half)`` is fitted to the rates: a call costs a fixed time and a time for each concept. Its error
 is the largest of those of rates that were left out one at a time; that of the limit is by the jackknife.
