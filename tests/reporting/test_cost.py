@@ -2,7 +2,7 @@
 
 import json
 import runpy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.seeding import generator
 from tests.conftest import ROOT
 
-Script = Mapping[str, Callable[..., Any]]
+Script = Mapping[str, Any]
 
 
 def script(name: str, monkeypatch: pytest.MonkeyPatch) -> Script:
@@ -108,6 +108,13 @@ def test_the_table_of_prices_is_what_its_file_says(monkeypatch: pytest.MonkeyPat
     content = json.loads((ROOT / "results" / "price.json").read_text(encoding="utf-8"))
     kept = (ROOT / "results" / "price.md").read_text(encoding="utf-8")
     assert price["table"](content, list(content["machines"])) == kept, "run benchmarks/price.py"
+
+
+@pytest.mark.parametrize("name", ["peers", "batching", "product_rate", "cost"])
+def test_the_tables_of_speed_are_what_their_files_say(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = script("speed_table", monkeypatch)["TABLES"][name]
+    content = json.loads((ROOT / "results" / f"{name}.json").read_text(encoding="utf-8"))
+    assert table(content) == (ROOT / "results" / f"{name}.md").read_text(encoding="utf-8"), "run benchmarks/speed_table.py"
 
 
 def test_the_curve_of_batching_finds_limit_and_half(monkeypatch: pytest.MonkeyPatch) -> None:
