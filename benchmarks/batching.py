@@ -5,7 +5,8 @@
 Concepts are those of the domain's suite with other demonstrations each (of driving, whose episodes take long to simulate, with
 the same ones), of strokes training concepts, five demonstrations each. Every number is of whole calls of ``invert``, to their
 end, where a concept stops by itself, or of ``--steps`` steps; of few concepts the mean over several disjoint groups. What was
-measured is kept after each number of concepts, and a run that is started again goes on from there.
+measured is kept after each number of concepts, and a run that is started again goes on from there. With one thread, seconds are of
+processor time, which other work disturbs less.
 
 A curve ``rate(n) = limit n / (n + half)`` is fitted to the rates: a call costs a fixed time and a time for each concept. Its error
 is the largest of those of rates that were left out one at a time; that of the limit is by the jackknife.
@@ -103,6 +104,7 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="measure what is in the file already, too")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    clock = time.process_time if options.threads == 1 else time.perf_counter
     path = Path(options.out)
     kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     own = {} if options.again else kept.get(options.domain, {})
@@ -122,9 +124,9 @@ def main() -> None:
         load, durations, steps = os.getloadavg()[0], [], []
         for first in range(0, max(GROUPS, number), number):
             group, losses = concatenate(known[first : first + number]), list[float]()
-            start = time.perf_counter()
+            start = clock()
             invert(model, group, settings, most, losses.append)
-            durations.append(time.perf_counter() - start)
+            durations.append(clock() - start)
             steps.append(len(losses))
         rows[number] = {
             "concepts": number,

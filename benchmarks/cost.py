@@ -1,13 +1,15 @@
 """What a step costs: how it grows with horizon, K, width and number of concepts, and a model of its time from counted operations.
 
-    python benchmarks/cost.py [--out results/cost.json] [--threads 1]
+    python benchmarks/cost.py [--out results/cost.json] [--kept logs/cost_steps.json] [--budget SECONDS]
 
 Weights are random: cost does not depend on them. In the grid one quantity varies at a time, the others keep the shipped values.
 
 The model is ``time = operations / rate + bytes / bandwidth + calls x overhead``: a sum over what ``counting.py`` counts, with
 factors of zero or more (least squares of relative errors). It is fitted on grids of sizes, of the temporal U-Net and of the MLP,
 and checked on configurations that it has not seen: every step of the models that ship, and steps of networks of the paper's size.
-Seconds are of processor time, the fastest of some steps.
+The published inversion takes one window at a time, whose convolutions torch runs by another routine: its error is told apart.
+Seconds are of processor time of one thread, the fastest of some steps. Measured steps are kept, so that a run goes on where another
+was stopped or had used up its budget.
 """
 
 import argparse
@@ -33,10 +35,10 @@ BASE = {"horizon": 128, "K": 2, "width": 32, "concepts": 5}
 GRID = {"horizon": (32, 64, 128, 256), "K": (1, 2, 3), "width": (16, 32, 64), "concepts": (1, 5, 10)}
 SAMPLES = 8
 """Noised demonstrations a concept and step."""
-FEATURES = ("products", "convolutions", "gradients", "near", "far", "read", "bent", "calls")
+FEATURES = ("products", "convolutions", "gradients", "near", "far", "read", "kernels", "bent", "calls")
 """Of :class:`counting.Counted`, what the model is a sum over."""
 LEAST, MOST = 3, 12
-"""Repeats of a step; between the two, as many as half a second holds."""
+"""Repeats of a step; between the two, as many as a quarter of a second holds."""
 WITHIN = 0.10
 """Relative error that the model is to keep."""
 
@@ -45,7 +47,7 @@ def seconds(work: Callable[[], None]) -> float:
     """Processor time of a step, the fastest of some."""
     work()
     found: list[float] = []
-    while len(found) < LEAST or (len(found) < MOST and sum(found) < 0.5):
+    while len(found) < LEAST or (len(found) < MOST and sum(found) < 0.25):
         start = time.process_time()
         work()
         found.append(time.process_time() - start)
@@ -101,6 +103,14 @@ def to_fit() -> dict[str, Step]:
     for width, horizon, batch in ((16, 64, 32), (32, 64, 8), (32, 128, 16), (64, 32, 8), (64, 64, 16), (96, 32, 4)):
         own = of_grid("pretraining", {**BASE, "width": width, "horizon": horizon, "concepts": 1})
         steps[f"U-Net {width} x {horizon}, pretraining, {batch}"] = replace(own, batch=batch)
+    wide = paper("agent").pretraining
+    for width, horizon, batch in ((64, 8, 2), (64, 32, 2), (96, 8, 2), (96, 16, 4), (112, 8, 4), (80, 64, 2)):
+        config = replace(wide.config, horizon=horizon, denoiser_args={**wide.config.denoiser_args, "width": width})
+        steps[f"U-Net {width} x {horizon} in the paper's form, pretraining, {batch}"] = replace(wide, config=config, batch=batch)
+    flat = paper("object_rearrangement").inversion
+    for hidden in (512, 768):
+        config = replace(flat.config, denoiser_args={**flat.config.denoiser_args, "hidden_dim": hidden})
+        steps[f"MLP {hidden}, published inversion"] = replace(flat, config=config)
     return steps
 
 
@@ -122,12 +132,12 @@ def measured(name: str, step: Step) -> dict[str, Any]:
     return {"step": name, "seconds": seconds(work), "features": features(work, count), "counted": told(count), **work.resident}
 
 
-def with_errors(rows: Sequence[dict[str, Any]], coefficients: Mapping[str, float]) -> list[dict[str, Any]]:
+def with_errors(rows: Sequence[Mapping[str, Any]], coefficients: Mapping[str, float]) -> list[dict[str, Any]]:
     """For the file: seconds, what the model says, and its relative error."""
     found = []
     for row in rows:
         says = predicted(coefficients, row["features"])
-        kept = {key: value for key, value in row.items() if key not in ("features", "seconds")}
+        kept = {key: value for key, value in row.items() if key not in ("features", "seconds", "load")}
         error = says / row["seconds"] - 1
         found.append({**kept, "seconds": round(row["seconds"], 6), "model": round(says, 6), "error": round(error, 4)})
     return found
@@ -145,45 +155,84 @@ def errors(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", default="results/cost.json")
-    parser.add_argument("--threads", type=int, default=1)
-    options = parser.parse_args()
-    torch.manual_seed(0)
-    torch.set_num_threads(options.threads)
-    load = os.getloadavg()[0]
-    grid: list[dict[str, Any]] = []
+def of_the_grid() -> dict[str, Step]:
+    """Steps in which one quantity varies, by :func:`grid_name`."""
+    steps = {}
+    for varied, values in GRID.items():
+        for value in values:
+            for kind in KINDS:
+                steps[grid_name(kind, varied, value)] = of_grid(kind, BASE | {varied: value})
+    return steps
+
+
+def grid_name(kind: str, varied: str, value: int) -> str:
+    """Of a step in the file."""
+    return f"U-Net, {kind}, {varied} {value}"
+
+
+KINDS: tuple[Kind, ...] = ("inversion", "sampling")
+
+
+def summary(measured: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """What the file says, of all steps by name."""
     rows = []
-    for name, value in track([(name, value) for name, values in GRID.items() for value in values], "grid"):
-        chosen = BASE | {name: value}
-        learn, generate = (measured(f"U-Net, {kind}, {name} {value}", of_grid(kind, chosen)) for kind in ("inversion", "sampling"))
-        grid += [learn, generate]
-        row = {"varied": name, "value": value, "inversion step, ms": round(1000 * learn["seconds"], 1)}
-        rows.append(row | {"denoising step, ms": round(1000 * generate["seconds"], 1)})
-    fit = grid + [measured(name, step) for name, step in track(to_fit().items(), "to fit")]
-    check = [measured(name, step) for name, step in track(to_check().items(), "to check")]
+    for varied, values in GRID.items():
+        for value in values:
+            learn, generate = (1000 * measured[grid_name(kind, varied, value)]["seconds"] for kind in KINDS)
+            row = {
+                "varied": varied,
+                "value": value,
+                "inversion step, ms": round(learn, 1),
+                "denoising step, ms": round(generate, 1),
+            }
+            rows.append(row)
+    fit, check = ([measured[name] for name in steps] for steps in ({**of_the_grid(), **to_fit()}, to_check()))
     coefficients = fitted([row["features"] for row in fit], [row["seconds"] for row in fit])
     own, others = with_errors(fit, coefficients), with_errors(check, coefficients)
-    found = {
-        "threads": options.threads,
+    loads = [row["load"] for row in measured.values()]
+    return {
+        "threads": 1,
         "torch": torch.__version__,
         "capability": torch.backends.cpu.get_cpu_capability(),
-        "load": [round(load, 2), round(os.getloadavg()[0], 2)],
+        "load": [max(loads), round(mean(loads), 2)],
         "samples a concept": SAMPLES,
         "base": BASE,
         "rows": rows,
         "model": {
             "seconds per": coefficients,
-            "operations a second, products": round(1 / coefficients["products"]) if coefficients["products"] else None,
             "fitted on": errors(own),
             "checked on": errors(others),
             "checked, ours": errors([row for row in others if ", ours" in row["step"]]),
-            "checked, the paper's size": errors([row for row in others if ", the paper" in row["step"]]),
+            "checked, the paper's size": errors([row for row in others if ", the paper: pretraining" in row["step"]]),
+            "checked, one window at a time": errors([row for row in others if ", the paper: inversion" in row["step"]]),
         },
         "fitted": own,
         "checked": others,
     }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", default="results/cost.json")
+    parser.add_argument("--kept", default="logs/cost_steps.json", help="steps that were measured already")
+    parser.add_argument("--budget", type=float, help="seconds of processor time after which to stop")
+    options = parser.parse_args()
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    kept = Path(options.kept)
+    known = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    every = {**of_the_grid(), **to_fit(), **to_check()}
+    for name, step in track(every.items(), "steps"):
+        if options.budget is not None and time.process_time() > options.budget:
+            break
+        if name not in known:
+            known[name] = {**measured(name, step), "load": round(os.getloadavg()[0], 2)}
+            write_text(kept, json.dumps(known) + "\n")
+    if missing := set(every) - set(known):
+        print(f"{len(missing)} of {len(every)} steps are not measured yet; run it again")
+        return
+    found = summary(known)
     write_text(Path(options.out), json.dumps(found, indent=1) + "\n")
     print(json.dumps(found["model"], indent=1))
     for row in found["checked"]:

@@ -46,7 +46,8 @@ class Counted:
         gradients: of convolutions backward.
         near: bytes read and written by all other calls, of those that touch at most :data:`NEAR`.
         far: of the others.
-        read: bytes read and written by products and convolutions.
+        read: bytes read and written by products.
+        kernels: by convolutions, whose weights are put into another order at each call.
         bent: numbers that exponentials, trigonometric functions, normalisation and random draws put out.
         calls: of operators that compute something.
         saved: bytes kept for the backward pass, parameters apart.
@@ -58,6 +59,7 @@ class Counted:
     near: float
     far: float
     read: float
+    kernels: float
     bent: float
     calls: int
     saved: int
@@ -70,7 +72,7 @@ class Counted:
     @property
     def moved(self) -> float:
         """All bytes read and written."""
-        return self.near + self.far + self.read
+        return self.near + self.far + self.read + self.kernels
 
 
 class _Calls(TorchDispatchMode):
@@ -78,7 +80,7 @@ class _Calls(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.near = self.far = self.read = self.bent = 0.0
+        self.near = self.far = self.read = self.kernels = self.bent = 0.0
         self.calls = 0
 
     def __torch_dispatch__(
@@ -93,8 +95,10 @@ class _Calls(TorchDispatchMode):
         size = sum(one.numel() * one.element_size() for one in tensors)
         name = str(function)
         self.calls += 1
-        if name.startswith(PRODUCTS) or "convolution" in name:
+        if name.startswith(PRODUCTS):
             self.read += size
+        elif "convolution" in name:
+            self.kernels += size
         elif size <= NEAR:
             self.near += size
         else:
@@ -143,6 +147,7 @@ def counted(work: Callable[[], Any], parameters: Iterable[Tensor] = ()) -> Count
         near=calls.near,
         far=calls.far,
         read=calls.read,
+        kernels=calls.kernels,
         bent=calls.bent,
         calls=calls.calls,
         saved=sum(size for _, size in kept.values()),

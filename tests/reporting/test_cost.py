@@ -69,7 +69,7 @@ def test_the_model_of_time_finds_the_coefficients_that_made_the_times(monkeypatc
     cost = script("cost", monkeypatch)
     draw = torch.Generator().manual_seed(0)
     rows = (10 ** (9 * torch.rand(30, len(cost["FEATURES"]), generator=draw, dtype=torch.float64))).tolist()
-    true = dict(zip(cost["FEATURES"], (1e-11, 2e-11, 3e-11, 1e-10, 0.0, 2e-10, 1e-9, 3e-6), strict=True))
+    true = dict(zip(cost["FEATURES"], (1e-11, 2e-11, 3e-11, 1e-10, 0.0, 2e-10, 4e-10, 1e-9, 3e-6), strict=True))
     durations = [sum(true[name] * value for name, value in zip(true, row, strict=True)) for row in rows]
     found = cost["fitted"](rows, durations)
     assert found == pytest.approx(true, rel=1e-5, abs=1e-15)
