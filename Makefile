@@ -44,8 +44,15 @@ comparison: minilm # ours and the four baselines in three domains, with the mode
 report: install # tables and figures of results/, and the table in the README
 	$(BIN)/python -m ftl_lightning report --readme README.md
 
-benchmark: install
+benchmark: install # every number of the page on speed, on a machine that does nothing else: half an hour
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/peers.py
+	$(BIN)/python benchmarks/batching.py --again
+	$(BIN)/python benchmarks/batching.py --again --domain driving --steps 60
+	$(BIN)/python benchmarks/product_rate.py
+	$(BIN)/python benchmarks/cost.py
+	$(BIN)/python benchmarks/price.py
+	$(BIN)/python benchmarks/speed_table.py
 
 docs: install # the documentation's pages, in docs/_build/html; a warning is an error
 	$(BIN)/sphinx-build -W --keep-going --quiet -d docs/_build/doctrees docs docs/_build/html

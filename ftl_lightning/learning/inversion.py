@@ -274,14 +274,14 @@ class Inversion(nn.Module):
         kind = "learned" if self.settings.omega == "learned" else "fixed"
         if kind == "learned":
             weights = weights * self.settings.weights.scale
-        found = {}
+        found, pretrained = {}, self.model.hash
         for index, name in enumerate(self.concepts):
             whole, *modes = [run for run in best.tolist() if self.runs[run].concept == index]
             mixed = auto and bool(explained(empty[whole], losses[whole], losses[modes].mean()) >= EXPLAINED)
             found[name] = Concept(
                 embeddings[whole].cpu(),
                 weights[whole].cpu(),
-                origin(self.model, self.demonstrations, name, kind, losses[whole].item()),
+                origin(self.model, self.demonstrations, name, kind, losses[whole].item(), pretrained),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
                 adapter.copied() if (adapter := self.adapter(self._adapter_of(whole))) else None,
             )
@@ -330,7 +330,9 @@ def warn_of_loss(model: ConceptModel, settings: InversionSettings) -> None:
         )
 
 
-def origin(model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float) -> Origin:
+def origin(
+    model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float, pretrained: str = ""
+) -> Origin:
     """Where a concept comes from.
 
     Args:
@@ -339,13 +341,14 @@ def origin(model: ConceptModel, demonstrations: Demonstrations, name: str, weigh
         name: the concept.
         weights: ``'fixed'`` or ``'learned'``.
         loss: at the end of learning.
+        pretrained: the model's hash, of which a concept more takes as long as several steps; empty where it is not known.
     """
     own = demonstrations.select(name)
     return Origin(
         name=name,
         domain=model.config.domain,
         encoder=model.config.encoder,
-        pretrained=model.hash,
+        pretrained=pretrained or model.hash,
         demonstrations=own.hash,
         count=len(own),
         weights=weights,

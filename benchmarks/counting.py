@@ -1,0 +1,159 @@
+"""What a computation costs, counted while it runs: operations, bytes moved, calls, and what is kept for the backward pass.
+
+Operations are torch's own count (``FlopCounterMode``). Tensors on the meta device have no numbers, so that what no memory here
+holds can be counted too.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.graph import saved_tensors_hooks
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+NEAR = 2**20
+"""Bytes that a call may touch to count as near: a core's own cache holds them."""
+PRODUCTS = ("aten.mm", "aten.addmm", "aten.bmm", "aten.baddbmm")
+BENT = (
+    "mish",
+    "silu",
+    "sigmoid",
+    "tanh",
+    "exp",
+    "sin",
+    "cos",
+    "log",
+    "softmax",
+    "normal",
+    "random",
+    "uniform",
+    "group_norm",
+    "softplus",
+)
+"""Parts of the names of operators that take more time to compute than to move."""
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What a computation costs.
+
+    Attributes:
+        products: floating-point operations of matrix products.
+        convolutions: of convolutions forward.
+        gradients: of convolutions backward.
+        near: bytes read and written by all other calls, of those that touch at most :data:`NEAR`.
+        far: of the others.
+        read: bytes read and written by products.
+        kernels: by convolutions, whose weights are put into another order at each call.
+        bent: numbers that exponentials, trigonometric functions, normalisation and random draws put out.
+        calls: of operators that compute something.
+        saved: bytes kept for the backward pass, parameters apart.
+    """
+
+    products: float
+    convolutions: float
+    gradients: float
+    near: float
+    far: float
+    read: float
+    kernels: float
+    bent: float
+    calls: int
+    saved: int
+
+    @property
+    def operations(self) -> float:
+        """All floating-point operations that torch counts."""
+        return self.products + self.convolutions + self.gradients
+
+    @property
+    def moved(self) -> float:
+        """All bytes read and written."""
+        return self.near + self.far + self.read + self.kernels
+
+
+class _Calls(TorchDispatchMode):
+    """Counts calls and the bytes they touch; views touch none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.near = self.far = self.read = self.kernels = self.bent = 0.0
+        self.calls = 0
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, arguments: tuple[Any, ...] = (), options: Mapping[str, Any] | None = None
+    ) -> Any:
+        found = function(*arguments, **(options or {}))
+        returns = function._schema.returns
+        view = any(one.alias_info is not None and not one.alias_info.is_write for one in returns)
+        if view or function is torch.ops.aten._unsafe_view.default:
+            return found
+        tensors = [*_tensors(arguments), *_tensors((options or {}).values()), *_tensors([found])]
+        size = sum(one.numel() * one.element_size() for one in tensors)
+        name = str(function)
+        self.calls += 1
+        if name.startswith(PRODUCTS):
+            self.read += size
+        elif "convolution" in name:
+            self.kernels += size
+        elif size <= NEAR:
+            self.near += size
+        else:
+            self.far += size
+        if any(word in name for word in BENT):
+            self.bent += sum(one.numel() for one in _tensors([found]))
+        return found
+
+
+def _tensors(values: Iterable[Any]) -> list[Tensor]:
+    """Those among arguments or results, also in lists."""
+    found = []
+    for value in values:
+        if isinstance(value, Tensor):
+            found.append(value)
+        elif isinstance(value, list | tuple):
+            found += _tensors(value)
+    return found
+
+
+def counted(work: Callable[[], Any], parameters: Iterable[Tensor] = ()) -> Counted:
+    """What a computation costs.
+
+    Args:
+        work: it, with its backward pass if it has one. It is run once.
+        parameters: that are no activations where they are kept for the backward pass.
+    """
+    known = {parameter.untyped_storage()._cdata for parameter in parameters}
+    kept: dict[int, tuple[Any, int]] = {}  # storages stay alive, or an address could come twice
+
+    def keep(value: Tensor) -> Tensor:
+        storage = value.untyped_storage()
+        if storage._cdata not in known:
+            kept[storage._cdata] = storage, storage.nbytes()
+        return value
+
+    with FlopCounterMode(display=False) as operations, _Calls() as calls, saved_tensors_hooks(keep, lambda value: value):
+        work()
+    by_name = {str(name): float(count) for name, count in operations.get_flop_counts().get("Global", {}).items()}
+    backward = sum(count for name, count in by_name.items() if "convolution_backward" in name)
+    forward = sum(count for name, count in by_name.items() if "convolution" in name) - backward
+    return Counted(
+        products=sum(by_name.values()) - forward - backward,
+        convolutions=forward,
+        gradients=backward,
+        near=calls.near,
+        far=calls.far,
+        read=calls.read,
+        kernels=calls.kernels,
+        bent=calls.bent,
+        calls=calls.calls,
+        saved=sum(size for _, size in kept.values()),
+    )
+
+
+def told(count: Counted) -> dict[str, float]:
+    """For a file."""
+    return {name: round(value) for name, value in asdict(count).items()}

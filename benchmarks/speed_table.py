@@ -1,0 +1,131 @@
+"""The tables of the page on speed, from what was measured: results/peers.md, batching.md, product_rate.md and cost.md.
+
+python benchmarks/speed_table.py
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.tensor_file import write_text
+
+RESULTS = Path(__file__).parent.parent / "results"
+NOT_QUIET = 1.2
+"""Load before a measurement from which on the machine was busy."""
+
+
+LIMIT, BY_OPERATOR = "limit's standard error", "share of time by operator"
+
+
+def cells(*values: object) -> str:
+    """A line of a table."""
+    return "| " + " | ".join(map(str, values)) + " |"
+
+
+def head(*titles: str) -> list[str]:
+    """Its first lines."""
+    return [cells(*titles), "|---" * len(titles) + "|"]
+
+
+def told(machine: str, loads: list[float]) -> str:
+    """Where it was measured, and whether other work was going on."""
+    beside = f"beside other work (load {max(loads):.1f}): preliminary" if loads[0] > NOT_QUIET else "on an otherwise idle machine"
+    return f"\n{machine}, {beside}.\n"
+
+
+def threads(count: int) -> str:
+    """In words."""
+    return f"{count} thread{'s' if count > 1 else ''}"
+
+
+def peers(found: Mapping[str, Any]) -> str:
+    """Beside diffusers."""
+    lines = head("sampling", "seconds", "theirs over ours")
+    lines += [cells("ours, all concepts at once", f"{found['sampling, seconds']['ours']:.2f}", "")]
+    for name, ratio in found["ratio"]["sampling"].items():
+        lines.append(cells(name, f"{found['sampling, seconds'][name]:.2f}", f"{ratio:.1f}"))
+    lines += ["", *head("learning", "seconds", "theirs over ours")]
+    for name in ("ours, together", "ours, one"):
+        lines.append(cells(name, f"{found['learning, seconds'][name]:.2f}", ""))
+    for name, ratio in found["ratio"]["learning"].items():
+        lines.append(cells(name, f"{found['learning, seconds'][name]:.2f}", f"{ratio:.1f}"))
+    machine, work = found["machine"], found["work"]
+    where = f"{machine['capability']}, {threads(machine['threads'])}, diffusers {machine['diffusers']}; {work['concepts']} concepts"
+    where += (
+        f", {work['plans of each']} plans of each, {work['denoising steps']} steps; {work['steps of learning']} steps of learning"
+    )
+    losses = found["loss of learned concepts"]
+    differences = found["same noise, largest difference of plans"]
+    same = f"\nFrom the same noise plans differ by at most {100 * max(differences.values()):.2g} % of their range. "
+    same += f"Mean loss of the learned concepts: ours {losses['ours, mean']:.4f}, theirs {losses['theirs, mean']:.4f}.\n"
+    return "\n".join(lines) + "\n" + same + told(where, found["load"])
+
+
+def batching(found: Mapping[str, Any]) -> str:
+    """Concepts a second."""
+    numbers = sorted({row["concepts"] for own in found.values() for row in own["rows"]})
+    lines = head("concepts a second, together:", *map(str, numbers), "most over one", "limit of the curve")
+    for domain, own in found.items():
+        rates = {row["concepts"]: f"{row['concepts a second']:.2g}" for row in own["rows"]}
+        curve = own.get("curve")
+        limit = f"{curve['limit']:.2g} ± {curve[LIMIT]:.1g}" if curve else ""
+        name = f"{domain.replace('_', ' ')}, at most {own['steps at most']} steps"
+        lines.append(cells(name, *(rates.get(number, "") for number in numbers), f"{own['most over one']:.1f}", limit))
+    own = next(iter(found.values()))
+    loads = [max(row["load"] for own in found.values() for row in own["rows"])]
+    return "\n".join(lines) + "\n" + told(f"{own['capability']}, {threads(own['threads'])}", loads)
+
+
+def product_rate(found: Mapping[str, Any]) -> str:
+    """The share of the rate of matrix products."""
+    best = found["best"]
+    lines = head("what", "operations a second", "share of the best product's", "most of the time")
+    for name, rate in found["products, operations a second"].items():
+        lines.append(cells(f"product {name}", f"{rate / 1e9:.0f} G", f"{100 * rate / best:.0f} %", ""))
+    for name, own in found.items():
+        if isinstance(own, dict) and "operations a second" in own:
+            most = ", ".join(
+                f"{key.removeprefix('aten::')} {100 * value:.0f} %" for key, value in list(own[BY_OPERATOR].items())[:4]
+            )
+            rate = own["operations a second"]
+            lines.append(cells(name, f"{rate / 1e9:.0f} G", f"{100 * own['share of the best rate']:.0f} %", most))
+    machine = found["machine"]
+    return "\n".join(lines) + "\n" + told(f"{machine['capability']}, {threads(machine['threads'])}", found["load"])
+
+
+def cost(found: Mapping[str, Any]) -> str:
+    """What a step costs, and how well the model of its time does."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in found["rows"]:
+        groups.setdefault(row["varied"], []).append(row)
+    titles = [f"{name} {' / '.join(str(row['value']) for row in rows)}" for name, rows in groups.items()]
+    lines = head("milliseconds", *titles)
+    for kind in ("inversion step, ms", "denoising step, ms"):
+        own = (" / ".join(f"{row[kind]:.0f}" for row in rows) for rows in groups.values())
+        lines.append(cells(kind.removesuffix(", ms"), *own))
+    model = found["model"]
+    lines += ["", *head("model of a step's time", "steps", "mean error", "median", "largest", "within 10 %")]
+    for name in ("fitted on", "checked on", "checked, ours", "checked, the paper's size", "checked, one window at a time"):
+        own = model[name]
+        shown = (f"{100 * own[key]:.1f} %" for key in ("mean", "median", "largest"))
+        lines.append(cells(name, own["steps"], *shown, f"{100 * own['within ten per cent']:.0f} %"))
+    return "\n".join(lines) + "\n" + told(f"{found['capability']}, {threads(found['threads'])}", found["load"])
+
+
+TABLES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "peers": peers,
+    "batching": batching,
+    "product_rate": product_rate,
+    "cost": cost,
+}
+
+
+def main() -> None:
+    for name, table in TABLES.items():
+        content = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+        write_text(RESULTS / f"{name}.md", table(content))
+
+
+if __name__ == "__main__":
+    main()
