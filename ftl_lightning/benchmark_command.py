@@ -160,7 +160,7 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.benchmark.run import run_benchmark
     from ftl_lightning.benchmark.submission import Submission, machine
     from ftl_lightning.benchmark.suite import SEEDS, load_suite
-    from ftl_lightning.learning.methods import load_method
+    from ftl_lightning.learning.methods import code_hash, load_method
     from ftl_lightning.representation import counted
     from ftl_lightning.targets import expect_writable_file
 
@@ -172,12 +172,14 @@ def _run(options: BenchmarkOptions) -> None:
     begun = Submission(
         method=options.method,
         name=method.name,
+        code=code_hash(options.method),
         machine=machine(),
         seeds=_numbers(options),
         suites={name: load_suite(name).hash for name in names},
     )
     if out.is_file():
         begun = _resumed(Submission.load(out), begun, out)
+        say(f"{out}: {counted(len(begun.runs), 'run')} kept")
     elif work.exists():
         raise UserError(f"{work}: expected no models and logs of another run, found some; remove the folder or give another --out")
     entry = _entry(options, work)
@@ -198,11 +200,11 @@ def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission
     """A submission that goes on where a file ends.
 
     Raises:
-        UserError: for a file of another method, version, machine or set of suites.
+        UserError: for a file of another method, code, version, machine or set of suites.
     """
     from dataclasses import replace
 
-    for key in ("kind", "format", "method", "name", "version", "machine"):
+    for key in ("kind", "format", "method", "name", "code", "version", "machine"):
         if getattr(known, key) != getattr(begun, key):
             raise UserError(f"{out}: expected a submission of the same {key}, found another; give --out another file")
     for name in set(known.suites) & set(begun.suites):
@@ -217,6 +219,8 @@ def _check(options: BenchmarkOptions) -> None:
     from ftl_lightning.representation import counted
 
     path = Path(options.check)
+    if (options.salt or options.recompute != BenchmarkOptions.recompute) and not options.method:
+        raise UserError("recompute: expected the installed method, too: ftl-lightning benchmark METHOD --check FILE, found none")
     submission, suites = expect_submission(path)
     rows = sum(len(run.rows) for run in submission.runs)
     counts = f"{counted(len(suites), 'suite')}, {counted(len(submission.runs), 'run')}, {counted(rows, 'row')}"

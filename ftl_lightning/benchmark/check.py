@@ -13,7 +13,7 @@ from ftl_lightning.benchmark.run import SHIPPED, Entry, scored, temporary
 from ftl_lightning.benchmark.submission import FORMAT, GIVEN, KIND, PRETRAINED, Row, Run, Submission, machine
 from ftl_lightning.benchmark.suite import ASKED, SEEDS, TRAINING, BenchmarkSuite, load_suite, suite_names
 from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.learning.methods import load_method
+from ftl_lightning.learning.methods import code_hash, load_method
 from ftl_lightning.printing import say
 from ftl_lightning.tensor_file import content_hash
 from ftl_lightning.version import __version__
@@ -59,6 +59,7 @@ def _expect_header(submission: Submission) -> None:
         _expect(NAME.fullmatch(value) is not None, key, "letters, digits and a few signs, at most 60", repr(value))
     _expect(tuple(submission.seeds) == SEEDS, "seeds", list(SEEDS), list(submission.seeds))
     _expect(bool(submission.suites), "suites", f"some of {', '.join(suite_names())}", "none")
+    _expect(not submission.code or HASH.fullmatch(submission.code) is not None, "code", "a hash of 16 digits", "another text")
     for key, value in submission.machine.items():
         _expect(len(key) + len(value) <= 200, "machine", "short texts", f"{len(key) + len(value)} characters")
 
@@ -226,7 +227,9 @@ def recompute(
     """
     method = load_method(entry.method)
     if method.name != submission.name:
-        raise UserError(f"method: expected {submission.name!r}, which the submission is of, found {method.name!r}")
+        raise UserError(f"method: expected {submission.method!r}, which the submission is of, found {entry.method!r}")
+    if submission.code != code_hash(entry.method):
+        say("note: the method's code is not that of the submission", error=True)
     alike = dict(submission.machine) == machine() and submission.version == __version__
     chosen = drawn(submission, share, salt)
     found: list[Difference] = []

@@ -88,6 +88,7 @@ class Submission:
         kind, format: of the file.
         method: the name under which its package offers it.
         name: in tables.
+        code: hash of the package that offers the method; empty for the methods of ftl-lightning itself.
         version: of ftl-lightning.
         machine: what it ran on.
         seeds: that every suite was asked with.
@@ -100,6 +101,7 @@ class Submission:
     format: int = FORMAT
     method: str
     name: str
+    code: str = ""
     version: str = __version__
     machine: Mapping[str, str]
     seeds: Sequence[int]

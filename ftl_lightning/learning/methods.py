@@ -1,10 +1,13 @@
 """Methods by the names under which installed packages offer them."""
 
 import importlib
+import importlib.util
 from collections.abc import Iterator
+from pathlib import Path
 
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.method import Method
+from ftl_lightning.tensor_file import content_hash, file_hash
 from ftl_lightning.trust import entry_points
 
 GROUP = "ftl_lightning.methods"
@@ -40,6 +43,23 @@ def load_method(name: str) -> Method:
     if name not in offered:
         raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")
     return _loaded(name, offered[name])
+
+
+def code_hash(name: str) -> str:
+    """Hash of the modules and settings of the package that offers a method; empty for ours, which the version tells apart.
+
+    Raises:
+        UserError: if there is no method of that name.
+    """
+    load_method(name)
+    if name in SHIPPED:
+        return ""
+    spec = importlib.util.find_spec(_offered()[name].partition(":")[0].partition(".")[0])
+    places = [Path(place) for place in (spec and spec.submodule_search_locations) or ()]
+    files = [path for place in places for kind in ("*.py", "*.yaml") for path in place.rglob(kind)]
+    if spec is not None and spec.origin and not places:  # a package of one file
+        files = [Path(spec.origin)]
+    return content_hash(sorted((path.name, file_hash(path)) for path in files))
 
 
 def _loaded(name: str, reference: str) -> Method:

@@ -97,6 +97,9 @@ def test_what_was_done_is_not_run_again(submitted: Path, capsys: pytest.CaptureF
 
 def test_a_file_of_something_else_is_not_gone_on_with(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "expected a submission of the same method" in line_of(capsys, "bc", "--suites", "beats", "--out", str(copy))
+    other = replace(Submission.load(copy), code="0123456789abcdef")  # the method has changed since
+    other.save(copy)
+    assert "expected a submission of the same code" in line_of(capsys, *RUN[1:], "--out", str(copy))
     copy.unlink()
     Path("replay.work").mkdir()
     assert "found some; remove the folder" in line_of(capsys, *RUN[1:], "--out", str(copy))
@@ -122,6 +125,7 @@ TAMPERED: list[tuple[Callable[[Any], None], str]] = [
     (_set("kind", "model"), "kind: expected 'few-shot concepts', found 'model'"),
     (_set("format", 2), "format: expected 1, found 2"),
     (_set("name", "<b>best</b>"), "name: expected letters, digits"),
+    (_set("code", "../../etc"), "code: expected a hash of 16 digits"),
     (_set("seeds", [0, 1]), "seeds: expected [0, 1, 2], found [0, 1]"),
     (_set("suites", {"../../agent": "0"}), "suites: expected some of agent, beats"),
     (_set("suites", {"beats": "0123456789abcdef"}), "suites.beats: expected the frozen suite's hash"),
@@ -178,7 +182,7 @@ def test_numbers_that_agree_with_one_another_but_were_never_measured_are_found(
 
 def test_another_method_is_not_run_for_a_submission(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = line_of(capsys, "bc", "--check", str(copy))
-    assert "method: expected 'replay', which the submission is of, found 'BC'" in told
+    assert "method: expected 'replay', which the submission is of, found 'bc'" in told
 
 
 HOSTILE = [
