@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -188,6 +189,16 @@ def compared(found: pd.DataFrame, expected: pd.DataFrame) -> dict[str, int]:
     }
 
 
+SUMS = ("lost", "doubled", "different")
+"""Rows that should not be."""
+
+
+def summary(nodes: Nodes, grids: Sequence[Mapping[str, int]], seconds: float) -> dict[str, Any]:
+    """What the file holds, after each grid."""
+    sums = {name: sum(grid[name] for grid in grids) for name in SUMS}
+    return {"kills": dict(nodes.kills), **sums, "seconds": round(seconds), "grids": list(grids)}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=20)
@@ -212,12 +223,11 @@ def main() -> int:
                 kills = sum(nodes.kills.values()) - before
                 grids.append({"kills": kills, "commands": commands, **compared(read_rows(folder / results), expected)})
                 print(grids[-1], flush=True)
+                write_text(options.out, json.dumps(summary(nodes, grids, time.monotonic() - start), indent=1) + "\n")
     finally:
         nodes.stop()
         shutil.rmtree(folder, ignore_errors=True)
-    sums = {name: sum(grid[name] for grid in grids) for name in ("lost", "doubled", "different")}
-    content = {"kills": dict(nodes.kills), **sums, "seconds": round(time.monotonic() - start), "grids": grids}
-    write_text(options.out, json.dumps(content, indent=1) + "\n")
+    sums = {name: count for name, count in summary(nodes, grids, 0).items() if name in SUMS}
     print(f"{sum(nodes.kills.values())} kills: rows {', '.join(f'{count} {name}' for name, count in sums.items())}")
     return 1 if any(sums.values()) else 0
 
