@@ -1,12 +1,14 @@
 """How many concepts a second are learned, of 1 to 256 that are learned together, with the settings that ship.
 
-    python benchmarks/batching.py [--domain object_rearrangement] [--most 256] [--out results/batching.json] [--threads 2]
+    python benchmarks/batching.py [--domain object_rearrangement] [--most 256] [--out results/batching.json]
+                                  [--precision bf16-mixed] [--processes 2]
 
 Concepts are those of the domain's suite with other demonstrations each (of driving, whose episodes take long to simulate, with
 the same ones), of strokes training concepts, five demonstrations each. Every number is of whole calls of ``invert``, to their
 end, where a concept stops by itself, or of ``--steps`` steps; of few concepts the mean over several disjoint groups. What was
-measured is kept after each number of concepts, and a run that is started again goes on from there. With one thread, seconds are of
-processor time, which other work disturbs less.
+measured is kept after each number of concepts, and a run that is started again goes on from there. In one process seconds are of
+its processor time, which other work disturbs less. Several processes are started anew by each call, and its seconds are those
+until all concepts are there, imports included. Every process has one thread.
 
 A curve ``rate(n) = limit n / (n + half)`` is fitted to the rates: a call costs a fixed time and a time for each concept. Its error
 is the largest of those of rates that were left out one at a time; that of the limit is by the jackknife.
@@ -28,7 +30,9 @@ import torch
 
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.data import InversionData
+from ftl_lightning.learning.in_processes import learned_in_processes
 from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import FULL, PRECISIONS, REDUCED
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.tensor_file import write_text
@@ -94,58 +98,77 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found | ({"curve": with_error(numbers, rates)} if len(rows) > 3 else {})
 
 
+def name(domain: str, precision: str, processes: int) -> str:
+    """In the file."""
+    more = [*(["bfloat16"] if precision == REDUCED else []), *([f"{processes} processes"] if processes > 1 else [])]
+    return ", ".join([domain, *more])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domain", default="object_rearrangement", choices=sorted(SUITES))
     parser.add_argument("--most", type=int, default=256)
     parser.add_argument("--out", default="results/batching.json")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--precision", choices=PRECISIONS, default=FULL)
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--least", type=int, default=1)
     parser.add_argument("--steps", type=int, help="of learning, at most, in place of the configuration's")
     parser.add_argument("--again", action="store_true", help="measure what is in the file already, too")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    clock = time.process_time if options.threads == 1 else time.perf_counter
-    path = Path(options.out)
+    torch.set_num_threads(1)
+    alone = options.processes == 1
+    clock = time.process_time if alone else time.perf_counter
+    path, title = Path(options.out), name(options.domain, options.precision, options.processes)
     kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    own = {} if options.again else kept.get(options.domain, {})
-    if own and own["threads"] != options.threads:
-        parser.error(f"{path}: expected {own['threads']} threads, as what is there was measured with, found {options.threads}")
+    own = {} if options.again else kept.get(title, {})
     rows = {int(row["concepts"]): row for row in own.get("rows", [])}
-    model = read_model(GenerativeModel, f"pretrained/{options.domain}")
+    folder = f"pretrained/{options.domain}"
+    model = read_model(GenerativeModel, folder)
     tuned = Tuned.read(settings_of(model.config.domain))
     most = options.steps or tuned.learning_steps
     endless = concepts(options.domain, model.examples)
     known = [next(endless) for _ in range(max(options.most, GROUPS))]
-    settings = tuned.inversion.changed(modes=1, knots=1)
+    settings = tuned.inversion.changed(modes=1, knots=1, precision=options.precision)
     invert(model, known[0], settings, 3)  # torch loads much when it is first used
     for number in (2**power for power in range(options.most.bit_length())):
-        if number in rows:
+        if number in rows or number < options.least:
             continue
-        load, durations, steps = os.getloadavg()[0], [], []
+        load, durations, steps, losses = os.getloadavg()[0], [], [], []
         for first in range(0, max(GROUPS, number), number):
-            group, losses = concatenate(known[first : first + number]), list[float]()
+            group, told = concatenate(known[first : first + number]), list[float]()
             start = clock()
-            invert(model, group, settings, most, losses.append)
+            if alone:
+                found = invert(model, group, settings, most, told.append)
+            else:
+                found = learned_in_processes(folder, group, settings, most, options.processes)
             durations.append(clock() - start)
-            steps.append(len(losses))
+            steps.append(len(told))
+            losses += [concept.origin.loss for concept in found.values()]
         rows[number] = {
             "concepts": number,
             "seconds": round(mean(durations), 4),
-            "steps": round(mean(steps), 1),
+            **({"steps": round(mean(steps), 1)} if alone else {}),
+            "loss": round(mean(losses), 5),
             "concepts a second": round(number / mean(durations), 4),
             "load": round(load, 2),
         }
         print(rows[number], flush=True)
-        kept[options.domain] = {
-            "threads": options.threads,
+        kept[title] = {
+            "domain": options.domain,
+            "precision": options.precision,
+            "processes": options.processes,
             "steps at most": most,
             "torch": torch.__version__,
             "capability": torch.backends.cpu.get_cpu_capability(),
             "rows": [rows[known] for known in sorted(rows)],
         }
-        kept[options.domain] |= summary(kept[options.domain]["rows"])
+        kept[title] |= summary(kept[title]["rows"])
+        if not alone and (one := kept.get(name(options.domain, FULL, 1))):
+            kept[title]["most over one concept in a process"] = round(
+                max(row["concepts a second"] for row in kept[title]["rows"]) / one["rows"][0]["concepts a second"], 2
+            )
         write_text(path, json.dumps(kept, indent=1) + "\n")
-    print(json.dumps({name: value for name, value in kept[options.domain].items() if name != "rows"}, indent=1))
+    print(json.dumps({key: value for key, value in kept[title].items() if key != "rows"}, indent=1))
 
 
 if __name__ == "__main__":

@@ -4,12 +4,12 @@
 
 Weights are random: cost does not depend on them. In the grid one quantity varies at a time, the others keep the shipped values.
 
-The model is ``time = operations / rate + bytes / bandwidth + calls x overhead``: a sum over what ``counting.py`` counts, with
-factors of zero or more (least squares of relative errors). It is fitted on grids of sizes, of the temporal U-Net and of the MLP,
-and checked on configurations that it has not seen: every step of the models that ship, and steps of networks of the paper's size.
-The published inversion takes one window at a time, whose convolutions torch runs by another routine: its error is told apart.
-Seconds are of processor time of one thread, the fastest of some steps. Measured steps are kept, so that a run goes on where another
-was stopped or had used up its budget.
+The model is ``time = products + convolutions + functions that bend + bytes / bandwidth + calls x overhead``. The first three are
+the calls that ``counting.py`` counts, each times what it takes by itself (``operator_time.py``): no formula tells that. Factors of
+the others, zero or more, are fitted on grids of sizes, of the temporal U-Net and of the MLP (least squares of relative errors), and
+checked on configurations that they have not seen: every step of the models that ship, and steps of networks of the paper's size.
+The error of the published inversion, which takes one window at a time, is told apart. Seconds are of processor time of one thread,
+the fastest of some steps. Measured steps are kept, so that a run goes on where another was stopped or had used up its budget.
 """
 
 import argparse
@@ -23,8 +23,9 @@ from statistics import mean, median
 from typing import Any
 
 import numpy as np
+import operator_time
 import torch
-from counting import Counted, counted, told
+from counting import PRODUCTS, Counted, counted, told
 from rich.progress import track
 from scipy.optimize import nnls
 from steps import DOMAINS, Kind, Made, Step, made, ours, paper
@@ -35,8 +36,12 @@ BASE = {"horizon": 128, "K": 2, "width": 32, "concepts": 5}
 GRID = {"horizon": (32, 64, 128, 256), "K": (1, 2, 3), "width": (16, 32, 64), "concepts": (1, 5, 10)}
 SAMPLES = 8
 """Noised demonstrations a concept and step."""
-FEATURES = ("products", "convolutions", "gradients", "near", "far", "read", "kernels", "bent", "calls")
-"""Of :class:`counting.Counted`, what the model is a sum over."""
+MEASURED = ("multiplied", "convolved", "bent")
+"""Seconds of products, of convolutions and of functions that bend, all by themselves: they count as they are."""
+FITTED = ("near", "far", "calls", "recorded", "backward")
+"""Of :class:`counting.Counted`, bytes of the other calls, and calls: each times a factor."""
+CACHE = 2**26
+"""Bytes that no cache of a processor holds."""
 LEAST, MOST = 3, 12
 """Repeats of a step; between the two, as many as a quarter of a second holds."""
 WITHIN = 0.10
@@ -55,30 +60,37 @@ def seconds(work: Callable[[], None]) -> float:
 
 
 def features(step: Made, count: Counted) -> list[float]:
-    """What the model multiplies by its coefficients; the optimiser is one more call, which passes over what it learns."""
-    own = {name: float(getattr(count, name)) for name in FEATURES}
+    """What the model is a sum over; the optimiser is one more call, which passes over what it learns."""
+    own = dict.fromkeys(MEASURED, 0.0) | {name: float(getattr(count, name)) for name in FITTED}
+    between = min(2 ** (step.resident["parameters"] - 1).bit_length(), CACHE)
+    for call, times in count.heavy.items():
+        kind = "multiplied" if call.name.startswith(PRODUCTS) else "convolved" if "convolution" in call.name else "bent"
+        # What a function bends was just put out, and is at hand.
+        own[kind] += times * operator_time.seconds(call, between if kind != "bent" else 0)
     own["far"] += step.updated
     own["calls"] += 1
-    return [own[name] for name in FEATURES]
+    return list(own.values())
 
 
 def fitted(rows: Sequence[Sequence[float]], durations: Sequence[float]) -> dict[str, float]:
-    """Coefficients of zero or more with the least relative errors.
+    """Factors of zero or more with the least relative errors.
 
     Args:
         rows: of :func:`features`.
         durations: seconds of each.
     """
-    table, target = np.asarray(rows, dtype=float), np.asarray(durations)
+    every, target = np.asarray(rows, dtype=float), np.asarray(durations)
+    measured, table = every[:, : len(MEASURED)].sum(axis=1), every[:, len(MEASURED) :]
     scale = table.max(axis=0)
     scale[scale == 0] = 1
-    found, _ = nnls(table / scale / target[:, None], np.ones(len(target)))
-    return dict(zip(FEATURES, map(float, found / scale), strict=True))
+    found, _ = nnls(table / scale / target[:, None], 1 - measured / target)
+    return dict(zip(FITTED, map(float, found / scale), strict=True))
 
 
 def predicted(coefficients: Mapping[str, float], row: Sequence[float]) -> float:
     """Seconds of a step."""
-    return sum(coefficients[name] * value for name, value in zip(FEATURES, row, strict=True))
+    counts = dict(zip((*MEASURED, *FITTED), row, strict=True))
+    return sum(counts[name] for name in MEASURED) + sum(coefficients[name] * counts[name] for name in FITTED)
 
 
 def of_grid(kind: Kind, chosen: Mapping[str, int]) -> Step:
@@ -219,6 +231,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(0)
     torch.set_num_threads(1)
+    operator_time.keep_memory()
     kept = Path(options.kept)
     known = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
     kept.parent.mkdir(parents=True, exist_ok=True)

@@ -4,11 +4,13 @@ Operations are torch's own count (``FlopCounterMode``). Tensors on the meta devi
 holds can be counted too.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
+from operator_time import Call, call
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -48,9 +50,11 @@ class Counted:
         far: of the others.
         read: bytes read and written by products.
         kernels: by convolutions, whose weights are put into another order at each call.
-        bent: numbers that exponentials, trigonometric functions, normalisation and random draws put out.
         calls: of operators that compute something.
+        recorded: of these, those that autograd takes note of.
+        backward: those of the backward pass.
         saved: bytes kept for the backward pass, parameters apart.
+        heavy: products, convolutions and calls of :data:`BENT`, how often each.
     """
 
     products: float
@@ -60,9 +64,11 @@ class Counted:
     far: float
     read: float
     kernels: float
-    bent: float
     calls: int
+    recorded: int
+    backward: int
     saved: int
+    heavy: Mapping[Call, int]
 
     @property
     def operations(self) -> float:
@@ -80,8 +86,9 @@ class _Calls(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.near = self.far = self.read = self.kernels = self.bent = 0.0
-        self.calls = 0
+        self.near = self.far = self.read = self.kernels = 0.0
+        self.calls = self.recorded = self.backward = 0
+        self.heavy = Counter[Call]()
 
     def __torch_dispatch__(
         self, function: Any, types: Any, arguments: tuple[Any, ...] = (), options: Mapping[str, Any] | None = None
@@ -95,6 +102,10 @@ class _Calls(TorchDispatchMode):
         size = sum(one.numel() * one.element_size() for one in tensors)
         name = str(function)
         self.calls += 1
+        if torch._C._current_graph_task_id() >= 0:
+            self.backward += 1
+        elif torch.is_grad_enabled():
+            self.recorded += 1
         if name.startswith(PRODUCTS):
             self.read += size
         elif "convolution" in name:
@@ -103,8 +114,8 @@ class _Calls(TorchDispatchMode):
             self.near += size
         else:
             self.far += size
-        if any(word in name for word in BENT):
-            self.bent += sum(one.numel() for one in _tensors([found]))
+        if name.startswith(PRODUCTS) or "convolution" in name or any(word in name for word in BENT):
+            self.heavy[call(function, arguments, options or {})] += 1
         return found
 
 
@@ -148,12 +159,15 @@ def counted(work: Callable[[], Any], parameters: Iterable[Tensor] = ()) -> Count
         far=calls.far,
         read=calls.read,
         kernels=calls.kernels,
-        bent=calls.bent,
         calls=calls.calls,
+        recorded=calls.recorded,
+        backward=calls.backward,
         saved=sum(size for _, size in kept.values()),
+        heavy=calls.heavy,
     )
 
 
 def told(count: Counted) -> dict[str, float]:
     """For a file."""
-    return {name: round(value) for name, value in asdict(count).items()}
+    numbers = {field.name: getattr(count, field.name) for field in fields(count) if field.name != "heavy"}
+    return {name: round(value) for name, value in numbers.items()}

@@ -4,9 +4,10 @@
 
 Losses: 50 steps of each configuration at its shipped size, in two processes with 4 windows each and in one with 8; the largest
 difference of any logged loss, as a share of it where it is above 1. Throughput: windows a second of two processes with one thread
-each, over those of one process with one thread and of one with two, at the shipped batch size for each process; on two cores, which
-should be idle. Kills: in turn the second process, the first, and both are killed at a random moment of a run, which then goes on
-from its last checkpoint in turn in two processes and in one; every loss is compared with those of a run that nobody killed.
+each, over those of one process with one thread and of one with two, at the shipped batch size for each process, and of the small
+network also at one where exchanging gradients takes long beside a step; on two cores, which should be idle. Kills: in turn the
+second process, the first, and both are killed at a random moment of a run, which then goes on from its last checkpoint in turn in
+two processes and in one; every loss is compared with those of a run that nobody killed.
 """
 
 import argparse
@@ -42,8 +43,9 @@ TWO = ["--trainer.devices=2", "--trainer.strategy=ddp"]
 SMALL = ["--model.denoiser_args={hidden_dim: 32, depth: 2, condition_dim: 16, dropout: 0.1}", "--data.samples_per_concept=20"]
 SMALL += ["--trainer.callbacks.init_args.every_n_train_steps=50", "--data.steps_per_epoch=100", "--trainer.max_steps=400"]
 STEPS, PATIENCE = 50, 600.0
-TIMED = {"object_rearrangement.yaml": 400, "agent.yaml": 60}
-"""Steps that are timed of a configuration; those before :data:`WARM` do not count."""
+TIMED = {"object_rearrangement.yaml": {512: 100, 64: 400}, "agent.yaml": {32: 100}}
+"""Of a configuration, windows of a step of each process, the shipped number first, and steps that are timed; those before
+:data:`WARM` do not count."""
 WARM = 10
 CLOSE = 1e-5
 
@@ -99,25 +101,26 @@ def losses(folder: Path, mocap: str | None) -> dict[str, float]:
 
 
 def throughput(folder: Path) -> dict[str, dict[str, float]]:
-    """Windows a second of each configuration; ``gain`` is two processes' over one's with a thread."""
+    """Windows a second of each configuration and number of windows; ``gain`` is two processes' over one's with a thread."""
     found: dict[str, dict[str, float]] = {}
-    with bar("timings", 3 * len(TIMED)) as advance:
-        for name, steps in TIMED.items():
-            options = [f"--trainer.max_steps={steps}", f"--data.steps_per_epoch={steps}"]
-            rates = {}
-            for kind, threads, more, windows in (
-                ("one process", 1, [], 64),
-                ("one process, two threads", 2, [], 64),
-                ("two processes", 1, TWO, 128),
+    timed = [(name, windows, steps) for name, sizes in TIMED.items() for windows, steps in sizes.items()]
+    with bar("timings", 3 * len(timed)) as advance:
+        for name, windows, steps in timed:
+            options = [f"--trainer.max_steps={steps}", f"--data.steps_per_epoch={steps}", f"--data.batch_size={windows}"]
+            rates, title = {}, f"{name}, {windows} windows"
+            for kind, threads, more, together in (
+                ("one process", 1, [], windows),
+                ("one process, two threads", 2, [], windows),
+                ("two processes", 1, TWO, 2 * windows),
             ):
-                place = folder / f"{name} {kind}"
-                run(command(CONF / name, place, [*options, "--data.batch_size=64", *more]), threads)
+                place = folder / f"{title} {kind}"
+                run(command(CONF / name, place, [*options, *more]), threads)
                 times = [at for step, (_, at) in sorted(curve(place).items()) if step >= WARM]
                 # The median: what else the machine does once costs a few steps alone.
-                rates[kind] = windows / statistics.median(later - at for at, later in itertools.pairwise(times))
+                rates[kind] = together / statistics.median(later - at for at, later in itertools.pairwise(times))
                 advance()
-            found[name] = rates | {"gain": rates["two processes"] / rates["one process"]}
-            print(name, found[name], flush=True)
+            found[title] = rates | {"gain": rates["two processes"] / rates["one process"]}
+            print(title, found[title], flush=True)
     return found
 
 

@@ -245,7 +245,7 @@ def here(path: Path) -> dict[str, Any]:
             fits = [row["seconds"] for row in rows if row["concepts"] >= number]
             hours[str(number)] = (min(fits) if fits else number / best["concepts a second"]) / HOUR
         error = own.get("curve", {}).get("largest error of one left out")
-        found[domain] = {"threads": own["threads"], "together": best["concepts"], "hours": hours, "error of the curve": error}
+        found[domain] = {"processes": own["processes"], "together": best["concepts"], "hours": hours, "error of the curve": error}
     return found
 
 
@@ -302,7 +302,8 @@ def table(found: Mapping[str, Any], names: Sequence[str]) -> str:
         if kind == "learning":
             for domain, own in found["here"].items():
                 cells = [shown(own["hours"][str(number)]) for number in NUMBERS]
-                title = f"{domain}, ours, on {own['threads']} cores, measured up to {own['together']} together"
+                cores = f"{own['processes']} core{'s' if own['processes'] > 1 else ''}"
+                title = f"{domain}, ours, on {cores}, measured up to {own['together']} together"
                 lines.append(f"| {title} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 

@@ -65,18 +65,20 @@ def peers(found: Mapping[str, Any]) -> str:
 def batching(found: Mapping[str, Any]) -> str:
     """Concepts a second."""
     numbers = sorted({row["concepts"] for own in found.values() for row in own["rows"]})
-    names = [f"{domain.replace('_', ' ')}, at most {own['steps at most']} steps" for domain, own in found.items()]
+    names = [f"{title.replace('_', ' ')}, at most {own['steps at most']} steps" for title, own in found.items()]
     lines = head("concepts a second, together", *names)
     for number in numbers:
         rates = [{row["concepts"]: f"{row['concepts a second']:.2g}" for row in own["rows"]} for own in found.values()]
         lines.append(cells(number, *(rate.get(number, "") for rate in rates)))
     lines.append(cells("most over one", *(f"{own['most over one']:.1f}" for own in found.values())))
+    beside = "most over one concept in a process"
+    lines.append(cells(f"{beside}, single precision", *(f"{own[beside]:.1f}" if beside in own else "" for own in found.values())))
     curves = [own.get("curve") for own in found.values()]
     limits = (f"{curve['limit']:.2g} ± {curve[LIMIT]:.1g}" if curve else "" for curve in curves)
     lines.append(cells("limit of the curve", *limits))
     own = next(iter(found.values()))
     loads = [max(row["load"] for own in found.values() for row in own["rows"])]
-    return "\n".join(lines) + "\n" + told(f"{own['capability']}, {threads(own['threads'])}", loads)
+    return "\n".join(lines) + "\n" + told(f"{own['capability']}, a thread for each process", loads)
 
 
 def product_rate(found: Mapping[str, Any]) -> str:

@@ -36,6 +36,7 @@ INVERSION: Mapping[str, str] = {
     "mode_samples": "modes.samples",
     "modes": "modes.sets",
     "tolerance": "budget.tolerance",
+    "precision": "budget.precision",
     "knots": "embeddings.knots",
     "guidance_scale": "weights.scale",
     "adapter": "adapter.rank",

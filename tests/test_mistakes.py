@@ -136,7 +136,7 @@ def test_options_of_fit(option: str, expected: str, capsys: Told) -> None:
         ("model.components=1.5", "components"),
         (
             "model.budget=null",
-            "key 'model.budget': expected some of samples, restarts, screening, learning_rate, tolerance, found null",
+            "key 'model.budget': expected some of samples, restarts, screening, learning_rate, tolerance, precision, found null",
         ),
         ("model.budget.samples=null", "key 'model.budget.samples': expected int, found null"),
         ("model.samples=null", "key 'model.budget.samples': expected int, found null"),

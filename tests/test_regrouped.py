@@ -44,6 +44,7 @@ model:
     mode_samples: 6
     modes: each
     tolerance: null
+    precision: 32-true
     knots: 1
     guidance_scale: 1.5
     adapter: 0
@@ -64,7 +65,7 @@ model:
     weights: {{initial: 0.7, learning_rate: 0.004, scale: 1.5, training: 0.9}}
     modes: {{sets: each, samples: 6}}
     adapter: {{rank: 0, learning_rate: 0.01, scope: all}}
-    budget: {{samples: 5, restarts: 2, screening: 3, learning_rate: 0.02, tolerance: null}}
+    budget: {{samples: 5, restarts: 2, screening: 3, learning_rate: 0.02, tolerance: null, precision: 32-true}}
     loss: {{kind: v, timestep_power: 2.0}}
 {BASE}"""
 
@@ -135,7 +136,14 @@ def test_an_own_file_beside_the_class_path_of_another_says_only_what_differs(cap
     write("base.yaml", NEW)
     own = write("own.yaml", "defaults: [base.yaml]\nmodel: {init_args: {samples: 4, learning_rate: 0.5}}\n")
     found = model("invert", f"--config={own}")["init_args"]
-    assert found["budget"] == {"samples": 4, "restarts": 2, "screening": 3, "learning_rate": 0.5, "tolerance": None}
+    assert found["budget"] == {
+        "samples": 4,
+        "restarts": 2,
+        "screening": 3,
+        "learning_rate": 0.5,
+        "tolerance": None,
+        "precision": "32-true",
+    }
     assert found["weights"]["learning_rate"] == 0.004
     assert notes(capsys) == [
         "note: own.yaml: model.samples is now model.budget.samples, model.learning_rate is now model.budget.learning_rate"
@@ -223,7 +231,14 @@ def test_the_learning_rate_of_a_pretraining_stays_where_it_is(capsys: Told) -> N
 def test_null_in_a_group_is_null_and_the_rest_of_the_group_stays(given: Sequence[str]) -> None:
     config = write("own.yaml", NEW.replace("tolerance: null", "tolerance: 0.1"))
     found = model("invert", "--config", config, "--model.budget.samples=7", *given)["init_args"]
-    assert found["budget"] == {"samples": 7, "restarts": 2, "screening": 3, "learning_rate": 0.02, "tolerance": None}
+    assert found["budget"] == {
+        "samples": 7,
+        "restarts": 2,
+        "screening": 3,
+        "learning_rate": 0.02,
+        "tolerance": None,
+        "precision": "32-true",
+    }
     assert found["weights"] == {"initial": 0.7, "learning_rate": 0.004, "scale": 1.5, "training": None}
 
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +27,7 @@ from ftl_lightning.learning.inversion_settings import (
     MODES,
     ONE,
     PAPER,
+    REDUCED,
     InversionSettings,
 )
 from ftl_lightning.learning.stopping import Stopping
@@ -212,12 +214,18 @@ class Inversion(nn.Module):
             if chosen.any():
                 # Anew for the modes, which would otherwise depend on whether any other run goes on.
                 draw = generator(self.embeddings.device, self.settings.seed, 1, step)
-                found.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
+                with self._reduced():
+                    found.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
         losses = torch.cat(found)
         mean = losses.detach().mean()
         if not mean.isfinite():
             raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.budget.learning_rate")
         return losses
+
+    def _reduced(self) -> AbstractContextManager[None]:
+        """Products in bfloat16, where the settings say so; a trainer may say so too."""
+        reduced = self.settings.budget.precision == REDUCED
+        return torch.autocast(self.embeddings.device.type, torch.bfloat16) if reduced else nullcontext()
 
     def stepped(self, step: int) -> bool:
         """Take note of a step that was made, by its number from 0.

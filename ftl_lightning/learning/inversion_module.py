@@ -90,7 +90,7 @@ class InversionModule(ExactResume, Adaptation):
         }
         self.save_hyperparameters(ignore=groups_of(INVERSION))
         # Configurations from before there were these keep their hash.
-        usual = {"start": _USUAL.embeddings.start, "screening": _USUAL.budget.screening}
+        usual = {"start": _USUAL.embeddings.start, "screening": _USUAL.budget.screening, "precision": _USUAL.budget.precision}
         self.save_hyperparameters({name: value for name, value in flat(groups, INVERSION).items() if value != usual.get(name)})
         self.settings = InversionSettings(
             components=components,

@@ -25,6 +25,8 @@ ONE, MODES, ADAPTED, MIXED = "one set", "modes", "adapter", "mixtures"
 for each demonstration and an adapter that they share, with samples from mixtures."""
 MEAN, CONCEPTS = STARTS = "mean", "concepts"
 """Where embeddings start."""
+FULL, REDUCED = PRECISIONS = "32-true", "bf16-mixed"
+"""Of products while concepts are learned."""
 FORMS = (UNSAID, PAPER, AUTO, ONE, MODES, ADAPTED, MIXED)
 
 
@@ -144,6 +146,9 @@ class BudgetOptions:
             all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
             :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not count; of fewer steps than
             a round has, the last one does. ``None`` for all steps, the rate decaying to 0.
+        precision: of the network's products in a step, with the names of Lightning's trainer: ``'32-true'``, or ``'bf16-mixed'``
+            for bfloat16, half the time where a processor or GPU multiplies it, see ``docs/speed.md``. Stopping and the loss that
+            is told are in single precision.
     """
 
     samples: int = 32
@@ -151,6 +156,7 @@ class BudgetOptions:
     screening: int = 0
     learning_rate: float = 0.1
     tolerance: float | None = None
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"
 
     def __post_init__(self) -> None:
         expect_count("model.budget.samples", self.samples, 1, MOST_TOGETHER)
@@ -159,6 +165,8 @@ class BudgetOptions:
         expect_factor("model.budget.learning_rate", self.learning_rate, 0, LARGEST_RATE)
         if self.tolerance is not None and not 0 <= self.tolerance < 1:
             raise UserError(f"model.budget.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
+        if self.precision not in PRECISIONS:
+            raise UserError(f"model.budget.precision: expected one of {', '.join(PRECISIONS)}, found {self.precision!r}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,6 +30,7 @@ OTHER: Mapping[str, Any] = {
     "mode_samples": 6,
     "modes": "each",
     "tolerance": 0.3,
+    "precision": "bf16-mixed",
     "knots": 4,
     "guidance_scale": 1.5,
     "adapter": 0,
@@ -78,7 +79,9 @@ def test_options_go_from_flat_names_into_groups_and_back() -> None:
     assert OTHER.keys() == INVERSION.keys()
     settings = InversionSettings().changed(**OTHER)
     assert flat(of_groups(settings), INVERSION) == OTHER
-    assert settings.budget == BudgetOptions(samples=5, restarts=2, screening=3, learning_rate=0.02, tolerance=0.3)
+    assert settings.budget == BudgetOptions(
+        samples=5, restarts=2, screening=3, learning_rate=0.02, tolerance=0.3, precision="bf16-mixed"
+    )
     assert settings.modes == ModeOptions(sets="each", samples=6)
     assert settings.loss == LossOptions(kind="v", timestep_power=2.0)
     usual = InversionSettings()
@@ -105,8 +108,10 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
     module = inversion_module(tiny, **options, components=3, seed=2)
     assert {name: module.hparams[name] for name in INVERSION} == options
     assert set(module.hparams) == {*INVERSION, "pretrained", "components", "omega", "output", "seed", "form"}
-    older = inversion_module(tiny, **{name: value for name, value in options.items() if name not in ("start", "screening")})
-    assert INVERSION.keys() - set(older.hparams) == {"start", "screening"}  # of which older rows know nothing
+    older = inversion_module(
+        tiny, **{name: value for name, value in options.items() if name not in ("start", "screening", "precision")}
+    )
+    assert INVERSION.keys() - set(older.hparams) == {"start", "screening", "precision"}  # of which older rows know nothing
     fit = PretrainingModule(loss=pretraining.LossOptions(kind="v", discount=0.9), codes=Codes(share=0.5, knots=2))
     found = {"loss": "v", "timestep_power": 1.0, "loss_discount": 0.9, "condition_dropout": 0.1}
     assert {name: fit.hparams[name] for name in PRETRAINING} == found | {

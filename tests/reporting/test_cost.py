@@ -1,5 +1,6 @@
 """Counted operations, the model of a step's time, prices, the curve of batching, and equality beside diffusers."""
 
+import importlib
 import json
 import runpy
 from collections.abc import Mapping
@@ -39,7 +40,25 @@ def test_operations_bytes_and_calls_are_those_counted_by_hand(monkeypatch: pytes
     assert counted(lambda: x.T.flatten().view(21)).calls == 1  # flattening what is transposed copies, views do not
     large = torch.ones(2**18, device="meta")
     assert counted(lambda: large.exp()).far == 2 * 2**20
-    assert counted(lambda: large.exp()).bent == 2**18
+    product, weight = torch.ones(2, 3), torch.ones(3, 4, requires_grad=True)
+    work = counted(lambda: (product @ weight).exp().sum().backward())
+    assert sorted((call.name, times) for call, times in work.heavy.items()) == [
+        ("aten.exp.default", 1),
+        ("aten.mm.default", 1),  # forward, and the gradient of the weight: other shapes
+        ("aten.mm.default", 1),
+    ]
+    assert work.recorded == 4  # product, exponential, sum, and the one that the backward pass starts from
+    assert work.backward == work.calls - work.recorded > 0
+
+
+def test_a_call_by_itself_takes_the_time_of_its_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    counting = script("counting", monkeypatch)
+    operator_time = importlib.import_module("operator_time")  # the same that counting imports
+    rows, many, weight = torch.ones(8, 256), torch.ones(2048, 256).T.contiguous().T, torch.ones(256, 256)
+    few, much = (next(iter(counting["counted"](lambda x=x: x @ weight).heavy)) for x in (rows, many))
+    assert few.arguments[0].shape == (8, 256)
+    assert much.arguments[0].strides == (1, 2048)
+    assert 0 < operator_time.seconds(few, 0) < operator_time.seconds(much, 2**22)
 
 
 def test_operations_of_convolutions_are_those_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +76,7 @@ def test_a_step_of_inversion_multiplies_as_often_as_its_layers_say(monkeypatch: 
     layers = 21 * 512 + 3 * 512 * 512 + 512 * 21
     of_time, of_concept = 64 * 64 * 2 + 64 * 4096, 384 * 384 + 384 * 4096
     rows, concepts = 2 * 32, 2
-    conditional = rows * (layers + of_time) + concepts * of_concept
+    conditional = rows * layers + 32 * of_time + concepts * of_concept  # both concepts are met at the same timesteps
     backward = rows * (layers - 21 * 512) + concepts * of_concept
     empty = 32 * (layers + of_time) + of_concept
     weighted = 32 * 2 * 21 * 2  # the sum over K, forward and backward
@@ -68,9 +87,13 @@ def test_a_step_of_inversion_multiplies_as_often_as_its_layers_say(monkeypatch: 
 def test_the_model_of_time_finds_the_coefficients_that_made_the_times(monkeypatch: pytest.MonkeyPatch) -> None:
     cost = script("cost", monkeypatch)
     draw = torch.Generator().manual_seed(0)
-    rows = (10 ** (9 * torch.rand(30, len(cost["FEATURES"]), generator=draw, dtype=torch.float64))).tolist()
-    true = dict(zip(cost["FEATURES"], (1e-11, 2e-11, 3e-11, 1e-10, 0.0, 2e-10, 4e-10, 1e-9, 3e-6), strict=True))
-    durations = [sum(true[name] * value for name, value in zip(true, row, strict=True)) for row in rows]
+    measured, counts = (
+        torch.rand(30, 3, generator=draw, dtype=torch.float64),
+        torch.rand(30, 5, generator=draw, dtype=torch.float64),
+    )
+    rows = torch.cat((measured, 10 ** (9 * counts)), dim=1).tolist()
+    true = dict(zip(cost["FITTED"], (1e-11, 1e-10, 0.0, 4e-10, 3e-9), strict=True))
+    durations = [sum(row[:3]) + sum(true[name] * value for name, value in zip(true, row[3:], strict=True)) for row in rows]
     found = cost["fitted"](rows, durations)
     assert found == pytest.approx(true, rel=1e-5, abs=1e-15)
     told = cost["with_errors"]([{"step": "a", "seconds": durations[0] / 1.5, "features": rows[0]}], found)
