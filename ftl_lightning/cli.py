@@ -49,6 +49,7 @@ SEVERAL = {"study-report": "answers"}
 REPEATED = {"concepts": "folder"}
 """Commands with an option that may be given several times."""
 MODULES = {
+    "ablate": "ftl_lightning.ablate_command",
     "benchmark": "ftl_lightning.benchmark_command",
     "check": "ftl_lightning.check_command",
     "invert": "ftl_lightning.invert_command",

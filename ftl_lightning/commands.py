@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from ftl_lightning.ablation import Stage
 from ftl_lightning.printing import line, say
 from ftl_lightning.ranges import expect_count, expect_range
 
@@ -163,57 +161,6 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
         parts += [(f"weighted sum{knot}", embedding) for knot, embedding in whole.items()]
     for name, embedding in parts:
         say(f"{name}: {explained(embedding, names, model.training_embeddings, nearest)}")
-
-
-def ablate(
-    stages: list[Stage],
-    results: str,
-    seeds: list[int] = [0],  # noqa: B006 (never changed)
-    shard: str = "1/1",
-    executor: Literal["local", "ray"] = "local",
-    root: str = "",
-    address: str = "",
-    only: list[int] = [],  # noqa: B006 (never changed)
-    estimate: bool = False,
-    status: bool = False,
-    slurm: str = "",
-    workers: int = 0,
-    sbatch: dict[str, str] = {},  # noqa: B006 (never changed)
-) -> None:
-    """Run every cell of an ablation that the results do not hold yet.
-
-    Args:
-        stages: verbs with grids of options, in order.
-        results: results file that rows are added to.
-        seeds: each stage runs once a seed.
-        shard: "3/8" for the third of eight parts; models that it needs and does not make itself must be there.
-        executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
-        root: folder of recordings, of domains that read one: data.root of every cell.
-        address: of the Ray cluster's head, HOST:PORT; empty for RAY_ADDRESS, or else a cluster that runs on this machine.
-        only: numbers of the stages to run, from 1; empty for all.
-        estimate: run nothing; print how many cells are to be run, and for how many hours by those that were measured.
-        status: run nothing; print the table of what became of each cell, also while another process runs them.
-        slurm: run nothing; write a script for Slurm's sbatch to this file, or several in order, whose jobs run shards.
-        workers: cells side by side, for the estimate; jobs of each of Slurm's arrays (0: one for each cell).
-        sbatch: more options of sbatch by name, such as {partition: long, time: "02:00:00"}.
-    """
-    from ftl_lightning.ablation.run import planned, run_ablation, show_cells, show_estimate
-
-    expect_count("workers", workers, 0, MOST_WORKERS)
-    if not (estimate or status or slurm):
-        return run_ablation(stages, seeds, results, shard, executor, root, address, only)
-    plan = planned(stages, seeds, root, only)
-    if estimate:
-        show_estimate(list(plan.values()), results, workers)
-    if status:
-        show_cells(results, [cell for cells in plan.values() for cell in cells])
-    if slurm:
-        from ftl_lightning.ablation.check import check
-        from ftl_lightning.ablation.slurm import write_scripts
-
-        check([cell for cells in plan.values() for cell in cells])
-        keys = {"results": results, "seeds": list(seeds), "root": root}
-        say("\n".join(write_scripts(slurm, stages, plan, keys, workers, sbatch)))
 
 
 def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
