@@ -48,9 +48,13 @@ benchmark: install # every number of the page on speed, on a machine that does n
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/peers.py
 	$(BIN)/python benchmarks/batching.py --again
+	$(BIN)/python benchmarks/batching.py --again --precision bf16-mixed --processes 2 --least 16
 	$(BIN)/python benchmarks/batching.py --again --domain driving --steps 60
+	$(BIN)/python benchmarks/batching.py --again --domain driving --steps 60 --precision bf16-mixed --processes 2 --least 16
 	$(BIN)/python benchmarks/product_rate.py
 	$(BIN)/python benchmarks/cost.py
+	$(BIN)/python benchmarks/distributed.py --parts throughput
+	$(BIN)/python benchmarks/fit_options.py
 	$(BIN)/python benchmarks/price.py
 	$(BIN)/python benchmarks/speed_table.py
 

@@ -1,4 +1,5 @@
-"""The tables of the page on speed, from what was measured: results/peers.md, batching.md, product_rate.md and cost.md.
+"""The tables of the page on speed, from what was measured: results/peers.md, batching.md, product_rate.md,
+cost.md and fit_options.md.
 
 python benchmarks/speed_table.py
 """
@@ -117,9 +118,24 @@ def cost(found: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n" + told(f"{found['capability']}, {threads(found['threads'])}", found["load"])
 
 
+def fit_options(found: Mapping[str, Any]) -> str:
+    """Steps of a fit with other options."""
+    lines = head("`fit`", "a step", "times as fast", "until the first step", "loss at the end")
+    for config, rows in found.items():
+        if not config.endswith(".yaml"):
+            continue
+        for name, row in rows.items():
+            step, until = f"{1000 * row['seconds a step']:.0f} ms", f"{row['seconds until the first step is made']:.0f} s"
+            title = f"{config.removesuffix('.yaml').replace('_', ' ')}, {name}"
+            lines.append(cells(title, step, f"{row['times as fast']:.2f}", until, f"{row['loss at the end']:.4f}"))
+    machine = found["machine"]
+    return "\n".join(lines) + "\n" + told(f"{machine['capability']}, {threads(machine['threads'])}", [found["load"]])
+
+
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "peers": peers,
     "batching": batching,
+    "fit_options": fit_options,
     "product_rate": product_rate,
     "cost": cost,
 }

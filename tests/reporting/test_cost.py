@@ -133,7 +133,7 @@ def test_the_table_of_prices_is_what_its_file_says(monkeypatch: pytest.MonkeyPat
     assert price["table"](content, list(content["machines"])) == kept, "run benchmarks/price.py"
 
 
-@pytest.mark.parametrize("name", ["peers", "batching", "product_rate", "cost"])
+@pytest.mark.parametrize("name", ["peers", "batching", "product_rate", "cost", "fit_options"])
 def test_the_tables_of_speed_are_what_their_files_say(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     table = script("speed_table", monkeypatch)["TABLES"][name]
     content = json.loads((ROOT / "results" / f"{name}.json").read_text(encoding="utf-8"))
