@@ -96,7 +96,7 @@ def test_what_was_done_is_not_run_again(submitted: Path, capsys: pytest.CaptureF
 
 
 def test_a_file_of_something_else_is_not_gone_on_with(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected a submission of the same method" in line_of(capsys, "bc", "--suites", "beats", "--out", str(copy))
+    assert "expected a submission of the same method" in line_of(capsys, "cvae", "--suites", "beats", "--out", str(copy))
     other = replace(Submission.load(copy), code="0123456789abcdef")  # the method has changed since
     other.save(copy)
     assert "expected a submission of the same code" in line_of(capsys, *RUN[1:], "--out", str(copy))
