@@ -132,7 +132,7 @@ def _named(text: str, key: str) -> list[str]:
 
 
 def _chosen(options: BenchmarkOptions) -> list[str]:
-    """The suites that are asked for; of all of them those that can be run here, and why others cannot is told.
+    """The suites that are asked for; of all of them those that the method can do here, and why it cannot do others is told.
 
     Raises:
         UserError: for a suite that is asked for by name and cannot be run here.
@@ -145,7 +145,7 @@ def _chosen(options: BenchmarkOptions) -> list[str]:
     for name in asked or suite_names():
         if name in skipped:
             continue
-        if not (missing := missing_of(load_suite(name), root)):
+        if not (missing := missing_of(load_suite(name), root, options.method)):
             found.append(name)
         elif asked:
             raise UserError(missing)

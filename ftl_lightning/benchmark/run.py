@@ -16,7 +16,7 @@ from ftl_lightning.benchmark.submission import GIVEN, PRETRAINED, Row, Run, Subm
 from ftl_lightning.benchmark.suite import ASKED, TRAINING, BenchmarkSuite, load_suite
 from ftl_lightning.configuration import load
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError, short
+from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.evaluation.row import METHOD, REFERENCE
 from ftl_lightning.learning.method import Method
 from ftl_lightning.learning.methods import load_method
@@ -277,12 +277,15 @@ def temporary(entry: Entry) -> Iterator[Entry]:
         yield replace(entry, work=Path(folder))
 
 
-def missing_of(suite: BenchmarkSuite, root: Path | None) -> str:
-    """Why a suite cannot be run here, in words; empty if it can be."""
+def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> str:
+    """Why a suite cannot be run here, by a method if one is named, in words; empty if it can be."""
     if suite.recordings and root is None:
         return f"suite {suite.name}: needs your own copy of the recordings (--root FOLDER)"
     try:
-        suite.loaded()
+        domain = suite.loaded()
+        if method:
+            with about(f"suite {suite.name}"):
+                load_method(method).expect_domain(domain)
     except UserError as error:
         return str(error)
     return ""

@@ -3,9 +3,12 @@
 import importlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.errors import UserError, about
+
+if TYPE_CHECKING:  # a declaration is read without torch
+    from ftl_lightning.domains.domain import Domain
 
 INVERSION = "ftl_lightning.learning.forms:learn"
 """The learner of methods whose concepts are learned by gradient descent."""
@@ -30,7 +33,8 @@ class Form:
 class Method:
     """A way to learn tasks from a few demonstrations.
 
-    ``model``, ``pretraining``, ``adaptation`` and ``learner`` are ``'package.module:NAME'``, imported when they are needed.
+    ``model``, ``pretraining``, ``adaptation``, ``learner`` and ``suits`` are ``'package.module:NAME'``, imported when they are
+    needed.
 
     Attributes:
         name: in tables and results.
@@ -43,6 +47,7 @@ class Method:
             through the model's losses unless it says otherwise.
         forms: of its concepts, in the order in which their names are joined.
         configurations: folder of its configuration files, one for each domain; empty for none.
+        suits: a function of a domain that raises a ``UserError`` for one that the method cannot do; empty if it can do all.
     """
 
     name: str
@@ -53,6 +58,7 @@ class Method:
     learner: str = INVERSION
     forms: Sequence[Form] = ()
     configurations: str = ""
+    suits: str = ""
 
     def expect_settings(self, names: Iterable[str]) -> None:
         """Refuse settings of an inversion where concepts are not learned by gradient descent.
@@ -79,6 +85,16 @@ class Method:
     def learn(self) -> Any:
         """How concepts are learned without a trainer."""
         return self._named(self.learner)
+
+    def expect_domain(self, domain: "Domain") -> None:
+        """Refuse a domain that the method cannot do.
+
+        Raises:
+            UserError: saying what it lacks.
+        """
+        if self.suits:
+            with about(f"method {self.name}"):
+                self._named(self.suits)(domain)
 
     def form(self, hparams: Mapping[str, Any]) -> str:
         """The form of concepts that are learned with these options; empty for the paper's."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.demonstrations.features import READ, Observed
+from ftl_lightning.domains.domain import Domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import ModelConfig
@@ -45,6 +46,26 @@ class StepConfig(ModelConfig):
     def moments(self) -> int:
         """States of a transition: the present and the next, or the only one of a domain without time."""
         return min(self.horizon, 2)
+
+
+def expect_present(domain: Domain) -> None:
+    """Refuse domains of which nothing is observed.
+
+    Raises:
+        UserError: naming the domain.
+    """
+    if not domain.observed:
+        raise UserError(f"domain: expected one with observed features, found {domain.name}: there is no present to go on from")
+
+
+def expect_present_or_moment(domain: Domain) -> None:
+    """Refuse domains of which nothing is observed, unless plans are single states, which need no present.
+
+    Raises:
+        UserError: naming the domain.
+    """
+    if domain.plans.horizon > 1:
+        expect_present(domain)
 
 
 def expect_window(config: StepConfig, data: "PretrainingData") -> None:

@@ -96,7 +96,7 @@ def test_what_was_done_is_not_run_again(submitted: Path, capsys: pytest.CaptureF
 
 
 def test_a_file_of_something_else_is_not_gone_on_with(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected a submission of the same method" in line_of(capsys, "bc", "--suites", "beats", "--out", str(copy))
+    assert "expected a submission of the same method" in line_of(capsys, "cvae", "--suites", "beats", "--out", str(copy))
     other = replace(Submission.load(copy), code="0123456789abcdef")  # the method has changed since
     other.save(copy)
     assert "expected a submission of the same code" in line_of(capsys, *RUN[1:], "--out", str(copy))
@@ -295,6 +295,8 @@ def test_data_are_written_with_cards_and_hashes(form: str) -> None:
         (["replay", "--suites", "beats", "--seeds", "0,x"], "seeds: expected different numbers"),
         (["replay", "--suites", "beats", "--seeds", "1,1"], "seeds: expected different numbers"),
         (["language", "--suites", "beats"], "model: expected models of kind diffusion, which language does not pretrain"),
+        (["bc", "--suites", "pictures,beats"], "suite beats: method BC: domain: expected one with observed features"),
+        (["in_context", "--suites", "pictures"], "suite pictures: method in-context: domain: expected one with observed features"),
         (["nobody", "--suites", "beats"], "method: expected one of ftl_igm"),
         (["replay", "--suites", "beats", "--model", "absent/{suite}"], "expected a pretrained model for suite beats, found none"),
         (["replay", "--suites", "beats", "--configurations", "absent"], "expected beats.yaml or suites.yaml in absent"),
@@ -308,3 +310,10 @@ def test_mistakes_are_one_line(arguments: list[str], expected: str, capsys: pyte
     if "--check" in arguments:
         Path("x.json").write_text("{}")
     assert expected in line_of(capsys, *arguments)
+
+
+def test_suites_that_a_method_cannot_do_are_left_out_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "bc", "--skip", "agent,driving,object_rearrangement,pictures,tabletop"]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: left out: suite ")]
+    assert [line.split()[4] for line in told] == ["beats:", "mocap:", "reaches:", "strokes:"]
+    assert all("method BC: domain: expected one with observed features" in line for line in told if "mocap" not in line)

@@ -67,7 +67,7 @@ def test_a_changed_generator_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys
             UserError, match=r"suite beats, seed 0, demonstrations: expected data with the hash \w{16}, found \w{16}"
         ):
             suite.expect_data(0, None, (DEMONSTRATIONS,))
-        assert main(["benchmark", "bc", "--suites", "beats"]) == 2
+        assert main(["benchmark", "cvae", "--suites", "beats"]) == 2
         assert "the generator was changed" in capsys.readouterr().err
     finally:
         load_domain.cache_clear()

@@ -10,4 +10,5 @@ METHOD = Method(
     adaptation="ftl_lightning.learning.learner_adaptation:LearnerAdaptation",
     learner="ftl_lightning.methods.in_context.prompting:prompt",
     configurations="conf/in_context",
+    suits="ftl_lightning.learning.transitions:expect_present",
 )

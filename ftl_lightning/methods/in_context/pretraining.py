@@ -13,7 +13,7 @@ from ftl_lightning.learning.model_config import ModelConfig
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.learning.pretraining import Pretraining, expect_shown
-from ftl_lightning.learning.transitions import expect_window
+from ftl_lightning.learning.transitions import expect_present, expect_window
 from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
 
 
@@ -59,8 +59,7 @@ class InContextPretraining(Pretraining[InContextModel]):
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> InContextModel:
         config = prepared.config
-        if not config.observed:
-            raise UserError(f"data.class_path: expected a domain with observed features, found {data.domain.name}: nothing follows")
+        expect_present(data.domain)
         if config.image_dim and self.hparams["images"] is None:
             raise UserError("model.images: expected the folder of a model that reads these images, found none")
         sizes = {name: self.hparams[name] for name in ("tokens", "bins", "width", "layers", "heads", "stride")}
