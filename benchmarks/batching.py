@@ -29,7 +29,6 @@ import numpy as np
 import torch
 
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
-from ftl_lightning.domains.data import InversionData
 from ftl_lightning.learning.in_processes import learned_in_processes
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import FULL, PRECISIONS, REDUCED
@@ -49,6 +48,8 @@ GROUPS = 8
 
 def concepts(domain: str, examples: Demonstrations | None) -> Iterator[Demonstrations]:
     """Without end: a domain's concepts, again and again with other demonstrations, under names of their own."""
+    from ftl_lightning.domains.data import InversionData  # not for the processes, which import this file: it takes seconds
+
     for seed in count():
         data = (
             InversionData(domain, suite=SUITES[domain], seed=0 if domain in SLOW else seed).demonstrations

@@ -237,7 +237,7 @@ def here(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     found = {}
-    for domain, own in json.loads(path.read_text(encoding="utf-8")).items():
+    for title, own in json.loads(path.read_text(encoding="utf-8")).items():
         rows = own["rows"]
         best = max(rows, key=lambda row: row["concepts a second"])
         hours = {}
@@ -245,7 +245,8 @@ def here(path: Path) -> dict[str, Any]:
             fits = [row["seconds"] for row in rows if row["concepts"] >= number]
             hours[str(number)] = (min(fits) if fits else number / best["concepts a second"]) / HOUR
         error = own.get("curve", {}).get("largest error of one left out")
-        found[domain] = {"processes": own["processes"], "together": best["concepts"], "hours": hours, "error of the curve": error}
+        found[title] = {name: own[name] for name in ("domain", "precision", "processes")}
+        found[title] |= {"together": best["concepts"], "hours": hours, "error of the curve": error}
     return found
 
 
@@ -300,10 +301,10 @@ def table(found: Mapping[str, Any], names: Sequence[str]) -> str:
             cells = [f"{shown(own[str(number)]['hours'])}, {money(own[str(number)]['dollars'])}" for number in NUMBERS]
             lines.append(f"| {name}, {own['together']} together | " + " | ".join(cells) + " |")
         if kind == "learning":
-            for domain, own in found["here"].items():
+            for own in found["here"].values():
                 cells = [shown(own["hours"][str(number)]) for number in NUMBERS]
                 cores = f"{own['processes']} core{'s' if own['processes'] > 1 else ''}"
-                title = f"{domain}, ours, on {cores}, measured up to {own['together']} together"
+                title = f"{own['domain']}, ours, {own['precision']}, on {cores}, measured up to {own['together']} together"
                 lines.append(f"| {title} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 

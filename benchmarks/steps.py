@@ -109,7 +109,7 @@ def made(step: Step, device: str = "cpu") -> Made:
     with torch.device(device):
         network = build_denoiser(config)
         images = ImageEncoders(config.observed, config.image_encoder) if config.image_dim else None
-        modules = nn.ModuleList([network, *([images] if images else [])])
+        modules = nn.ModuleList([network, *([images] if images else [])]).to(device)  # constants are made on the processor
         alpha_bar = cosine_alpha_bar(config.diffusion_steps).to(device)
         clean, noise = (torch.randn(together, config.horizon, config.state_dim) for _ in range(2))
         spread = torch.arange(together) % step.batch * config.diffusion_steps // step.batch

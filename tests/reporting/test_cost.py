@@ -84,6 +84,17 @@ def test_a_step_of_inversion_multiplies_as_often_as_its_layers_say(monkeypatch: 
     assert counting["counted"](made.compute, made.parameters).products == pytest.approx(expected, rel=1e-3)
 
 
+def test_a_network_that_no_memory_here_holds_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps, counting = script("steps", monkeypatch), script("counting", monkeypatch)
+    step = steps["ours"]("agent").inversion
+    small = replace(step, batch=2, config=replace(step.config, horizon=32))
+    on_paper, here = (
+        counting["counted"](made.compute, made.parameters) for made in (steps["on_paper"](small), steps["made"](small))
+    )
+    assert on_paper.convolutions == here.convolutions > 0
+    assert on_paper.calls == here.calls
+
+
 def test_the_model_of_time_finds_the_coefficients_that_made_the_times(monkeypatch: pytest.MonkeyPatch) -> None:
     cost = script("cost", monkeypatch)
     draw = torch.Generator().manual_seed(0)
