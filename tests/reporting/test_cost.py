@@ -92,7 +92,7 @@ def test_a_network_that_no_memory_here_holds_is_counted_too(monkeypatch: pytest.
         counting["counted"](made.compute, made.parameters) for made in (steps["on_paper"](small), steps["made"](small))
     )
     assert on_paper.convolutions == here.convolutions > 0
-    assert on_paper.calls == here.calls
+    assert on_paper.products == here.products > 0  # calls are more: some operators are several there
 
 
 def test_the_model_of_time_finds_the_coefficients_that_made_the_times(monkeypatch: pytest.MonkeyPatch) -> None:
