@@ -31,8 +31,8 @@ def head(*titles: str) -> list[str]:
 
 def told(machine: str, loads: list[float]) -> str:
     """Where it was measured, and whether other work was going on."""
-    beside = f"beside other work (load {max(loads):.1f}): preliminary" if loads[0] > NOT_QUIET else "on an otherwise idle machine"
-    return f"\n{machine}, {beside}.\n"
+    busy = f"load {max(loads):.1f} before, of other work or of the benchmark before"
+    return f"\n{machine}, {busy if loads[0] > NOT_QUIET else 'on an otherwise idle machine'}.\n"
 
 
 def threads(count: int) -> str:
@@ -78,7 +78,8 @@ def batching(found: Mapping[str, Any]) -> str:
     limits = (f"{curve['limit']:.2g} ± {curve[LIMIT]:.1g}" if curve else "" for curve in curves)
     lines.append(cells("limit of the curve", *limits))
     own = next(iter(found.values()))
-    loads = [max(row["load"] for own in found.values() for row in own["rows"])]
+    alone = [own for own in found.values() if own["processes"] == 1]  # several are a load themselves
+    loads = [max(row["load"] for own in alone for row in own["rows"])]
     return "\n".join(lines) + "\n" + told(f"{own['capability']}, a thread for each process", loads)
 
 
