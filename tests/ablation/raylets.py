@@ -36,8 +36,8 @@ QUICK = {
     },
 }
 """A stage whose cells take a second or two."""
-SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
-"""Of the head: a node that is gone is missed soon."""
+SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 16}
+"""Of the head: a node that is gone is missed soon, and one on a machine that stands still for some seconds is not."""
 
 
 @contextmanager
