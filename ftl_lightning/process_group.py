@@ -137,11 +137,13 @@ def _how(process: "subprocess.Popen[bytes]") -> str:
 
 
 def take_over(trainer: pl.Trainer) -> None:
-    """Let a trainer of several processes start them by a :class:`Launcher`."""
+    """Let a trainer of several processes start them by a :class:`Launcher`, and exchange gradients where they lie."""
     launcher = trainer.strategy.launcher
     if type(launcher) is _SubprocessScriptLauncher:
         own = Launcher(launcher.cluster_environment, launcher.num_processes, launcher.num_nodes)
         trainer.strategy._launcher = own
+    if isinstance(trainer.strategy, DDPStrategy):  # gradients are not copied before and after they are exchanged
+        trainer.strategy._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
 
 
 def expect_alone(trainer: pl.Trainer, verb: str) -> None:
