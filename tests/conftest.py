@@ -1,11 +1,9 @@
-"""Fixtures that all tests share, the markers of the three suites, and the limit of work for a test without one."""
+"""Fixtures and helpers that all tests share."""
 
 import os
 import subprocess
 import sys
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +14,8 @@ from filelock import FileLock
 
 from ftl_lightning.cli import main
 from ftl_lightning.errors import LONGEST
+from tests.suites import *  # noqa: F403
+from tests.suites import of_no_test
 
 if TYPE_CHECKING:
     from ftl_lightning.learning import InversionModule
@@ -58,20 +58,25 @@ def environment(**variables: str) -> dict[str, str]:
     return os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)} | variables
 
 
-def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *expected: str) -> str:
-    """Run a verb and expect one line that says something, and no new file; returns what went to standard error."""
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *expected: str, longest: int = LONGEST) -> str:
+    """Run a verb and expect one line with these texts, and no new file; returns what went to standard error."""
     capsys.readouterr()
-    before = {path: path.lstat().st_mtime_ns for path in Path().rglob("*")}
+    before = files()
     assert main(arguments) == 2
     told = capsys.readouterr().err
     lines = [line for line in told.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1
     assert "Traceback" not in told
-    assert len(lines[0]) <= LONGEST
+    assert len(lines[0]) <= longest
     for text in expected:
         assert text in lines[0]
-    assert {path: path.lstat().st_mtime_ns for path in Path().rglob("*") if "cache" not in path.parts} == before
+    assert files() == before
     return told
+
+
+def files() -> dict[Path, int]:
+    """When each file below the current folder was written, but for the cache."""
+    return {path: path.lstat().st_mtime_ns for path in Path().rglob("*") if "cache" not in path.parts}
 
 
 def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
@@ -83,127 +88,17 @@ def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
     return InversionModule(str(pretrained), **{field.name: getattr(settings, field.name) for field in fields(settings)})
 
 
-# The three suites
-
-
-MARKERS = {
-    "slow": "takes more than five seconds of work",
-    "browser": "opens a page in Chromium",
-    "release": "builds or installs the package, or checks types of its users",
-    "notebook": "executes a notebook",
-    "cluster": "starts processes that exchange gradients, or a Ray cluster",
-    "fuzz": "reads damaged and hostile input by the hundred",
-}
-"""Kinds of tests that are not in ``make test``."""
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    for name, what in MARKERS.items():
-        config.addinivalue_line("markers", f"{name}: {what}; not in `make test`")
-
-
-def marked(item: pytest.Item) -> list[str]:
-    """The markers of a test that keep it out of ``make test``."""
-    return [name for name in MARKERS if item.get_closest_marker(name)]
-
-
-LEFT_OUT, SECONDS = pytest.StashKey[Counter[str]](), pytest.StashKey[float]()
-LIMIT = 5.0
-"""Seconds of work of a test without a marker: of processors, child processes included, and of ``time.sleep``.
-
-Nothing here looks at the clock on the wall, which goes on while a machine does something else.
-"""
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with the most marked tests first, since a file is the work of one process: so all end at about the same time."""
-    heavy = Counter(item.path for item in items if marked(item))
-    items.sort(key=lambda item: (-heavy[item.path], item.path))
-
-
-def pytest_deselected(items: list[pytest.Item]) -> None:
-    """Count what a marker leaves out, by its marker."""
-    for item in items:
-        item.config.stash.setdefault(LEFT_OUT, Counter()).update(marked(item)[:1])
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Send the counts to the process that prints."""
-    if output := getattr(session.config, "workeroutput", None):
-        output["left out"] = dict(session.config.stash.get(LEFT_OUT, Counter()))
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: Any) -> None:
-    """Take the counts of a process; those of all processes are the same."""
-    node.config.stash[LEFT_OUT] = Counter(getattr(node, "workeroutput", {}).get("left out", {}))
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Print how many tests were left out, and how to run them."""
-    if config.option.markexpr and (left := config.stash.get(LEFT_OUT, Counter[str]())):
-        kinds = ", ".join(f"{count} {name}" for name, count in left.most_common())
-        terminalreporter.write_line(f"{left.total()} tests left out ({kinds}): `make test-all` runs all, `pytest -m NAME` one kind")
-
-
-def work() -> float:
-    """Seconds of work that this process and the child processes that ended have done."""
-    return sum(os.times()[:4]) + slept[0]
-
-
-slept = [0.0]
-sleep = time.sleep
-
-
-def counted(seconds: float) -> None:
-    slept[0] += seconds
-    sleep(seconds)
-
-
-time.sleep = counted
-
-
-@pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
-    """Measure the work of a test's fixtures, which are made for the first test that needs them."""
-    item.stash[SECONDS] = work()
-    return (yield)
-
-
-@pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    """Measure the work of a test."""
-    item.stash[SECONDS] = work()
-    return (yield)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[pytest.TestReport]:
-    """Fail a test that takes long and has no marker."""
-    report: pytest.TestReport = yield
-    seconds = work() - item.stash[SECONDS]
-    if call.when != "teardown" and report.passed and seconds > LIMIT and not marked(item):
-        expected = f"at most {LIMIT:.0f} s of work, or one of the markers {', '.join(MARKERS)}"
-        report.outcome, report.longrepr = "failed", f"{item.nodeid}: {call.when}: expected {expected}, found {seconds:.1f} s"
-    return report
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Print a failure at once: a run that is stopped from outside never comes to its summary."""
-    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
-        print(f"\nFAILED {report.nodeid[:200]} ({report.when}, {report.duration:.0f} s)\n{report.longreprtext[-3000:]}", flush=True)
-
-
 # Fixtures
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Import what most tests need before the first of them, whose work it would be."""
+    import ftl_lightning.lightning_cli  # noqa: F401
 
 
 @pytest.fixture(autouse=True)
 def _in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # logs and outputs of a test stay its own
+    monkeypatch.chdir(tmp_path)  # what a test logs and writes is of no other test
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))  # no concepts of the person who runs the tests
     torch.set_num_threads(1)
@@ -220,7 +115,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
 
     def made(name: str, make: Callable[[Path], object]) -> Path:
         folder, done = shared / name, shared / f"{name}.done"
-        with FileLock(shared / f"{name}.lock"), pytest.MonkeyPatch.context() as patch:
+        with FileLock(shared / f"{name}.lock"), pytest.MonkeyPatch.context() as patch, of_no_test():
             if not done.exists():
                 folder.mkdir(exist_ok=True)
                 patch.chdir(folder)
@@ -247,12 +142,21 @@ def tiny_of(once: Once) -> Callable[[str], Path]:
 
     def model(domain: str) -> Path:
         def fit(folder: Path) -> None:
-            few = ["--trainer.max_steps=10", "--data.steps_per_epoch=5", "--data.batch_size=8", "--evaluation.samples=1", "--evaluation.steps=2"]
-            succeed(*tiny.fit(Path(f"{domain}.yaml"), *few, "--evaluation.figures=0", "--evaluation.diversity=false"))
+            few = ["--trainer.max_steps=10", "--data.steps_per_epoch=5", "--data.batch_size=8", "--evaluation.samples=1"]
+            few += ["--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.diversity=false"]
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("XDG_CACHE_HOME", str(once("drawn", lambda folder: None)))
+                succeed(*tiny.fit(Path(f"{domain}.yaml"), *few))
 
         return once(f"tiny_{domain}", fit) / "logs" / domain / "fit" / "pretrained"
 
     return model
+
+
+@pytest.fixture
+def drawn(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the demonstrations that other tests of this run have drawn from a cache in common."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(once("drawn", lambda folder: None)))
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,9 @@ from ftl_lightning.domains.domain import Concepts, Domain, Plans, Show
 from ftl_lightning.domains.mocap.rendering import film, picture, wireframe
 from ftl_lightning.domains.mocap.skeleton import COLUMNS
 from ftl_lightning.study.answers import Key
+from ftl_lightning.study.films import read_films
+from ftl_lightning.study.page import Made, make_study
+from ftl_lightning.study.questions import ask
 from tests.domains.test_mocap_rendering import waving
 
 TRAINING = ("march", "run", "walk")
@@ -47,6 +50,14 @@ def write_films(folder: Path, samples: int = 2) -> Path:
             )
             made.save(folder / method / f"{concept.replace(' ', '_')}.safetensors")
     return folder
+
+
+def make(films: Path, out: Path, **options: Any) -> Made:
+    """The page of a small study, and its key."""
+    told = {"domain": PEOPLE, "scenarios": 1, "repeats": 2, "still": 1, "seed": 0} | options
+    domain, scenarios, repeats, still, seed = (told.pop(name) for name in ("domain", "scenarios", "repeats", "still", "seed"))
+    questions = ask(read_films(films, domain, scenarios, seed), repeats, still, seed)
+    return make_study(domain, questions, out, **told)
 
 
 Opinion = Callable[[Mapping[str, Any], Key], str | None]

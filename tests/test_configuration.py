@@ -1,18 +1,20 @@
 """Configuration files: parts, sections, their order, their mistakes, former names, and what is shipped."""
 
+import copy
 import functools
 import importlib
 import inspect
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
-from ftl_lightning.cli import main
-from ftl_lightning.configuration import SECTIONS, _say_once, expanded, find, load, parts
+from ftl_lightning.configuration import SECTIONS, _read, _say_once, expanded, find, load, parts
 from ftl_lightning.errors import UserError
+from ftl_lightning.lightning_cli import parse
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tuned import settings_of
 from tests.conftest import CONF, ROOT
@@ -60,20 +62,6 @@ def test_a_part_is_looked_for_beside_the_file_then_above_it_then_among_the_shipp
         ("'3'", "a.yaml: expected a configuration file (YAML), found no mapping of keys"),
         ("model: {x: 1", "a.yaml: expected a configuration file (YAML), found "),
         ("model: 1\nmodel: 2\n", "a.yaml: expected a configuration file (YAML), found "),
-    ],
-)
-def test_mistakes_in_a_file_name_it(text: str, expected: str) -> None:
-    write("a.yaml", text)
-    write("b.yaml", "defaults: [a.yaml]")
-    with pytest.raises(UserError) as told:
-        load("a.yaml")
-    assert expected in str(told.value)
-    assert "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
         ("defaults: 3", "a.yaml: key 'defaults': expected a list of configuration files, found 3"),
         ("defaults: {b.yaml: 1}", "a.yaml: key 'defaults': expected a list of configuration files"),
         (f"defaults: [{'b' * 5000}]", "expected configuration files, found bbb"),
@@ -81,9 +69,10 @@ def test_mistakes_in_a_file_name_it(text: str, expected: str) -> None:
         ("defaults: [below.yaml]\nmodel: [1]", "a.yaml: expected keys that go together"),
     ],
 )
-def test_odd_defaults_are_told_in_one_short_line(text: str, expected: str) -> None:
+def test_mistakes_in_a_file_name_it_in_one_short_line(text: str, expected: str) -> None:
     write("below.yaml", "model: {omega: 1}")
     write("a.yaml", text)
+    write("b.yaml", "defaults: [a.yaml]")
     with pytest.raises(UserError) as told:
         load("a.yaml")
     assert expected in str(told.value)
@@ -101,16 +90,13 @@ def test_a_command_line_gets_the_content_of_its_files() -> None:
     assert expanded(expanded(["--config", "a.yaml"])) == expanded(["--config", "a.yaml"])
 
 
-def test_the_shipped_files_are_those_of_the_repository(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_shipped_files_are_those_of_the_repository_and_what_is_there_wins(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find("conf/agent.yaml").read_bytes() == (CONF / "agent.yaml").read_bytes()
     assert (shipped("pretrained/agent") / "config.json").is_file()
-    monkeypatch.chdir(ROOT)
-    assert find("conf/agent.yaml") == Path("conf/agent.yaml")
-
-
-def test_what_is_there_wins_over_what_is_shipped() -> None:
     write("conf/agent.yaml", "x: mine\n")
     assert load("conf/agent.yaml") == {"x": "mine"}
+    monkeypatch.chdir(ROOT)
+    assert find("conf/agent.yaml") == Path("conf/agent.yaml")
 
 
 @pytest.mark.parametrize("path", ["conf/../cli.py", "cli.py", "domains/agent", "pretrained/nothing", "/conf/agent.yaml", ""])
@@ -130,11 +116,8 @@ def test_sections_count_for_their_verb_alone_and_after_the_other_keys_of_their_f
         ("a.yaml", {"x": 3, "z": {"u": 1}}),
     ]
     assert yaml.safe_load(expanded(["--config=b.yaml"], "fit")[0].removeprefix("--config=")) == {"x": 4, "y": 5}
-
-
-def test_files_of_other_verbs_have_no_sections() -> None:
     write("a.yaml", "x: 1\nfit: {x: 2}\n")
-    assert load("a.yaml", "ablate") == load("a.yaml") == {"x": 1, "fit": {"x": 2}}
+    assert load("a.yaml", "ablate") == load("a.yaml") == {"x": 1, "fit": {"x": 2}}  # files of other verbs have no sections
 
 
 def test_an_empty_section_is_none_and_one_that_is_no_mapping_is_refused() -> None:
@@ -146,13 +129,6 @@ def test_an_empty_section_is_none_and_one_that_is_no_mapping_is_refused() -> Non
             load("a.yaml", verb)
 
 
-def test_a_mistake_is_told_with_the_section_of_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
-    write("a.yaml", "defaults: [conf/agent.yaml]\ninvert:\n  trainer: {max_stepz: 1}\nfit:\n  trainer: {max_stepz: 2}\n")
-    for verb, number in (("fit", 5), ("invert", 3)):
-        assert main([verb, "--config=a.yaml"]) == 2
-        assert f"error: a.yaml: line {number}: " in capsys.readouterr().err
-
-
 @pytest.fixture
 def told(capsys: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
     """What was said on standard error since it was asked for last; a note is said once by a process."""
@@ -161,6 +137,11 @@ def told(capsys: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
 
 
 Told = Callable[[], list[str]]
+
+
+def said(path: str | Path, verb: str) -> list[dict[str, object]]:
+    """The keys of a file and of those that it builds on, in order, which are what is merged."""
+    return [keys for _, keys in parts(path, verb) if keys]
 
 
 @pytest.mark.parametrize(
@@ -194,34 +175,21 @@ def test_a_former_name_stands_for_the_files_of_today(
     former: str, verb: str, today: list[str], advice: str, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever the verb of the run is: the name says which section was meant."""
-    expected: dict[str, object] = {}
-    for name in today:
-        for _, keys in parts(CONF / name, verb or "fit"):
-            expected = merged(expected, keys if verb else {"seed_everything": 0})
+    expected = [keys for name in today for _, keys in shipped_parts((CONF / name).resolve(), verb or "fit") if keys]
     write("mine.yaml", f"defaults: [conf/{former}]\n")
-    for path in (f"conf/{former}", "mine.yaml"):
-        for running in ("fit", "invert", "test"):
-            found = load(path, running)
-            assert found == expected if verb else set(expected) <= set(found), (path, running)
-            assert not found.keys() & {"fit", "invert"}
+    for path, running in (("mine.yaml", "fit"), ("mine.yaml", "invert"), (f"conf/{former}", "invert"), (f"conf/{former}", "test")):
+        found = said(path, running)
+        assert found == expected if verb else not today or "seed_everything" in found[0], (path, running)
+        assert not {key for keys in found for key in keys} & {"fit", "invert"}
     assert told() == [f"note: conf/{former} {advice}"]
     # In a checkout the path may be written in other ways, and from files within the folder without it.
     checkout = Path("checkout")
     checkout.mkdir()
     (checkout / "conf").symlink_to(CONF)
-    assert load(checkout.absolute() / "conf" / former, "fit") == load(f"conf/{former}", "fit")
+    assert said(checkout.absolute() / "conf" / former, "fit") == found
     assert len(told()) == 1
     monkeypatch.chdir(checkout)
-    assert load(f"./conf/{former}", "fit") == load(f"conf/{former}", "fit")
-
-
-def merged(below: dict[str, object], keys: dict[str, object]) -> dict[str, object]:
-    """Mappings key by key; of everything else the later value."""
-    found = dict(below)
-    for key, value in keys.items():
-        old = found.get(key)
-        found[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return found
+    assert said(f"./conf/{former}", "fit") == said(f"conf/{former}", "fit") == found
 
 
 def test_a_former_name_needs_no_prefix_in_a_folder_of_the_shipped_files(tmp_path: Path, told: Told) -> None:
@@ -238,20 +206,16 @@ def test_a_former_name_needs_no_prefix_in_a_folder_of_the_shipped_files(tmp_path
     ]
 
 
-def test_a_file_of_one_s_own_wins_over_a_former_name(told: Told) -> None:
-    write("conf/invert/agent.yaml", "x: mine\n")
-    write("mine.yaml", "defaults: [conf/invert/agent.yaml]\n")
-    assert load("conf/invert/agent.yaml", "invert") == load("mine.yaml", "invert") == {"x": "mine"}
-    assert told() == []
-
-
-def test_a_former_name_never_means_a_file_of_one_s_own(told: Told) -> None:
+def test_a_file_of_one_s_own_wins_over_a_former_name_which_never_means_another_of_them(told: Told) -> None:
     write("conf/agent.yaml", "x: mine\n")
     write("mine.yaml", "defaults: [conf/invert/agent.yaml]\n")
     assert load("conf/agent.yaml", "invert") == {"x": "mine"}
     for path in ("conf/invert/agent.yaml", "mine.yaml"):
         assert load(path, "invert") == load(CONF / "agent.yaml", "invert")
     assert len(told()) == 1
+    write("conf/invert/agent.yaml", "x: mine\n")
+    assert load("conf/invert/agent.yaml", "invert") == load("mine.yaml", "invert") == {"x": "mine"}
+    assert told() == []
 
 
 @pytest.mark.parametrize("name", ["conf/invert/chess.yaml", "conf/baseline/telepathy/agent.yaml", "elsewhere/invert/agent.yaml"])
@@ -262,7 +226,7 @@ def test_a_name_that_never_was_is_missing(name: str, told: Told) -> None:
 
 
 def test_a_run_with_a_former_name_says_one_line(told: Told) -> None:
-    assert main(["fit", "--config=conf/baseline/bc/agent.yaml", "--print_config"]) == 0
+    parse("fit", ["--config=conf/baseline/bc/agent.yaml"])
     assert told() == ["note: conf/baseline/bc/agent.yaml is now conf/bc/agent.yaml (for fit and invert)"]
 
 
@@ -280,14 +244,23 @@ def test_settings_go_with_a_domain_by_its_name() -> None:
     assert settings_of("chess") == "conf/invert/chess.yaml"
 
 
-def test_there_are_at_most_fifty_configuration_files() -> None:
-    assert 0 < len(list(CONF.rglob("*.yaml"))) <= 50
+read_once = functools.cache(_read)
 
 
-def test_every_part_is_used_by_a_configuration() -> None:
+@functools.cache
+def shipped_parts(path: Path, verb: str) -> list[tuple[Path, dict[str, Any]]]:
+    """For several tests: reading YAML takes long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ftl_lightning.configuration._read", lambda path: copy.deepcopy(read_once(path.resolve())))
+        return parts(path, verb)
+
+
+@pytest.mark.slow
+def test_there_are_at_most_fifty_configuration_files_and_every_part_is_used_by_one() -> None:
     files = {path.resolve() for path in CONF.rglob("*.yaml")}
+    assert 0 < len(files) <= 50
     inside = {path for path in files if path.relative_to(CONF.resolve()).parts[0] in PARTS}
-    used = {part.resolve() for path in files - inside for verb in SECTIONS for part, _ in parts(path, verb)}
+    used = {part.resolve() for path in files - inside for verb in SECTIONS for part, _ in shipped_parts(path, verb)}
     assert inside - used == {CONF.resolve() / "method" / "language.yaml"}  # which is added to another
     assert inside
 
@@ -327,7 +300,7 @@ def repeated(verb: str, names: list[str]) -> dict[tuple[str, str, str], bool]:
     Then the files before it give the value already or, where none of them has the key, it is the default of the class. Where a
     file that is added changes a class, references to other keys go with the former one.
     """
-    found = [(str(part), keys) for name in names for part, keys in parts(CONF / f"{name}.yaml", verb)]
+    found = [(str(part), keys) for name in names for part, keys in shipped_parts((CONF / f"{name}.yaml").resolve(), verb)]
     classes = {"evaluation": "ftl_lightning.evaluation.evaluator.Evaluator", "trainer": "ftl_lightning.trainer.Trainer"}
     for _, keys in found:
         classes |= {key: keys[key]["class_path"] for key in ("model", "data") if "class_path" in keys.get(key, {})}
@@ -355,8 +328,9 @@ def test_a_configuration_says_only_what_differs() -> None:
     assert [place for place, same in useless.items() if same] == []
 
 
-@pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONF)))
-def test_sections_do_not_say_the_same(path: Path) -> None:
+def test_sections_do_not_say_the_same() -> None:
     """What counts for both stands above them."""
-    sections = [dict(leaves(yaml.safe_load(path.read_text()).get(name, {}))) for name in SECTIONS]
-    assert {key for key in sections[0].keys() & sections[1].keys() if sections[0][key] == sections[1][key]} == set()
+    for path in CONF.rglob("*.yaml"):
+        keys = yaml.safe_load(path.read_text())
+        fit, invert = (dict(leaves(keys.get(name, {}))) for name in SECTIONS)
+        assert [key for key in fit.keys() & invert.keys() if fit[key] == invert[key]] == [], path

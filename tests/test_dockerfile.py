@@ -4,15 +4,13 @@ import fnmatch
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from tests.checkout import copied
-from tests.conftest import ROOT
+from tests.conftest import ROOT, python
 
 TEXT = (ROOT / "Dockerfile").read_text("utf-8")
 IGNORED = (ROOT / ".dockerignore").read_text("utf-8").split()
@@ -75,6 +73,7 @@ def test_packages_come_with_hashes_and_the_program_runs_as_no_administrator() ->
     assert kinds.index("USER") < kinds.index("COPY")
 
 
+@pytest.mark.release
 def test_the_last_step_installs_the_program_from_the_context_alone(tmp_path: Path) -> None:
     """As the file says it, into a folder of its own, with the packages of this environment."""
     pytest.importorskip("setuptools", reason="the build needs it, as in the lock file")
@@ -82,16 +81,14 @@ def test_the_last_step_installs_the_program_from_the_context_alone(tmp_path: Pat
     (install,) = last
     assert install[:2] == ["pip", "install"]
     place, target = context(tmp_path / "app"), tmp_path / "installed"
-    command = [sys.executable, "-m", *install, "--quiet", "--target", str(target)]
-    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
+    done = python("-m", *install, "--quiet", "--target", target, folder=place, PYTHONPATH="")
     assert done.returncode == 0, done.stderr
     (entry,) = [step.text for step in STEPS if step.kind == "ENTRYPOINT"]
     (default,) = [step.text for step in STEPS if step.kind == "CMD"]
     program, *arguments = [*re.findall(r'"([^"]+)"', entry), *re.findall(r'"([^"]+)"', default)]
     assert program == "python"
-    told, where = ([*arguments], ["-c", "import ftl_lightning; print(ftl_lightning.__file__)"])
-    for words, expected in ((told, "usage: "), (where, str(target))):
-        run = [sys.executable, *words]
-        found = subprocess.run(run, cwd=tmp_path, env={"PYTHONPATH": str(target)}, capture_output=True, text=True, check=False)
+    where = ["-c", "import ftl_lightning; print(ftl_lightning.__file__)"]
+    for words, expected in ((arguments, "usage: "), (where, str(target))):
+        found = python(*words, folder=tmp_path, PYTHONPATH=str(target))
         assert found.returncode == 0, found.stderr
         assert found.stdout.startswith(expected)

@@ -120,25 +120,16 @@ def test_the_pages_are_found() -> None:
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_relative_link_points_to_something(path: Path) -> None:
-    missing = [
-        target for target in targets(path.read_text(encoding="utf-8")) if not (path.parent / target.partition("#")[0]).exists()
-    ]
-    assert missing == []
-
-
-@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_command_names_a_verb_and_files_that_exist(path: Path) -> None:
-    for verb, files in commands(path.read_text(encoding="utf-8")):
+def test_every_link_command_and_benchmark_of_a_page_is_there(path: Path) -> None:
+    """Relative links point to something, commands name a verb and files that exist, and benchmarks are files."""
+    text = path.read_text(encoding="utf-8")
+    assert [target for target in targets(text) if not (path.parent / target.partition("#")[0]).exists()] == []
+    for verb, files in commands(text):
         assert verb in TRAINER_VERBS | COMMANDS, verb
         for name in files:
             found = (any(folder.glob(PLACEHOLDER.sub("*", name))) for folder in FOLDERS)
             assert any(found), f"{verb} --config {name}"
-
-
-@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_benchmark_that_is_named_is_there(path: Path) -> None:
-    named = set(re.findall(r"benchmarks/[\w/]+\.py", path.read_text(encoding="utf-8")))
+    named = set(re.findall(r"benchmarks/[\w/]+\.py", text))
     assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
 
 
@@ -181,18 +172,28 @@ def test_pages_tell_the_numbers_of_strokes() -> None:
     assert told in (ROOT / "docs" / "experiments-own-data.md").read_text(encoding="utf-8")
 
 
-def test_the_tables_of_the_table_top_are_what_the_results_say(tmp_path: Path) -> None:
-    tables = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_table.py"))
-    tables["main"]([f"--results={ROOT / 'results'}", f"--out={tmp_path}"])
-    for name in ("tabletop.md", "tabletop_wide.md"):
+@pytest.mark.parametrize(
+    ("script", "results", "out", "names"),
+    [
+        ("tabletop_table.py", "results", ".", ("tabletop.md", "tabletop_wide.md")),
+        ("mocap_table.py", "results/mocap.csv", "mocap.md", ("mocap.md",)),
+    ],
+)
+def test_the_tables_of_the_table_top_and_of_human_motion_are_what_the_results_say(
+    script: str, results: str, out: str, names: tuple[str, ...], tmp_path: Path
+) -> None:
+    runpy.run_path(str(ROOT / "benchmarks" / script))["main"]([f"--results={ROOT / results}", f"--out={tmp_path / out}"])
+    for name in names:
         kept = (ROOT / "results" / name).read_text(encoding="utf-8")
-        assert (tmp_path / name).read_text(encoding="utf-8") == kept, "run benchmarks/tabletop_table.py"
+        assert (tmp_path / name).read_text(encoding="utf-8") == kept, f"run benchmarks/{script}"
 
 
-def test_the_table_of_settings_is_what_the_configurations_say() -> None:
-    settings = runpy.run_path(str(ROOT / "docs" / "settings.py"))
-    page = settings["PAGE"].read_text(encoding="utf-8")
-    assert settings["written"](page) == page, "run docs/settings.py"
+@pytest.mark.parametrize("name", ["settings", "paper"])
+def test_a_generated_page_is_what_its_command_writes(name: str) -> None:
+    """The table of settings by the configurations, and the page of the paper by the results."""
+    made = runpy.run_path(str(ROOT / "docs" / f"{name}.py"))
+    page = (made["PAGE"] if name == "settings" else ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    assert (made["written"](page) if name == "settings" else made["page"]()) == page, f"run docs/{name}.py"
 
 
 def test_the_table_of_starts_is_what_was_measured() -> None:
@@ -201,11 +202,6 @@ def test_the_table_of_starts_is_what_was_measured() -> None:
     found = json.loads((ROOT / "results" / "imports.json").read_text(encoding="utf-8"))
     assert imports["written"](page, found) == page, "run benchmarks/imports.py --page"
     assert set(found["help"]) <= TRAINER_VERBS.keys() | COMMANDS.keys(), "run benchmarks/imports.py"
-
-
-def test_the_page_of_the_paper_is_what_the_results_say() -> None:
-    page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
-    assert runpy.run_path(str(ROOT / "docs" / "paper.py"))["page"]() == page, "run docs/paper.py"
 
 
 ONLY_PRINTED = {"0.32": "Section 4.1", "people 73.3 %": "Table 1", "people 26.7 %": "Table 1", "people 0 %": "Table 1"}
@@ -237,13 +233,6 @@ def test_the_page_of_the_paper_says_what_has_no_rows() -> None:
         paper["shown"](rows, {"method": "BC", "metric": "accuracy"}, "BC")
     with pytest.raises(SystemExit, match="all: expected rows of one setting, found"):
         paper["shown"](rows, {"method": "FTL-IGM", "metric": "closed loop success"}, "all")
-
-
-def test_the_tables_of_human_motion_are_what_the_results_say(tmp_path: Path) -> None:
-    tables = runpy.run_path(str(ROOT / "benchmarks" / "mocap_table.py"))
-    tables["main"]([f"--results={ROOT / 'results' / 'mocap.csv'}", f"--out={tmp_path / 'found.md'}"])
-    kept = (ROOT / "results" / "mocap.md").read_text(encoding="utf-8")
-    assert (tmp_path / "found.md").read_text(encoding="utf-8") == kept, "run benchmarks/mocap_table.py"
 
 
 def test_the_notes_tell_how_well_the_judge_of_motion_recognises_unseen_people() -> None:

@@ -1,15 +1,13 @@
 """What starting costs: large packages that a verb does not need are not imported by it. Times are in ``benchmarks/imports.py``."""
 
+import importlib.util
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from ftl_lightning.cli import COMMANDS
-from tests.conftest import ROOT
+from tests.conftest import python
 
 FORBIDDEN = {
     "lightning": "trains",
@@ -39,35 +37,7 @@ VERBS = [
     ["sample", "--pretrained", "agent", "--compose", "go to bowl", *FEW],
 ]
 """In one process one after another: what a verb imports stays imported."""
-PROGRAM = f"""
-import json, sys
-FORBIDDEN = {list(FORBIDDEN)}
-def found(name):
-    print(json.dumps([name, [one for one in FORBIDDEN if one in sys.modules]]), file=sys.stderr)
-"""
-
-
-def imported(program: str, folder: Path) -> dict[str, list[str]]:
-    """Which of the packages were there at each point that a program marks by ``found(NAME)``."""
-    command = [sys.executable, "-c", PROGRAM + program]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return dict(json.loads(line) for line in done.stderr.splitlines() if line.startswith("["))
-
-
-def run(verbs: list[list[str]]) -> str:
-    """A program that runs verbs one after another, and marks what was imported after each by its words."""
-    return f"from ftl_lightning.cli import main\nfor verb in {verbs}:\n    assert main(verb) == 0, verb\n    found(' '.join(verb))"
-
-
-def test_verbs_that_learn_without_a_trainer_import_none_of_its_packages(tmp_path: Path) -> None:
-    assert imported(run(VERBS), tmp_path) == {" ".join(verb): [] for verb in VERBS}
-
-
-def test_the_learner_in_python_and_the_page_import_none_of_its_packages(tmp_path: Path) -> None:
-    pytest.importorskip("starlette", reason="the extra play serves the page")
-    program = """
+PYTHON = """
 from ftl_lightning import FewShot
 model = FewShot.from_pretrained("strokes")
 found("load")
@@ -83,15 +53,49 @@ found("mix")
 for name in ("tabletop", "mocap"):
     FewShot.from_pretrained(name)
     found(name)
+"""
+"""The learner in Python."""
+PAGE = """
 from ftl_lightning.play.application import Desk, playing
 from ftl_lightning.play.server import serve
 from ftl_lightning.play.workspace import Workspace
 Workspace("strokes", None).work()
 found("play")
 """
-    points = imported(program, tmp_path)
-    assert set(points) == {"load", "sample", "learn", "mix", "tabletop", "mocap", "play"}
-    assert not any(points.values()), points
+REPORTS = """
+import ftl_lightning.reporting.report, ftl_lightning.reporting.html.page, ftl_lightning.study.report
+found("report")
+"""
+PROGRAM = f"""
+import json, sys
+FORBIDDEN = {list(FORBIDDEN)}
+def found(name):
+    print(json.dumps([name, [one for one in FORBIDDEN if one in sys.modules]]), file=sys.stderr)
+"""
+
+
+def imported(program: str, folder: Path) -> dict[str, list[str]]:
+    """Which of the packages were there at each point that a program marks by ``found(NAME)``."""
+    done = python("-c", PROGRAM + program, folder=folder)
+    assert done.returncode == 0, done.stderr
+    return dict(json.loads(line) for line in done.stderr.splitlines() if line.startswith("["))
+
+
+def run(verbs: list[list[str]]) -> str:
+    """A program that runs verbs one after another, and marks what was imported after each by its words."""
+    return (
+        f"from ftl_lightning.cli import main\nfor verb in {verbs}:\n    assert main(verb) == 0, verb\n    found(' '.join(verb))\n"
+    )
+
+
+@pytest.mark.slow
+def test_what_learns_without_a_trainer_imports_none_of_its_packages(tmp_path: Path) -> None:
+    """Verbs, the learner in Python and the page in one process, and then what reports and studies import besides."""
+    page = PAGE if importlib.util.find_spec("starlette") else ""
+    points = imported(run(VERBS) + PYTHON + page + REPORTS, tmp_path)
+    assert set(points.pop("report")) <= {"scipy", "pandas", "matplotlib", "rich"}
+    expected = [*map(" ".join, VERBS), "load", "sample", "learn", "mix", "tabletop", "mocap", *["play"][: bool(page)]]
+    assert points == {name: [] for name in expected}
 
 
 def test_help_of_these_verbs_does_not_even_import_torch(tmp_path: Path) -> None:
@@ -100,13 +104,9 @@ def test_help_of_these_verbs_does_not_even_import_torch(tmp_path: Path) -> None:
     assert imported(more + run(verbs), tmp_path) == {" ".join(verb): [] for verb in verbs}
 
 
-def test_reports_and_studies_import_no_trainer(tmp_path: Path) -> None:
-    modules = ("reporting.report", "reporting.html.page", "study.report")
-    program = "".join(f"import ftl_lightning.{module}\n" for module in modules) + "found('report')"
-    assert set(imported(program, tmp_path)["report"]) <= {"scipy", "pandas", "matplotlib", "rich"}
-
-
-def test_what_is_imported_is_not_searched_for_garbage(tmp_path: Path) -> None:
+def test_what_is_imported_is_not_searched_for_garbage_and_what_is_forbidden_is_found(tmp_path: Path) -> None:
+    for name in ("scipy", "sympy"):
+        (tmp_path / f"{name}.py").touch()
     program = """
 import gc
 from ftl_lightning.starting import imported
@@ -115,10 +115,8 @@ assert imported("decimal") is imported("decimal") and gc.isenabled() and gc.get_
 gc.disable()
 imported("fractions")
 assert not gc.isenabled(), "it was off before"
-found("end")
+found("neither")
+import scipy, sympy
+found("both")
 """
-    assert "end" in imported(program, tmp_path)
-
-
-def test_what_is_forbidden_is_found_where_it_is_imported(tmp_path: Path) -> None:
-    assert imported("import scipy, sympy\nfound('both')", tmp_path) == {"both": ["sympy", "scipy"]}
+    assert imported(program, tmp_path) == {"neither": [], "both": ["sympy", "scipy"]}

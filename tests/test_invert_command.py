@@ -1,5 +1,6 @@
 """``invert MODEL FILE``: what ``invert --config`` learns, without a trainer."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +8,18 @@ import pytest
 import torch
 
 from ftl_lightning import Demonstrations, FewShot
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import concatenate
 from ftl_lightning.errors import UserError
-from tests.conftest import CONF, refused
+from tests.conftest import CONF, refused, succeed
+from tests.tiny import QUIET
 
 GOALS = ("square diagonal to triangle", "circle right of square and square above triangle")
+
+
+@pytest.fixture
+def model(tiny_of: Callable[[str], Path]) -> Path:
+    """Folder of a model of scenes."""
+    return tiny_of("object_rearrangement")
 
 
 @pytest.fixture
@@ -23,13 +30,14 @@ def file() -> Path:
     return Path("two.npz")
 
 
-def test_it_writes_the_bytes_that_the_trainer_writes(tiny: Path, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    options = ["--data.steps=5", "--model.form=paper", "--seed_everything=3", "--evaluation.samples=3", "--evaluation.steps=3"]
-    options += ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
-    trained = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
-    assert main([*trained, f"--data.demonstrations={file}", "--model.output=trained", *options]) == 0
+@pytest.mark.slow
+def test_it_writes_the_bytes_that_the_trainer_writes(model: Path, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    options = ["--data.steps=5", "--model.form=paper", "--seed_everything=3", "--evaluation.samples=1", "--evaluation.steps=2"]
+    options += ["--evaluation.figures=0", "--evaluation.diversity=false", *QUIET]
+    trained = ["invert", f"--config={CONF / 'object_rearrangement.yaml'}", f"--model.pretrained={model}"]
+    succeed(*trained, f"--data.demonstrations={file}", "--model.output=trained", *options)
     capfd.readouterr()
-    assert main(["invert", str(tiny), str(file), "--steps=5", "--form=paper", "--seed=3", "--out=own"]) == 0
+    succeed("invert", str(model), str(file), "--steps=5", "--form=paper", "--seed=3", "--out=own")
     told = capfd.readouterr()
     names = sorted(path.name for path in Path("own").iterdir())
     assert len(names) == len(GOALS)
@@ -39,10 +47,10 @@ def test_it_writes_the_bytes_that_the_trainer_writes(tiny: Path, file: Path, cap
     assert "learning 2 concepts: 5 steps" in told.err
 
 
-def test_faults_of_demonstrations_are_noted(tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_faults_of_demonstrations_are_noted(model: Path, capfd: pytest.CaptureFixture[str]) -> None:
     source = FewShot.from_pretrained("object_rearrangement").domain.source(None)
     source.draw(GOALS[0], 5, 0).rows([0, 0, 0, 1]).save("copied.npz")
-    assert main(["invert", str(tiny), "copied.npz", "--steps=1", "--form=paper"]) == 0
+    succeed("invert", str(model), "copied.npz", "--steps=1", "--form=paper")
     assert "note: " in capfd.readouterr().err
 
 
@@ -63,22 +71,18 @@ def test_mistakes_are_one_line(file: Path, arguments: list[str], expected: str, 
     refused(capsys, ["invert", *arguments], expected)
 
 
-def test_in_python_several_concepts_are_learned_together(tiny: Path, file: Path) -> None:
-    model, two = FewShot.from_pretrained(tiny), Demonstrations.load(file)
-    learned = model.learn_all(two, steps=2, form="paper")
+def test_in_python_several_concepts_are_learned_together(file: Path) -> None:
+    learner, two = FewShot.from_pretrained("object_rearrangement"), Demonstrations.load(file)
+    learned = learner.learn_all(two, steps=2, form="paper")
     assert list(learned) == list(GOALS)
     for goal, concept in learned.items():
-        alone = model.learn(two.select(goal), name=goal, steps=2, form="paper")
+        alone = learner.learn(two.select(goal), name=goal, steps=2, form="paper")
         torch.testing.assert_close(concept.embeddings, alone.embeddings, rtol=1e-4, atol=1e-5)
         assert concept.demonstrations is not None
         assert set(concept.demonstrations.concepts) == {goal}
-
-
-def test_what_is_no_demonstrations_with_texts_is_refused(tiny: Path, file: Path) -> None:
-    model, two = FewShot.from_pretrained(tiny), Demonstrations.load(file)
     with pytest.raises(UserError, match="learn_all: expected Demonstrations"):
-        model.learn_all(two.states)  # type: ignore[arg-type]
+        learner.learn_all(two.states)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="demonstrations: expected a text for each"):
-        model.learn_all(replace(two, concepts=("",) * len(two)))
+        learner.learn_all(replace(two, concepts=("",) * len(two)))
     with pytest.raises(UserError, match="learn_all: "):
-        model.learn_all(two, iterations=3)
+        learner.learn_all(two, iterations=3)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 
@@ -35,6 +36,7 @@ def ends_apart(model: FewShot, name: str, text: str) -> float:
     return float((samples[:, -1] - torch.from_numpy(new["states"])[:, -1]).norm(dim=-1).mean())
 
 
+@pytest.mark.slow
 def test_a_concept_is_learned_from_five_pictures_and_followed_in_new_ones(tmp_path: Path) -> None:
     both = [behaviour(text, 100, seed) for seed, text in enumerate(("to the mark", "away from the mark"))]
     np.savez("many.npz", **{name: np.concatenate([one[name] for one in both]) for name in both[0]})

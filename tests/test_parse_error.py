@@ -1,13 +1,15 @@
 """A mistake in a configuration is told with the user's own file and the line that it stands in."""
 
+from argparse import ArgumentError
 from pathlib import Path
 
 import pytest
 
-from ftl_lightning.cli import main
-from ftl_lightning.errors import LONGEST
+from ftl_lightning.errors import LONGEST, UserError
+from ftl_lightning.lightning_cli import parse
+from ftl_lightning.parse_error import one_line
+from tests.conftest import refused
 
-CALLBACKS = "lightning.pytorch.callbacks"
 MISTAKES = [
     ("trainer:\n  max_stepz: 3", 3, "'trainer.max_stepz' is not accepted"),
     ("trainer:\n  max_steps: abc", 3, "key 'trainer.max_steps': expected int, found abc"),
@@ -27,28 +29,37 @@ MISTAKES = [
 ]
 
 
+def line_of(verb: str, *arguments: str) -> str:
+    """The one short line that the program prints of what the parser of a verb refuses."""
+    with pytest.raises((ArgumentError, UserError)) as error:
+        parse(verb, list(arguments))
+    told = one_line(str(error.value), [verb, *arguments])
+    assert "\n" not in told
+    assert len(f"error: {told}") <= LONGEST
+    return told
+
+
 @pytest.mark.parametrize(("text", "line", "expected"), MISTAKES, ids=lambda value: str(value)[:40])
 def test_a_mistake_in_a_file_of_one_s_own_is_told_with_its_line(
     text: str, line: int, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Path("own.yaml").write_text(f"defaults: [conf/object_rearrangement.yaml]\n{text}\n")
-    assert main(["fit", "--config=own.yaml"]) == 2
-    (told,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
-    assert told.startswith(f"error: own.yaml: line {line}: ")
-    assert expected in told
-    assert "conf/verb" not in told
-    assert len(told) <= LONGEST
+    Path("data.yaml").write_text(
+        "data: {class_path: ftl_lightning.domains.object_rearrangement.datamodule.ObjectRearrangementData}\n"
+    )
+    Path("own.yaml").write_text(f"defaults: [conf/method/ftl_igm.yaml, data.yaml]\n{text}\n")
+    refused(capsys, ["fit", "--config=own.yaml"], f"error: own.yaml: line {line}: ", expected)
 
 
-def test_a_mistake_in_a_file_that_another_builds_on_is_told_with_that_file(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_is_told_with_the_file_or_the_section_that_it_stands_in_and_of_the_command_line_with_none(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     Path("base.yaml").write_text("defaults: [conf/object_rearrangement.yaml]\n\ntrainer: {max_stepz: 3}\n")
     Path("own.yaml").write_text("defaults: [base.yaml]\ntrainer: {max_steps: 3}\n")
-    assert main(["fit", "--config=own.yaml"]) == 2
-    assert "error: base.yaml: line 3: " in capsys.readouterr().err
-
-
-def test_a_mistake_on_the_command_line_names_no_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "conf/verb" not in refused(capsys, ["fit", "--config=own.yaml"], "error: base.yaml: line 3: ")
+    sections = "invert:\n  trainer: {max_stepz: 1}\nfit:\n  trainer: {max_stepz: 2}\n"
+    Path("own.yaml").write_text(f"defaults: [conf/agent.yaml]\n{sections}")
+    for verb, number in (("fit", 5), ("invert", 3)):
+        assert line_of(verb, "--config=own.yaml").startswith(f"own.yaml: line {number}: ")
     Path("own.yaml").write_text("defaults: [conf/object_rearrangement.yaml]\ntrainer: {max_steps: 3}\n")
-    assert main(["fit", "--config=own.yaml", "--trainer.max_steps=abc"]) == 2
-    told = capsys.readouterr().err
-    assert "error: key 'trainer.max_steps': expected int, found abc; see --help" in told
+    told = line_of("fit", "--config=own.yaml", "--trainer.max_steps=abc")
+    assert told == "key 'trainer.max_steps': expected int, found abc; see --help"

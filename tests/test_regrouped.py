@@ -28,31 +28,10 @@ trainer: {max_epochs: 1, logger: false, enable_checkpointing: false, enable_prog
 OLD = f"""
 model:
   class_path: ftl_lightning.learning.inversion_module.InversionModule
-  init_args:
-    pretrained: object_rearrangement
-    components: 3
-    omega: learned
-    initial_omega: 0.7
-    off_span: 0.5
-    initial_spread: 0.2
-    start: concepts
-    restarts: 2
-    screening: 3
-    learning_rate: 0.02
-    weight_learning_rate: 0.004
-    samples: 5
-    mode_samples: 6
-    modes: each
-    tolerance: null
-    precision: 32-true
-    knots: 1
-    guidance_scale: 1.5
-    adapter: 0
-    adapter_learning_rate: 0.01
-    adapter_scope: all
-    loss: v
-    timestep_power: 2.0
-    training_omega: 0.9
+  init_args: {{pretrained: object_rearrangement, components: 3, omega: learned, initial_omega: 0.7, off_span: 0.5,
+    initial_spread: 0.2, start: concepts, restarts: 2, screening: 3, learning_rate: 0.02, weight_learning_rate: 0.004, samples: 5,
+    mode_samples: 6, modes: each, tolerance: null, precision: 32-true, knots: 1, guidance_scale: 1.5, adapter: 0,
+    adapter_learning_rate: 0.01, adapter_scope: all, loss: v, timestep_power: 2.0, training_omega: 0.9}}
 {BASE}"""
 NEW = f"""
 model:
@@ -68,6 +47,8 @@ model:
     budget: {{samples: 5, restarts: 2, screening: 3, learning_rate: 0.02, tolerance: null, precision: 32-true}}
     loss: {{kind: v, timestep_power: 2.0}}
 {BASE}"""
+BUDGET = {"samples": 5, "restarts": 2, "screening": 3, "learning_rate": 0.02, "tolerance": None, "precision": "32-true"}
+"""That of both files."""
 
 
 @pytest.fixture(autouse=True)
@@ -99,6 +80,7 @@ def identity(*options: str) -> str:
     return config_hash(configuration(line.model, line.datamodule, {}, line.trainer))
 
 
+@pytest.mark.slow
 def test_an_older_file_means_the_same_as_a_new_one_and_is_told_in_one_line(capsys: Told) -> None:
     old, new = write("old.yaml", OLD), write("new.yaml", NEW)
     expected = model("invert", f"--config={new}")
@@ -136,14 +118,7 @@ def test_an_own_file_beside_the_class_path_of_another_says_only_what_differs(cap
     write("base.yaml", NEW)
     own = write("own.yaml", "defaults: [base.yaml]\nmodel: {init_args: {samples: 4, learning_rate: 0.5}}\n")
     found = model("invert", f"--config={own}")["init_args"]
-    assert found["budget"] == {
-        "samples": 4,
-        "restarts": 2,
-        "screening": 3,
-        "learning_rate": 0.5,
-        "tolerance": None,
-        "precision": "32-true",
-    }
+    assert found["budget"] == BUDGET | {"samples": 4, "learning_rate": 0.5}
     assert found["weights"]["learning_rate"] == 0.004
     assert notes(capsys) == [
         "note: own.yaml: model.samples is now model.budget.samples, model.learning_rate is now model.budget.learning_rate"
@@ -181,30 +156,45 @@ def test_the_settings_of_a_learner_can_be_in_an_older_file(capsys: Told) -> None
         Tuned.read("wrong.yaml")
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        ["--model.samples", "4", "--model.learning_rate", "0.5"],
-        ["--model.samples=4", "--model.learning_rate=0.5"],
-        ["--model.init_args.samples=4", "--model.init_args.learning_rate=0.5"],
-        ["--model.init_args.samples", "4", "--model.init_args.learning_rate", "0.5"],
-        ["--model.init_args={samples: 4, learning_rate: 0.5}"],
-        ["--config={model: {init_args: {samples: 4, learning_rate: 0.5}}}"],
-        ["--config", "{model: {init_args: {samples: 4, learning_rate: 0.5}}}"],
-    ],
-    ids=str,
-)
-def test_older_options_of_an_inversion_mean_the_same_as_new_ones_in_every_spelling(given: Sequence[str], capsys: Told) -> None:
-    config = write("new.yaml", NEW)
-    options = ["--config", config, "--model.budget.samples=4", "--model.budget.learning_rate=0.5"]
-    expected = model("invert", *options)
-    assert notes(capsys) == []
-    assert model("invert", "--config", config, *given) == expected
+SPELLINGS = [
+    ["--model.samples", "4", "--model.learning_rate", "0.5"],
+    ["--model.samples=4", "--model.learning_rate=0.5"],
+    ["--model.init_args.samples=4", "--model.init_args.learning_rate=0.5"],
+    ["--model.init_args.samples", "4", "--model.init_args.learning_rate", "0.5"],
+    ["--model.init_args={samples: 4, learning_rate: 0.5}"],
+    ["--config={model: {init_args: {samples: 4, learning_rate: 0.5}}}"],
+    ["--config", "{model: {init_args: {samples: 4, learning_rate: 0.5}}}"],
+]
+TODAY = ["--config=new.yaml", "--model.budget.samples=4", "--model.budget.learning_rate=0.5"]
+
+
+@pytest.fixture(scope="module")
+def of_today(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the spelling of today comes to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("today"))
+        write("new.yaml", NEW)
+        return model("invert", *TODAY)
+
+
+@pytest.mark.parametrize("given", SPELLINGS, ids=str)
+def test_older_options_of_an_inversion_mean_the_same_as_new_ones_in_every_spelling(
+    given: Sequence[str], of_today: dict[str, Any], capsys: Told
+) -> None:
+    write("new.yaml", NEW)
+    assert model("invert", "--config=new.yaml", *given) == of_today
     (told,) = notes(capsys)
     for name in ("samples", "learning_rate"):
         assert f"{name} is now " in told
         assert f"model.budget.{name}" in told
-    assert identity("--config", config, *given) == identity(*options)
+
+
+@pytest.mark.slow
+def test_rows_of_older_options_are_known_as_those_of_new_ones(capsys: Told) -> None:
+    write("new.yaml", NEW)
+    expected = identity(*TODAY)
+    assert notes(capsys) == []
+    assert identity("--config=new.yaml", *SPELLINGS[0]) == expected
 
 
 def test_the_learning_rate_of_a_pretraining_stays_where_it_is(capsys: Told) -> None:
@@ -231,14 +221,7 @@ def test_the_learning_rate_of_a_pretraining_stays_where_it_is(capsys: Told) -> N
 def test_null_in_a_group_is_null_and_the_rest_of_the_group_stays(given: Sequence[str]) -> None:
     config = write("own.yaml", NEW.replace("tolerance: null", "tolerance: 0.1"))
     found = model("invert", "--config", config, "--model.budget.samples=7", *given)["init_args"]
-    assert found["budget"] == {
-        "samples": 7,
-        "restarts": 2,
-        "screening": 3,
-        "learning_rate": 0.02,
-        "tolerance": None,
-        "precision": "32-true",
-    }
+    assert found["budget"] == BUDGET | {"samples": 7}
     assert found["weights"] == {"initial": 0.7, "learning_rate": 0.004, "scale": 1.5, "training": None}
 
 

@@ -110,6 +110,7 @@ def served(pages: list[str]) -> Iterator[str]:
         thread.join()
 
 
+@pytest.mark.browser
 def test_pages_of_results_are_no_wider_than_their_window(tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed")

@@ -3,12 +3,10 @@
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -16,25 +14,42 @@ import pytest
 from ftl_lightning import log_folder
 from ftl_lightning.cli import main
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.results import read_rows
+from ftl_lightning.evaluation.results import add_rows, read_rows
 from ftl_lightning.tensor_file import atomic, write_text
 
-from .conftest import CONF, ROOT, TINY
+from .conftest import CONF, ROOT, TINY, refused, succeed
 
-INVERT = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), "--data.steps=2", "--model.budget.samples=2"]
-QUIET = ["--evaluation.samples=1", "--evaluation.steps=1", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
-
-
-def started(*arguments: str) -> subprocess.Popen[str]:
-    variables = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "ftl_lightning", *arguments]
-    return subprocess.Popen(command, env=variables, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+INVERT = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), "--data.suite=validation", "--data.steps=2"]
+INVERT += ["--evaluation.suites=[validation]", "--model.budget.samples=2", "--evaluation.samples=1", "--evaluation.steps=1"]
+INVERT += ["--evaluation.figures=0", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+FIT = ["fit", "--config", str(CONF / "object_rearrangement.yaml"), *TINY]
 
 
+def together(target: Callable[..., None], count: int, *arguments: Any) -> list[Any]:
+    """What processes put into a queue that call a function at the same instant.
+
+    The function is called with its number, the barrier at which all of them wait for each other, the queue and the arguments.
+    """
+    context = multiprocessing.get_context("fork")
+    barrier, queue = context.Barrier(count), context.Queue()
+    runs = [context.Process(target=target, args=(number, barrier, queue, *arguments), daemon=True) for number in range(count)]
+    for run in runs:
+        run.start()
+    found = [queue.get(timeout=120) for _ in runs]
+    for run in runs:
+        run.join(timeout=120)
+    assert [run.exitcode for run in runs] == [0] * count
+    return found
+
+
+def _invert(number: int, barrier: Any, queue: Any, tiny: Path) -> None:
+    barrier.wait()
+    queue.put(main([*INVERT, f"--model.pretrained={tiny}", f"--seed_everything={number}"]))
+
+
+@pytest.mark.slow
 def test_inversions_that_start_together_have_folders_of_their_own(tiny: Path) -> None:
-    runs = [started(*INVERT, *QUIET, f"--model.pretrained={tiny}", f"--seed_everything={seed}") for seed in range(3)]
-    told = [run.communicate(timeout=300)[0] for run in runs]
-    assert [run.returncode for run in runs] == [0] * 3, told
+    assert together(_invert, 3, tiny) == [0] * 3
     folders = sorted(Path("logs/object_rearrangement").iterdir())
     assert [folder.name for folder in folders] == ["invert", "invert_1", "invert_2"]
     assert {tuple(read_rows(folder / "results.csv")["seed"].unique()) for folder in folders} == {(0,), (1,), (2,)}
@@ -42,27 +57,21 @@ def test_inversions_that_start_together_have_folders_of_their_own(tiny: Path) ->
     assert not list(Path("logs").rglob(log_folder.LOCK))
 
 
-def _claim_when_told(folder: Path, new: bool, go: object, found: object) -> None:
+def _claim(number: int, barrier: Any, queue: Any, folder: Path, new: bool) -> None:
     with log_folder.run():
-        go.wait()  # type: ignore[attr-defined]
+        barrier.wait()
         name = log_folder.claim(folder, "run", new)
-        (folder / name / f"{os.getpid()}").touch()
-        found.put(name)  # type: ignore[attr-defined]
-        time.sleep(1)
+        (folder / name / str(number)).touch()
+        queue.put(name)
+        barrier.wait()  # every run goes on until all have their folders
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("new", [True, False])
-def test_of_twenty_that_start_at_the_same_instant_none_loses_its_folder(new: bool, tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
-    go, found = context.Barrier(20), context.Queue()
-    runs = [context.Process(target=_claim_when_told, args=(tmp_path / "deep" / "logs", new, go, found)) for _ in range(20)]
-    for run in runs:
-        run.start()
-    names = {found.get(timeout=60) for _ in runs}
-    for run in runs:
-        run.join(timeout=60)
-    assert names == {"run", *(f"run_{number}" for number in range(1, 20))}
-    assert all(len(list(folder.iterdir())) == 1 for folder in (tmp_path / "deep" / "logs").iterdir())
+def test_of_twenty_that_start_at_the_same_instant_none_loses_its_folder(new: bool) -> None:
+    logs = Path("deep/logs").absolute()
+    assert set(together(_claim, 20, logs, new)) == {"run", *(f"run_{number}" for number in range(1, 20))}
+    assert sorted(file.name for file in logs.glob("*/*")) == sorted(map(str, range(20)))
 
 
 def test_a_pretraining_takes_the_folder_of_one_that_ended_and_not_of_one_that_goes_on(tmp_path: Path) -> None:
@@ -84,41 +93,34 @@ def test_what_goes_on_from_a_checkpoint_does_not_join_a_run_in_its_folder(capsys
     with log_folder.run():
         log_folder.hold(folder)
         (folder / "events").touch()
-        assert main(["fit", "--config", str(CONF / "object_rearrangement.yaml"), *TINY, "--ckpt_path=last"]) == 2
-    assert "logs/object_rearrangement/fit: expected the log folder of a run that has ended" in capsys.readouterr().err
+        refused(capsys, [*FIT, "--ckpt_path=last"], f"{folder}: expected the log folder of a run that has ended")
 
 
 def test_a_refused_run_leaves_no_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", "--config", str(CONF / "object_rearrangement.yaml"), *TINY, "--data.batch_size=0"]) == 2
-    assert "data.batch_size" in capsys.readouterr().err
+    refused(capsys, [*FIT, "--data.batch_size=0"], "data.batch_size")
     assert not Path("logs").exists()
 
 
-def test_rows_that_are_added_together_are_all_there(tmp_path: Path) -> None:
-    results = sorted((ROOT / "results").glob("agent*.csv"))[0]
-    table = read_rows(results).iloc[:20]
+def _add(number: int, barrier: Any, queue: Any, rows: pd.DataFrame) -> None:
+    barrier.wait()
+    add_rows(Path("r.csv"), rows.iloc[[number]])
+    queue.put(number)
+
+
+@pytest.mark.slow
+def test_rows_that_are_added_together_are_all_there() -> None:
+    table = read_rows(sorted((ROOT / "results").glob("agent*.csv"))[0]).iloc[:20]
     table.to_csv("all.csv", index=False)
-    context = multiprocessing.get_context("fork")
-    runs = [context.Process(target=_add, args=(tmp_path / "r.csv", table.iloc[[number]])) for number in range(20)]
-    for run in runs:
-        run.start()
-    for run in runs:
-        run.join(timeout=60)
-    assert len(read_rows(tmp_path / "r.csv")) == len(read_rows("all.csv").drop_duplicates())
+    together(_add, 20, table)
+    assert len(read_rows("r.csv")) == len(read_rows("all.csv").drop_duplicates())
 
 
-def _add(path: Path, rows: pd.DataFrame) -> None:
-    from ftl_lightning.evaluation.results import add_rows
-
-    add_rows(path, rows)
-
-
-def _left(write: Callable[[Path], None]) -> list[str]:
-    """Hidden files that a process leaves which is killed in the middle of writing."""
+def _left() -> list[str]:
+    """Hidden files that a process leaves which is killed in the middle of writing ``table.md``."""
     child = os.fork()
     if not child:
         with atomic("table.md") as temporary:
-            write(temporary)
+            temporary.write_text("ha")
             os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     return sorted(path.name for path in Path().iterdir() if path.name.startswith("."))
@@ -126,21 +128,21 @@ def _left(write: Callable[[Path], None]) -> list[str]:
 
 def test_what_a_killed_process_leaves_is_removed_when_the_file_is_written_again() -> None:
     Path("other.md").write_text("whole")
-    assert len(_left(lambda path: path.write_text("ha"))) == 1
+    assert len(_left()) == 1
     write_text("table.md", "whole")
     assert sorted(path.name for path in Path().iterdir()) == ["other.md", "table.md"]
 
 
-def test_a_report_removes_what_a_killed_one_left(shipped: Path) -> None:
-    results = ROOT / "results" / "tabletop.csv"
-    assert main(["report", f"--results={results}", "--out=."]) == 0
+@pytest.mark.slow
+def test_a_report_removes_what_a_killed_one_left() -> None:
+    report = ["report", f"--results={ROOT / 'results' / 'tabletop.csv'}", "--out=."]
+    succeed(*report)
     before = sorted(Path().rglob("*"))
     whole = next(path for path in before if path.suffix == ".md")
-    whole.rename("table.md")
-    (left,) = _left(lambda path: path.write_text("ha"))
+    (left,) = _left()
     Path(left).rename(whole.parent / left.replace("table.md", whole.name))
-    assert main(["report", f"--results={results}", "--out=."]) == 0
-    assert sorted(path for path in Path().rglob("*") if path.name != "table.md") == before
+    succeed(*report)
+    assert sorted(Path().rglob("*")) == before
 
 
 def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
@@ -148,7 +150,7 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
         mine.write_text("mine")
         writer = threading.Thread(target=write_text, args=(tmp_path / "a.md", "theirs"))
         writer.start()
-        writer.join(timeout=30)
+        writer.join()
         assert (tmp_path / "a.md").read_text() == "theirs"
         assert mine.read_text() == "mine"
     assert (tmp_path / "a.md").read_text() == "mine"
@@ -175,11 +177,11 @@ def test_a_folder_that_another_run_made_in_the_meantime_is_never_removed(tmp_pat
     monkeypatch.setattr(log_folder, "expect_writable_folder", lambda path: None)
     monkeypatch.setattr(Path, "exists", filled)
 
-    def refused() -> None:
+    def held() -> None:
         with log_folder.run():
             log_folder.hold(folder)
             raise UserError("refused")
 
     with pytest.raises(UserError, match="refused"):
-        refused()
+        held()
     assert [path.name for path in folder.iterdir()] == ["results.csv"]

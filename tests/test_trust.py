@@ -1,11 +1,9 @@
 """Code runs when the person at the keyboard names it, and never because a file does: planted modules tell on themselves."""
 
 import json
-import os
-import subprocess
 import sys
-import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import nbformat
@@ -16,12 +14,16 @@ from nbclient import NotebookClient
 
 from ftl_lightning import trust
 from ftl_lightning.cli import main
+from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import LONGEST, UserError
+from ftl_lightning.domains.tabletop.tasks import PUSH
+from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import COLUMNS
 from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.pretrained import load_model
 
-from .conftest import CONF, ROOT
+from .conftest import CONF, ROOT, python
 
 EVIL = """
 from pathlib import Path
@@ -74,22 +76,21 @@ def ran() -> bool:
     return any(Path().rglob("ran"))
 
 
-def program(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in the current folder; the package is found where it is installed."""
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
-    paths = os.pathsep.join(filter(None, (environment.pop("PYTHONPATH", ""), str(ROOT))))
-    return subprocess.run(
-        command, env=variables | {"PYTHONPATH": paths} | environment, capture_output=True, text=True, check=False, timeout=100
-    )
+@pytest.fixture
+def _found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules in the current folder are found, as in a notebook."""
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
 
 
-def refused(done: subprocess.CompletedProcess[str], *expected: str) -> None:
-    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert done.returncode == 2, done.stderr
-    assert len(lines) == 1
-    assert "Traceback" not in done.stderr
-    for text in expected:
-        assert text in lines[0]
+found = pytest.mark.usefixtures("_found")
+
+
+def refused(capsys: pytest.CaptureFixture[str], arguments: Sequence[str], *expected: str) -> None:
+    """Run a verb in this process and expect one line that says something, and no code of others."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert all(text in line for text in expected), line
     assert not ran()
 
 
@@ -97,45 +98,58 @@ def refused(done: subprocess.CompletedProcess[str], *expected: str) -> None:
 
 
 @pytest.mark.parametrize("domain", [DOMAIN, "inside.evil:DOMAIN"])
-def test_a_model_s_folder_that_names_code_is_refused_by_the_module(domain: str) -> None:
+@pytest.mark.parametrize("first", ["", ".", "here", "inside"])
+def test_a_model_s_folder_that_names_code_is_refused_with_a_path_of_python(
+    domain: str, first: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python begins its path with nothing or the folder, and ``PYTHONPATH`` adds to it."""
+    entry = {"here": str(Path.cwd()), "inside": str(Path("inside").absolute())}.get(first, first)
+    monkeypatch.setattr(sys, "path", [entry, *sys.path])
+    monkeypatch.setenv("PYTHONPATH", entry)
     model(domain)
-    refused(program(sys.executable, "-m", "ftl_lightning", *SAMPLE), "model/config.json", domain, "--trust", NOT_IMPORTED)
+    refused(capsys, SAMPLE, "model/config.json", domain, "--trust", NOT_IMPORTED)
 
 
-def test_a_model_s_folder_that_names_code_is_refused_by_the_console_script() -> None:
-    script = Path(sys.executable).with_name("ftl-lightning")
-    refused(program(str(script), *SAMPLE), "model/config.json", DOMAIN, NOT_IMPORTED)
-
-
-@pytest.mark.parametrize("path", ["", ".", "inside"])
-def test_a_model_s_folder_that_names_code_is_refused_with_a_path_of_python(path: str) -> None:
-    done = program(sys.executable, "-m", "ftl_lightning", *SAMPLE, PYTHONPATH=path and str(Path(path).absolute()))
-    refused(done, "model/config.json", DOMAIN, NOT_IMPORTED)
-
-
-def test_a_model_s_folder_that_names_code_is_refused_by_everything_in_one_python() -> None:
-    calls = [SAMPLE, INVERT, ["explain", "--pretrained=model", "--concept=c.safetensors"]]
-    concept()
-    code = f"""
-    from ftl_lightning import FewShot
-    from ftl_lightning.cli import main
-    from ftl_lightning.errors import UserError
-    from ftl_lightning.learning.pretrained import load_model
-    assert [main(call) for call in {calls!r}] == [2] * {len(calls)}
-    for load in (FewShot.from_pretrained, load_model):
-        try:
-            load("model")
-        except UserError as error:
-            assert "domain='evil:DOMAIN'" in str(error), error
-        else:
-            raise AssertionError("loaded")
-    """
-    done = program(sys.executable, "-c", textwrap.dedent(code))
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count(NOT_IMPORTED) == len(calls)
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["-m, here", "-m, inside", "script"])
+def test_a_model_s_folder_that_names_code_is_refused_by_the_program(start: str) -> None:
+    program = [Path(sys.executable).with_name("ftl-lightning")] if start == "script" else ["-m", "ftl_lightning"]
+    first = f"{Path('inside').absolute() if start.endswith('inside') else Path.cwd()}:" if start != "script" else ""
+    done = python(*program, *SAMPLE, PYTHONPATH=f"{first}{ROOT}")
+    assert done.returncode == 2, done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error: "))
+    for text in ("model/config.json", DOMAIN, "--trust", NOT_IMPORTED):
+        assert text in line
+    assert "Traceback" not in done.stderr
     assert not ran()
 
 
+def refused_by_everything() -> None:
+    """Whatever reads a model's folder refuses the one that asks for code."""
+    concept()
+    for call in (SAMPLE, INVERT, ["explain", "--pretrained=model", "--concept=c.safetensors"]):
+        assert main(call) == 2
+    for load in (FewShot.from_pretrained, load_model):
+        with pytest.raises(UserError, match=f"domain='{DOMAIN}'"):
+            load("model")
+    assert not ran()
+
+
+@found
+def test_a_model_s_folder_that_names_code_is_refused_by_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    refused_by_everything()
+    assert capsys.readouterr().err.count(NOT_IMPORTED) == 3
+
+
+@pytest.mark.slow
+def test_a_model_s_folder_that_names_code_is_refused_by_everything_in_one_python() -> None:
+    done = python("-c", "from tests.test_trust import refused_by_everything; refused_by_everything()")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count(NOT_IMPORTED) == 3
+    assert not ran()
+
+
+@pytest.mark.notebook
 def test_a_model_s_folder_that_names_code_is_refused_in_a_notebook_beside_it() -> None:
     cells = ["from ftl_lightning import FewShot", "FewShot.from_pretrained('model')"]
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
@@ -162,14 +176,11 @@ def test_a_model_s_folder_that_names_code_is_refused_in_a_notebook_beside_it() -
 def test_a_model_s_folder_names_no_module_at_all(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     model(name)
     before = set(sys.modules)
-    assert main(SAMPLE) == 2
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert "model/config.json" in line
-    assert len(line) <= LONGEST
+    refused(capsys, SAMPLE, "model/config.json")
     assert not {"evil", name.partition(":")[0]} & (set(sys.modules) - before)
-    assert not ran()
 
 
+@found
 @pytest.mark.parametrize(
     "changes",
     [
@@ -191,13 +202,7 @@ def test_a_model_s_folder_names_no_module_at_all(name: str, capsys: pytest.Captu
 )
 def test_nothing_in_a_model_s_folder_is_imported(changes: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
     model("driving", **changes)
-    sys.path.insert(0, "")
-    try:
-        assert main(SAMPLE) == 2
-    finally:
-        sys.path.remove("")
-    assert "Traceback" not in capsys.readouterr().err
-    assert not ran()
+    refused(capsys, SAMPLE)
 
 
 def test_the_record_of_training_in_a_model_s_folder_is_no_code() -> None:
@@ -218,6 +223,7 @@ def concept() -> None:
     safetensors.torch.save_file(tensors, "c.safetensors", {"ftl_lightning": json.dumps(header)})
 
 
+@found
 @pytest.mark.parametrize("place", ["logs", "pretrained"])
 @pytest.mark.parametrize("form", [1, 2])
 def test_folders_that_a_search_finds_are_read_as_data(place: str, form: int, capsys: pytest.CaptureFixture[str]) -> None:
@@ -225,71 +231,69 @@ def test_folders_that_a_search_finds_are_read_as_data(place: str, form: int, cap
     model(DOMAIN, format=form, initial_state_dim=3)
     Path(place).mkdir()
     Path("model").rename(f"{place}/a")
-    sys.path.insert(0, "")
-    try:
-        # The planted folder has the hash of the model, which ships, too, and is found.
-        assert main(["explain", "--concept=c.safetensors"]) == 0, capsys.readouterr().err
-    finally:
-        sys.path.remove("")
+    # The planted folder has the hash of the model, which ships, too, and is found.
+    assert main(["explain", "--concept=c.safetensors"]) == 0, capsys.readouterr().err
     assert "nearest" in capsys.readouterr().out
     assert not ran()
 
 
+@found
 @pytest.mark.parametrize("name", [DOMAIN, "inside.evil:DOMAIN", "evil"])
 def test_rows_name_no_code(name: str) -> None:
-    cells = [
-        name,
-        "paper",
-        "go",
-        "evil.Called",
-        "evil:make",
-        "evil:make",
-        "method",
-        "1",
-        "1.2",
-        "5",
-        "0",
-        "10",
-        "evil:make",
-        "0.5",
-        "",
-        "a",
-        "1",
-    ]
-    Path("r.csv").write_text("\n".join((",".join(COLUMNS), ",".join(cells))))
-    sys.path.insert(0, "")
-    try:
-        main(["report", "--results=r.csv", "--out=out"])
-    finally:
-        sys.path.remove("")
+    cells = f"{name},paper,go,evil.Called,evil:make,evil:make,method,1,1.2,5,0,10,evil:make,0.5,,a,1"
+    Path("r.csv").write_text("\n".join((",".join(COLUMNS), cells)))
+    main(["report", "--results=r.csv", "--out=out"])
     assert not ran()
 
 
-def test_a_card_of_a_package_in_the_current_folder_installs_nothing() -> None:
+def card() -> None:
     Path("evil-1.0.dist-info").mkdir()
     Path("evil-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: evil\nVersion: 1.0\n")
     Path("evil-1.0.dist-info/entry_points.txt").write_text(OFFERED)
     model("evil")
-    refused(program(sys.executable, "-m", "ftl_lightning", *SAMPLE), "domain: expected one of", "found 'evil'")
-    done = program(sys.executable, "-c", "from ftl_lightning import FewShot; FewShot.from_pretrained('model')")
-    assert "found 'evil'" in done.stderr
+
+
+@found
+def test_a_card_of_a_package_in_the_current_folder_installs_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    card()
+    refused(capsys, SAMPLE, "domain: expected one of", "found 'evil'")
+    with pytest.raises(UserError, match="found 'evil'"):
+        FewShot.from_pretrained("model")
+    assert not [point for point in trust.entry_points("ftl_lightning.domains") if point.name == "evil"]
+
+
+@pytest.mark.slow
+def test_a_card_of_a_package_in_the_current_folder_installs_nothing_in_a_new_python() -> None:
+    card()
+    code = f"from ftl_lightning.cli import main; assert main({SAMPLE}) == 2; "
+    done = python("-c", code + "from ftl_lightning import FewShot; FewShot.from_pretrained('model')")
+    assert "domain: expected one of" in done.stderr
+    assert done.stderr.count("found 'evil'") >= 2
     assert not ran()
 
 
-def test_a_module_named_as_one_of_a_library_s_does_not_run_in_its_place() -> None:
-    for name in ("typing", "torch", "pandas", "rich", "matplotlib", "safetensors", "omegaconf", "transformers", "jsonargparse"):
+@pytest.mark.parametrize(
+    ("names", "arguments"),
+    [
+        (("typing", "rich", "omegaconf", "jsonargparse"), ["--version"]),
+        pytest.param(
+            ("typing", "torch", "pandas", "rich", "matplotlib", "safetensors", "omegaconf", "transformers", "jsonargparse"),
+            [*SAMPLE, "--figure=a.png"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ("multiprocessing", "pickle", "torch", "pybullet"),
+            ["generate", "tabletop", f"--task={PUSH}", "--count=2", "--workers=2", "--out=d.safetensors"],
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["at once", "sampling", "worker processes"],
+)
+def test_a_module_named_as_one_of_a_library_s_does_not_run_in_its_place(names: Sequence[str], arguments: Sequence[str]) -> None:
+    for name in names:
         Path(f"{name}.py").write_text(SHADOW)
     model("driving")
-    done = program(sys.executable, "-m", "ftl_lightning", *SAMPLE, "--figure=a.png")
-    assert done.returncode == 0, done.stderr
-    assert not ran()
-
-
-def test_worker_processes_do_not_look_in_the_current_folder() -> None:
-    for name in ("multiprocessing", "pickle", "torch", "highway_env"):
-        Path(f"{name}.py").write_text(SHADOW)
-    options = ["--task=merge", "--count=2", "--workers=2", "--out=d.safetensors"]
-    done = program(sys.executable, "-m", "ftl_lightning", "generate", "driving", *options)
+    done = python("-m", "ftl_lightning", *arguments)
     assert done.returncode == 0, done.stderr
     assert not ran()
 
@@ -325,26 +329,25 @@ CONFIGURED = [
 ]
 
 
+@found
 @pytest.mark.parametrize(("text", "expected"), CONFIGURED, ids=lambda value: value[:60])
-@pytest.mark.parametrize("found", [True, False], ids=["found in the current folder", "as installed"])
-def test_a_configuration_that_names_code_is_refused(
-    text: str, expected: str, found: bool, capsys: pytest.CaptureFixture[str]
+def test_a_configuration_that_names_code_is_refused(text: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("c.yaml").write_text(text)
+    refused(capsys, [*FIT, "--config=c.yaml"], expected)
+
+
+REST = [pytest.param(*case, marks=pytest.mark.fuzz) for case in CONFIGURED[3:-4]]
+
+
+@pytest.mark.parametrize(("text", "expected"), [*CONFIGURED[:3], *CONFIGURED[-4:], *REST], ids=lambda value: value[:60])
+def test_a_configuration_that_names_code_which_is_not_found_is_refused(
+    text: str, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("c.yaml").write_text(text)
-    if found:
-        sys.path.insert(0, "")
-    try:
-        assert main([*FIT, "--config=c.yaml"]) == 2
-    finally:
-        if found:
-            sys.path.remove("")
-    told = capsys.readouterr().err
-    assert "Traceback" not in told
-    line = next(line for line in told.splitlines() if line.startswith("error: "))
-    assert expected in line
-    assert not ran()
+    refused(capsys, [*FIT, "--config=c.yaml"], expected)
 
 
+@found
 @pytest.mark.parametrize(
     "stage",
     [
@@ -361,13 +364,7 @@ def test_the_plan_of_an_ablation_names_no_code(stage: str, capsys: pytest.Captur
         f"defaults: [{CONF / 'object_rearrangement.yaml'}]\ntrainer: {{callbacks: [{{class_path: evil.Called}}]}}"
     )
     Path("a.yaml").write_text(f"stages: [{stage}]\nresults: r.csv")
-    sys.path.insert(0, "")
-    try:
-        assert main(["ablate", "--config=a.yaml"]) == 2
-    finally:
-        sys.path.remove("")
-    assert "error: " in capsys.readouterr().err
-    assert not ran()
+    refused(capsys, ["ablate", "--config=a.yaml"])
 
 
 def test_an_installed_class_that_is_no_domain_s_is_taken_from_a_configuration() -> None:
@@ -375,12 +372,10 @@ def test_an_installed_class_that_is_no_domain_s_is_taken_from_a_configuration() 
     assert main([*FIT, "--config=c.yaml", "--print_config"]) == 0
 
 
-def test_a_module_on_the_path_that_is_not_the_current_folder_is_taken_from_a_configuration() -> None:
+def test_a_module_on_the_path_that_is_not_the_current_folder_is_taken_from_a_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("c.yaml").write_text("trainer: {callbacks: [{class_path: evil.Called}]}")
-    done = program(
-        sys.executable, "-m", "ftl_lightning", *FIT, "--config=c.yaml", "--print_config", PYTHONPATH=str(Path("inside").absolute())
-    )
-    assert done.returncode == 0, done.stderr
+    monkeypatch.setattr(sys, "path", [str(Path("inside").absolute()), *sys.path])
+    assert main([*FIT, "--config=c.yaml", "--print_config"]) == 0
     assert Path("inside/ran").exists()
     assert not Path("ran").exists()
 
@@ -448,9 +443,13 @@ def test_in_python_the_domain_is_an_argument(monkeypatch: pytest.MonkeyPatch) ->
     assert FewShot.from_pretrained("model", settings="own.yaml").domain is found.domain
 
 
+@pytest.mark.slow
 def test_a_model_is_adapted_where_the_configuration_names_its_domain() -> None:
-    options = ["--data.domain", DOMAIN, "--evaluation.samples=1", "--evaluation.suites=[]", "--trainer.enable_progress_bar=false"]
-    assert main([*INVERT, *options, "--data.suite=validation", "--evaluation.figures=0", "--evaluation.closed_loop=false"]) == 0
+    two = Demonstrations.load(SHIPPED / "merge.safetensors").rows([0, 1])
+    replace(two, concepts=("roundabout",) * 2).save("two.safetensors")
+    options = ["--data.domain", DOMAIN, "--data.demonstrations=two.safetensors", "--model.form=paper", "--model.budget.samples=2"]
+    options += ["--evaluation.samples=1", "--evaluation.references=false", "--trainer.enable_progress_bar=false"]
+    assert main([*INVERT, *options, "--evaluation.figures=0", "--evaluation.closed_loop=false"]) == 0
     assert ran()
 
 
@@ -469,11 +468,12 @@ def test_the_path_is_restored_after_a_command(monkeypatch: pytest.MonkeyPatch) -
 
 def test_stages_of_an_ablation_are_read_in_a_process_of_their_own() -> None:
     """What a process has been told of trusted classes before would hide that they are not."""
-    done = program(sys.executable, "-m", "ftl_lightning", "ablate", "--config=conf/ablation/smoke.yaml", "--print_config")
+    done = python("-m", "ftl_lightning", "ablate", "--config=conf/ablation/smoke.yaml", "--print_config")
     assert done.returncode == 0, done.stderr
     assert "verb: invert" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_class_that_a_person_named_once_stays_taken_from_its_package(capsys: pytest.CaptureFixture[str]) -> None:
     stopping = "--trainer.callbacks+=lightning.pytorch.callbacks.EarlyStopping"
     for more, expected in (([stopping, "--trainer.callbacks.monitor=val/loss"], "data.batch_size"), ([], "data.batch_size")):

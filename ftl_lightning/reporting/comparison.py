@@ -268,6 +268,7 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
     for domain, setting, metric in lines:
         rows = rows_of[domain.name]
         lead = least_certain(_leads(domain, rows, setting, metric))
+        rows = select(rows, setting=setting, metric=metric)  # which every cell of the line is made from
         form = f"{domain.ours.form}: " if domain.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
         line += [_cell(domain, rows, method, setting, metric) for method in first]

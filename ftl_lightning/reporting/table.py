@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
@@ -91,9 +92,10 @@ class Table:
 
 def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
     """The rows with these values in their columns."""
+    chosen = np.ones(len(rows), dtype=bool)
     for column, value in values.items():
-        rows = rows[rows[column] == value]
-    return rows
+        chosen &= (rows[column] == value).to_numpy(dtype=bool)
+    return rows[chosen]
 
 
 def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:

@@ -1,6 +1,5 @@
 """A Ray cluster of several nodes on this machine, whose nodes can be killed, and grids that run on it as a user runs them."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -11,12 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from ftl_lightning.ablation.record import Entry, read_record
-from tests.conftest import CONF, ROOT
+from tests.conftest import CONF, ROOT, environment
 
-WAIT = 120.0
+WAIT = 300.0
 """Seconds for anything that is waited for: a machine may be slow."""
 QUICK = {
     "verb": "invert",
@@ -36,8 +36,13 @@ QUICK = {
     },
 }
 """A stage whose cells take a second or two."""
-SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 16}
-"""Of the head: a node that is gone is missed soon, and one on a machine that stands still for some seconds is not."""
+SYSTEM = {
+    "health_check_initial_delay_ms": 0,
+    "health_check_period_ms": 200,
+    "health_check_failure_threshold": 5,
+    "health_check_timeout_ms": 1000 * int(WAIT),
+}
+"""Of the head: a node that is gone refuses connections and is missed within a second; one that stands still is waited for."""
 
 
 @contextmanager
@@ -46,19 +51,19 @@ def nodes(*resources: dict[str, Any]) -> Iterator[Any]:
     from ray.cluster_utils import Cluster
 
     folder = tempfile.mkdtemp(prefix="ray")  # a short name: those of sockets are limited
-    before = {name: os.environ.get(name) for name in ("RAY_TMPDIR", "RAY_USAGE_STATS_ENABLED", "PYTHONPATH", "RAY_worker_niceness")}
-    os.environ |= {"RAY_TMPDIR": folder, "RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
-    made = Cluster()
-    try:
-        made.add_node(num_cpus=1, include_dashboard=False, _system_config=SYSTEM)
-        for asked in resources:
-            made.add_node(**asked)
-        yield made
-    finally:
-        made.shutdown()
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
-        shutil.rmtree(folder, ignore_errors=True)
+    variables = {"RAY_TMPDIR": folder, "RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in variables.items():
+            patch.setenv(name, value)
+        made = Cluster()
+        try:
+            made.add_node(num_cpus=1, include_dashboard=False, _system_config=SYSTEM)
+            for asked in resources:
+                made.add_node(**asked)
+            yield made
+        finally:
+            made.shutdown()
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_plan(path: Path, *stages: dict[str, Any], results: str = "r.csv") -> Path:
@@ -76,15 +81,14 @@ cluster.HEAD_WAIT = cluster.LOOK = 1.0  # nobody waits for a head that a test ha
 run.attempt, run.check = attempts.rows, lambda cells: None
 sys.exit(main())
 """
-"""A user's command, whose cells take a second."""
+"""A user's command, whose cells wait for files."""
 
 
 def begin(folder: Path, plan: Path, address: str) -> "subprocess.Popen[str]":
-    """Start a grid in a folder, whose cells take a second; what it says goes to ``said.txt`` there."""
+    """Start a grid in a folder, whose cells wait for files; what it says goes to ``said.txt`` there."""
     command = [sys.executable, "-c", PROGRAM, "ablate", "--config", str(plan), "--executor", "ray"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_ADDRESS": address, "OMP_NUM_THREADS": "1"}
     with (folder / "said.txt").open("w", encoding="utf-8") as said:
-        return subprocess.Popen(command, cwd=folder, stdout=said, stderr=said, text=True, env=environment)
+        return subprocess.Popen(command, cwd=folder, stdout=said, stderr=said, text=True, env=environment(RAY_ADDRESS=address))
 
 
 def until(there: Callable[[], Any], process: "subprocess.Popen[str]", folder: Path) -> Any:
@@ -98,9 +102,9 @@ def until(there: Callable[[], Any], process: "subprocess.Popen[str]", folder: Pa
     return found
 
 
-def entries(folder: Path, state: str, results: str = "r.csv") -> dict[str, Entry]:
+def entries(folder: Path, state: str) -> dict[str, Entry]:
     """Of a grid's cells those in a state."""
-    return {name: entry for name, entry in read_record(folder / results).items() if entry.state == state}
+    return {name: entry for name, entry in read_record(folder / "r.csv").items() if entry.state == state}
 
 
 def node_of(entry: Entry, made: Any) -> Any:

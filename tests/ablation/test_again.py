@@ -29,6 +29,7 @@ def fit(version: str) -> Cell:
     return Cell("fit", (str(CONF / "object_rearrangement.yaml"),), options, "", version)
 
 
+@pytest.mark.slow
 def test_a_lost_pretraining_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that was lost in the fourth of five steps, and one that was not lost, end with the same bytes."""
     step = PretrainingModule.training_step

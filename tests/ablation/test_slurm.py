@@ -12,12 +12,11 @@ import yaml
 from ftl_lightning.ablation.plan import Stage
 from ftl_lightning.ablation.record import read_record
 from ftl_lightning.ablation.slurm import Wave, script, waves, write_scripts
-from ftl_lightning.cli import main
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.trust import vouching
 from tests.ablation.raylets import QUICK, write_plan
-from tests.conftest import ROOT
+from tests.conftest import environment, succeed
 
 STAGES = [
     Stage("fit", "a.yaml", options={"model.output": "models/{seed}"}, resources={"cpus": 4, "gpus": 1, "memory_gb": 7.5}),
@@ -28,16 +27,11 @@ STAGES = [
 PLAN = {number: [cell for seed in (0, 1) for cell in stage.cells(seed)] for number, stage in enumerate(STAGES, 1)}
 
 
-def test_stages_wait_for_the_models_that_they_read() -> None:
-    assert [wave.numbers for wave in waves(PLAN)] == [(1, 2), (3, 4)]
-    assert [len(wave.cells) for wave in waves(PLAN)] == [4, 4]
-
-
-def test_a_script_asks_for_what_its_largest_cell_books() -> None:
+def test_stages_wait_for_the_models_that_they_read_and_a_script_asks_for_what_its_largest_cell_books() -> None:
     first, second = waves(PLAN)
-    lines = script(
-        first, Path("/p/grid.sh.yaml"), Path("/p"), 3, {"partition": "long", "exclusive": "", "time": "1-02:00:00"}
-    ).splitlines()
+    assert [(wave.numbers, len(wave.cells)) for wave in (first, second)] == [((1, 2), 4), ((3, 4), 4)]
+    options = {"partition": "long", "exclusive": "", "time": "1-02:00:00"}
+    lines = script(first, Path("/p/grid.sh.yaml"), Path("/p"), 3, options).splitlines()
     assert [line for line in lines if line.startswith("#SBATCH")] == [
         "#SBATCH --job-name=grid",
         "#SBATCH --array=1-3",
@@ -56,23 +50,22 @@ def test_a_script_asks_for_what_its_largest_cell_books() -> None:
     assert "mem" not in plain
 
 
+def write_srun(content: str) -> None:
+    Path("srun").write_text(f"#!/bin/bash\n{content}")
+    Path("srun").chmod(0o755)
+
+
 def test_what_a_user_gives_is_quoted(tmp_path: Path) -> None:
     (wave, _) = waves(PLAN)
     folder = tmp_path / 'it\'s $(touch bad) "here"; touch bad'
     folder.mkdir()
     with vouching(["my.module"]):
         text = script(wave, folder / "plan `touch bad`.yaml", folder)
-    (tmp_path / "s.sh").write_text(text)
-    told = tmp_path / "srun"
-    told.write_text('#!/bin/bash\npwd > "$OUT"\nprintf "%s\\n" "$@" >> "$OUT"\n')
-    told.chmod(0o755)
-    environment = os.environ | {
-        "PATH": f"{tmp_path}:{os.environ['PATH']}",
-        "SLURM_ARRAY_TASK_ID": "2",
-        "OUT": str(tmp_path / "out"),
-    }
-    subprocess.run(["bash", str(tmp_path / "s.sh")], env=environment, check=True)
-    place, *words = (tmp_path / "out").read_text().splitlines()
+    Path("s.sh").write_text(text)
+    write_srun('pwd > "$OUT"\nprintf "%s\\n" "$@" >> "$OUT"\n')
+    variables = environment(PATH=f"{tmp_path}:{os.environ['PATH']}", SLURM_ARRAY_TASK_ID="2", OUT=str(tmp_path / "out"))
+    subprocess.run(["bash", "s.sh"], env=variables, check=True)
+    place, *words = Path("out").read_text().splitlines()
     assert place == str(folder)
     assert words[words.index("--config") + 1] == str(folder / "plan `touch bad`.yaml")
     assert words[words.index("--trust") + 1] == "my.module"
@@ -102,7 +95,7 @@ def test_resources_that_slurm_does_not_know_are_refused() -> None:
         script(Wave((1,), (cell,)), Path("p.yaml"), Path("/p"))
 
 
-SRUN = """#!/bin/bash
+SRUN = """
 while [ "${1#--}" != "$1" ]; do shift; done
 export SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0 SLURM_JOB_ID=$SLURM_ARRAY_JOB_ID SLURM_JOB_NAME=grid
 export SLURM_NODELIST=localhost
@@ -111,34 +104,30 @@ exec "$@"
 """What srun does with a single task on this machine: Lightning finds itself in a job of Slurm."""
 
 
+@pytest.mark.slow
 def test_the_jobs_of_an_array_run_a_grid_between_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = write_plan(tmp_path / "a.yaml", QUICK | {"grid": {"model.omega": [1.0, 1.2]}})
     arguments = ["ablate", "--config", str(plan), "--slurm", "my grid.sh", "--sbatch", '{partition: long, time: "02:00:00"}']
-    assert main(arguments) == 0
+    succeed(*arguments)
     assert capsys.readouterr().out == "sbatch 'my grid.sh'\n"
     subprocess.run(["bash", "-n", "my grid.sh"], check=True)
-    refused = subprocess.run(["bash", "my grid.sh"], capture_output=True, text=True, check=False)
-    assert "submit this file by sbatch" in refused.stderr
-    frozen = yaml.safe_load(Path("my grid.sh.yaml").read_text())
-    assert frozen["results"] == "r.csv"
+    assert "submit this file by sbatch" in subprocess.run(["bash", "my grid.sh"], capture_output=True, text=True).stderr
+    assert yaml.safe_load(Path("my grid.sh.yaml").read_text())["results"] == "r.csv"
     plan.unlink()  # jobs that wait run what was submitted
-    Path("srun").write_text(SRUN)
-    Path("srun").chmod(0o755)
-    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT), "SLURM_ARRAY_JOB_ID": "7"}
-    environment.pop("OMP_NUM_THREADS", None)
-    (header,) = [line for line in Path("my grid.sh").read_text().splitlines() if "--array" in line]
-    assert header == "#SBATCH --array=1-2"
+    write_srun(SRUN)
+    variables = environment(PATH=f"{tmp_path}:{os.environ['PATH']}", SLURM_ARRAY_JOB_ID="7", SLURM_ARRAY_TASK_ID="2")
+    variables.pop("OMP_NUM_THREADS")
+    assert [line for line in Path("my grid.sh").read_text().splitlines() if "--array" in line] == ["#SBATCH --array=1-2"]
     # One job as Slurm runs it, and the other's command in this process, which has imported everything.
-    subprocess.run(["bash", "my grid.sh"], env=environment | {"SLURM_ARRAY_TASK_ID": "2"}, check=True)
+    subprocess.run(["bash", "my grid.sh"], env=variables, check=True)
     words = shlex.split(Path("my grid.sh").read_text().splitlines()[-1])
-    command = words[words.index("ftl_lightning") + 1 :]
-    assert main([word.replace("$SLURM_ARRAY_TASK_ID", "1") for word in command]) == 0
+    succeed(*(word.replace("$SLURM_ARRAY_TASK_ID", "1") for word in words[words.index("ftl_lightning") + 1 :]))
     assert {entry.state for entry in read_record("r.csv").values()} == {"done"}
     rows = read_rows("r.csv").query("role == 'method'")
     one, other = (rows[rows["omega"] == omega] for omega in ("1.0", "1.2"))
     assert len(one) == len(other) == len(rows) / 2 > 0
     capsys.readouterr()
-    assert main(["ablate", "--config", "my grid.sh.yaml"]) == 0  # what two jobs wrote is one whole
+    succeed("ablate", "--config", "my grid.sh.yaml")  # what two jobs wrote is one whole
     assert capsys.readouterr().out.count("in the results already") == 2
 
 

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from ftl_lightning.benchmark.submission import Submission
 from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.errors import LONGEST
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Once, succeed
 
 RUN = ["benchmark", "replay", "--suites", "beats"]
 
@@ -39,13 +38,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def submitted(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def submitted(site: Path, once: Once) -> Path:
     """The submission of the stranger's method on one suite."""
-    folder = tmp_path_factory.mktemp("submitted")
     torch.set_num_threads(1)
-    with chdir(folder):
-        assert main([*RUN, "--out", "replay.json"]) == 0
-    return folder / "replay.json"
+    return once("submitted", lambda folder: succeed(*RUN, "--out", "replay.json")) / "replay.json"
 
 
 @pytest.fixture
@@ -65,6 +61,7 @@ def line_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return found
 
 
+@pytest.mark.slow
 def test_a_strangers_method_gives_a_submission_that_passes(submitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
     submission, suites = expect_submission(submitted)
     assert (submission.name, list(suites), len(submission.runs)) == ("replay", ["beats"], 3)
@@ -166,6 +163,7 @@ def test_a_tampered_copy_is_refused(
     assert expected in line_of(capsys, "--check", str(copy))
 
 
+@pytest.mark.slow
 def test_numbers_that_agree_with_one_another_but_were_never_measured_are_found(
     copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -47,8 +47,6 @@ def test_a_concept_with_modes_comes_back_from_its_file(mixed: bool) -> None:
     assert header("c.safetensors")["format"] == 2
     assert header("c.safetensors")["axes"] == "mode component n"
     found = Concept.load("c.safetensors")
-    assert found.modes is not None
-    assert own.modes is not None
     assert torch.equal(found.modes.embeddings, own.modes.embeddings)
     assert torch.equal(found.modes.weights, own.modes.weights)
     assert found.modes.mixed is mixed
@@ -71,7 +69,6 @@ def test_a_concept_without_modes_is_written_in_the_first_form_and_has_no_modes_w
 def written(form: int, without: str = "", **changes: object) -> str:
     """A file whose header differs from that of a concept with modes."""
     own = concept()
-    assert own.modes is not None
     tensors = {"embeddings": own.embeddings[:, 0], "weights": own.weights}
     tensors |= {"mode_embeddings": own.modes.embeddings[:, :, 0], "mode_weights": own.modes.weights}
     told = {**ORIGIN.__dict__, "axes": AXES[2], "mixed": False, **changes}
@@ -102,7 +99,6 @@ def test_a_form_that_cannot_be_read_is_told_in_one_line(path: dict[str, object],
 
 def test_parts_are_the_components_and_those_of_every_mode_by_name() -> None:
     own = concept(modes=2)
-    assert own.modes is not None
     names = [f"{mode}component {number}" for mode in ("", "mode 1, ", "mode 2, ") for number in (1, 2)]
     assert list(own.parts()) == names
     part = own.parts()["mode 2, component 1"]

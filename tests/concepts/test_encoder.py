@@ -27,13 +27,11 @@ def language_model(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "t5":
         model = T5EncoderModel(T5Config(vocab_size=8, d_model=16, d_kv=4, d_ff=16, num_layers=1, num_heads=2))
     else:
-        model = BertModel(
-            BertConfig(vocab_size=8, hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16)
-        )
+        sizes = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+        model = BertModel(BertConfig(vocab_size=8, **sizes))
     folder = tmp_path / request.param
-    PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>", unk_token="<unk>").save_pretrained(
-        folder
-    )
+    fast = PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>", unk_token="<unk>")
+    fast.save_pretrained(folder)
     model.save_pretrained(folder)  # type: ignore[operator]
     return folder
 
@@ -82,12 +80,9 @@ def test_a_model_without_some_of_its_weights_is_refused(language_model: Path, ke
         TransformerEncoder(str(language_model))(["circle"])
 
 
-def test_every_shipped_table_holds_every_description() -> None:
+def test_every_shipped_table_holds_every_description_and_a_missing_model_is_a_clear_error(tmp_path: Path) -> None:
     descriptions = load_domain("object_rearrangement").concepts.descriptions
     assert load_encoder("table", TABLE)(["", *descriptions]).shape == (1 + len(descriptions), 384)
-
-
-def test_a_missing_model_is_a_clear_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="encoder: expected a folder or a Hugging Face name"):
         load_encoder(str(tmp_path / "nothing"), TABLE)(["text"])
 

@@ -1,13 +1,16 @@
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
-from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.explanation import explain
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.learning.pretrained import load_model
-from tests.conftest import CONF, ROOT
+from tests.conftest import ROOT, refused, succeed
 
 NAMES = ("a", "b", "c", "d")
 
@@ -48,11 +51,8 @@ def test_learned_concepts_are_combinations_with_small_weights_that_explain_as_mu
     model = load_model(ROOT / "pretrained" / domain)
     names, training = model.config.training_concepts, model.training_embeddings
     basis = torch.linalg.svd(training.double(), full_matrices=False).Vh[: len(training) - 1]
-    embeddings = [
-        row
-        for path in (ROOT / "results" / "concepts" / domain).rglob("*.safetensors")
-        for row in Concept.load(path).embeddings[:, 0]
-    ]
+    files = (ROOT / "results" / "concepts" / domain).rglob("*.safetensors")
+    embeddings = [row for path in files for row in Concept.load(path).embeddings[:, 0]]
     assert embeddings
     for embedding in embeddings:
         found = explain(embedding, names, training)
@@ -66,25 +66,20 @@ def test_learned_concepts_are_combinations_with_small_weights_that_explain_as_mu
 
 
 def test_the_verb_finds_the_model_and_says_what_a_concept_is_made_of(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = [f"--model.pretrained={tiny}", "--data.suite=validation", "--data.steps=2", "--evaluation.samples=2"]
-    options += ["--evaluation.steps=2", "--model.output=concepts", "--trainer.enable_progress_bar=false"]
-    assert main(["invert", "--config", str(CONF / "object_rearrangement.yaml"), *options]) == 0
-    concept = str(next(Path("concepts").iterdir()))
-    capsys.readouterr()
-    assert main(["explain", "--concept", concept]) == 2
-    assert f"expected the model with the hash {load_model(tiny).hash} below pretrained, logs" in capsys.readouterr().err
+    scenes = load_domain("object_rearrangement").source(None).draw("square diagonal to triangle", 5, 0)
+    (concept,) = invert(model := load_model(tiny), scenes, InversionSettings().changed(samples=2), 2).values()
+    concept.save("c.safetensors")
+    explain = ["explain", "--concept", "c.safetensors"]
+    expected = f"expected the model with the hash {model.hash} below pretrained, logs"
+    refused(capsys, explain, expected)
     Path("logs/some").mkdir(parents=True)
     Path("logs/some/config.json").write_text("{}")  # the configuration of something else does not matter
     Path("logs/model").symlink_to(tiny)
-    assert main(["explain", "--concept", concept, "--nearest", "2"]) == 2  # links are not followed
-    Path("pretrained").mkdir()
-    for name in ("config.json", "model.safetensors"):
-        (Path("pretrained") / name).write_bytes((tiny / name).read_bytes())
-    capsys.readouterr()
-    assert main(["explain", "--concept", concept, "--nearest", "2"]) == 0
+    refused(capsys, explain, expected)  # links are not followed
+    shutil.copytree(tiny, "pretrained")
+    succeed(*explain, "--nearest", "2")
     out = capsys.readouterr().out
     assert out.count("nearest: ") == 3  # two components and their sum
     assert "component 2, weight 1.20: nearest: " in out
     assert "explains 0." in out
-    assert main(["explain", "--concept", concept, "--pretrained", str(ROOT / "pretrained" / "agent")]) == 2
-    assert "key 'domain': expected 'agent' (the pretrained model's)" in capsys.readouterr().err
+    refused(capsys, [*explain, f"--pretrained={ROOT}/pretrained/agent"], "key 'domain': expected 'agent' (the pretrained model's)")

@@ -45,22 +45,15 @@ def test_selection_naming_and_concatenation() -> None:
     assert demonstrations(torch.zeros(2, 1, 1), concepts=("", "x")).named("mine").concepts == ("mine", "x")
 
 
-def test_windows_are_padded_with_the_last_state() -> None:
+def test_windows_are_padded_with_the_last_state_and_start_at_the_beginning_where_only_that_is_observed() -> None:
     states = torch.arange(10.0).reshape(2, 5, 1)
     whole = replace(demonstrations(states), lengths=torch.tensor([5, 3]), observed={"place": states + 100}, per_step=("place",))
     assert whole.starts(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 0.9999, 0.5, 0.9]), 3.0, 4).tolist() == [0, 4, 0, 2]
     found, seen = whole.windows(torch.tensor([0, 1]), torch.tensor([3, 0]), 4)
     assert found[..., 0].tolist() == [[3, 4, 4, 4], [5, 6, 7, 8]]
     assert seen["place"][:, 0].tolist() == [103, 105]
-
-
-def test_windows_start_at_the_beginning_where_only_the_first_observation_is_known() -> None:
-    whole = demonstrations(
-        torch.zeros(2, 5, 1),
-        lengths=torch.tensor([5, 3]),
-        observed={"first": torch.eye(2), "always": torch.zeros(2, 5, 1)},
-        per_step=("always",),
-    )
+    observed = {"first": torch.eye(2), "always": torch.zeros(2, 5, 1)}  # of the former, only the beginning is known
+    whole = demonstrations(torch.zeros(2, 5, 1), lengths=torch.tensor([5, 3]), observed=observed, per_step=("always",))
     assert whole.starts(torch.tensor([0, 1]), torch.tensor([0.1, 0.9]), 3.0, 2).tolist() == [0, 0]
     assert torch.equal(whole.windows(torch.tensor([1]), torch.tensor([0]), 2)[1]["first"], torch.eye(2)[1:])
 
@@ -139,14 +132,10 @@ def test_the_hash_is_of_what_is_observed_and_scenes_too() -> None:
     states = torch.zeros(2, 3, 1)
     plain = demonstrations(states)
     seen = demonstrations(states, observed={"place": torch.zeros(2, 3)})
-    others = [
-        plain,
-        seen,
-        demonstrations(states, observed={"spot": torch.zeros(2, 3)}),
-        demonstrations(states, observed={"place": torch.ones(2, 3)}),
-        demonstrations(states, scenes=torch.zeros(2, 3)),
-    ]
-    assert len({one.hash for one in others}) == len(others)
+    observed = {"spot": torch.zeros(2, 3)}, {"place": torch.ones(2, 3)}
+    others = [plain, seen, *(demonstrations(states, observed=one) for one in observed)]
+    others += [demonstrations(states, scenes=torch.zeros(2, 3))]
+    assert len({one.hash for one in others}) == 5
     assert replace(seen, concepts=("x", "y"), provenance={"seed": 1}).hash == seen.hash
 
 
@@ -154,13 +143,16 @@ def test_features_that_a_domain_does_not_find_are_told() -> None:
     seen = demonstrations(torch.zeros(2, 3, 1), observed={"place": torch.zeros(2, 3)})
     assert seen.fitted({"place": Feature((3,))}) is seen
     assert seen.fitted({}) is seen
-    with pytest.raises(
-        UserError, match=r"key 'observed/place': expected float32 of shape \(4,\) each, found float32 of shape \(3,\)"
+    for name, feature, expected in (
+        ("place", Feature((4,)), r"observed/place': expected float32 of shape \(4,\) each, found float32 of shape \(3,\)"),
+        ("photo", Feature((3, 8, 8), "image"), r"observed/photo': expected uint8 images of shape \(3, 8, 8\) each, found none"),
+        (
+            "place",
+            Feature((3,), "image"),
+            r"observed/place': expected uint8 images of shape \(3,\) each, found float32 of shape \(3,\)",
+        ),
     ):
-        seen.fitted({"place": Feature((4,))})
-    with pytest.raises(UserError, match=r"key 'observed/photo': expected uint8 images of shape \(3, 8, 8\) each, found none"):
-        seen.fitted({"photo": Feature((3, 8, 8), "image")})
-    with pytest.raises(UserError, match=r"expected uint8 images of shape \(3,\) each, found float32 of shape \(3,\)"):
-        seen.fitted({"place": Feature((3,), "image")})
+        with pytest.raises(UserError, match=f"key '{expected}"):
+            seen.fitted({name: feature})
     with pytest.raises(UserError, match="key 'observed/place': expected float32, or uint8 for images, found float64"):
         demonstrations(torch.zeros(2, 3, 1), observed={"place": torch.zeros(2, 3, dtype=torch.float64)})

@@ -10,12 +10,9 @@ def observed(count: int, offset: float = 0.0) -> dict[str, torch.Tensor]:
     return {"place": offset + torch.arange(count * 2.0).reshape(count, 2), "photo": photos}
 
 
-def test_a_features_size_is_the_numbers_in_one_sample() -> None:
-    assert Feature((7,)).size == 7
-    assert Feature((3, 4, 5), "image").size == 60
-
-
 def test_samples_are_taken_joined_and_moved_feature_by_feature() -> None:
+    assert Feature((7,)).size == 7
+    assert Feature((3, 4, 5), "image").size == 60  # the numbers in one sample
     both = joined([observed(2), observed(1, 9.0)])
     assert both["place"].tolist() == [[0, 1], [2, 3], [9, 10]]
     assert both["photo"].dtype == torch.uint8
@@ -44,14 +41,14 @@ def test_features_that_are_missing_or_of_another_shape_are_told(features: dict[s
         expect_features(observed(2), features)
 
 
-def test_initial_states_are_counted_by_what_there_is() -> None:
-    assert len(InitialStates()) == 0
-    assert len(InitialStates(observed(3))) == 3
-    assert len(InitialStates(scenes=torch.zeros(4, 2))) == 4
-    assert len(InitialStates(observed(3), torch.zeros(3, 2))) == 3
-
-
-def test_some_of_the_initial_states_and_several_one_after_another() -> None:
+def test_initial_states_are_counted_by_what_there_is_and_are_taken_and_joined() -> None:
+    some = (
+        InitialStates(),
+        InitialStates(observed(3)),
+        InitialStates(scenes=torch.zeros(4, 2)),
+        InitialStates(observed(3), torch.zeros(3, 2)),
+    )
+    assert [len(one) for one in some] == [0, 3, 4, 3]
     one, other = InitialStates(observed(2), torch.zeros(2, 4)), InitialStates(observed(1, 9.0), torch.ones(1, 4))
     both = join([one, other])
     assert len(both) == 3
@@ -65,13 +62,10 @@ def test_some_of_the_initial_states_and_several_one_after_another() -> None:
     assert len(join([])) == 0
 
 
-def test_scenes_that_are_missing_are_told_where_an_environment_needs_them() -> None:
-    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), what an environment is reset with, found none"):
-        InitialStates(observed(2)).require_scenes()
-
-
-def test_initial_states_that_are_missing_are_told_where_nothing_goes_without() -> None:
+def test_scenes_and_initial_states_that_are_missing_are_told_where_nothing_goes_without() -> None:
     starts = InitialStates(observed(2))
+    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), what an environment is reset with, found none"):
+        starts.require_scenes()
     assert expect_starts(starts) is starts
     with pytest.raises(UserError, match="starts: expected initial states, found none; give what is observed where plans start"):
         expect_starts(None)

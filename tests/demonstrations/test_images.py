@@ -64,12 +64,10 @@ def squeezed(count: int) -> torch.Tensor:
 
 
 PHOTO = "observed/photo"
-
-
 SIZE = 2 * 40 * 3 * 32 * 32
-
-
 FITS = r"expected images of shape \(2, 40, ...\) that fit into \d+ compressed bytes, found the shape "
+SHAPES: list[object] = [[2, 40, 3, 1 << 40, 1 << 40], [2, 40, -3, -32, 32], [2, 39, 3, 32, 32], [3, 40, 3, 32, 32]]
+SHAPES += [[2], [2, 40, 3, 32.0, 32], [2, 40, 3, True, 32], "2, 40"]
 
 
 @pytest.mark.parametrize(
@@ -84,14 +82,7 @@ FITS = r"expected images of shape \(2, 40, ...\) that fit into \d+ compressed by
         ({PHOTO: torch.empty(0, dtype=torch.uint8)}, {}, FITS),
         ({PHOTO: torch.zeros(99)}, {}, r"expected compressed images, uint8 of shape \(byte,\) .*, found float32 of shape \(99,\)"),
         ({PHOTO: torch.zeros(9, 9, dtype=torch.uint8)}, {}, r"expected compressed images, .*, found uint8 of shape \(9, 9\)"),
-        ({}, {"compressed": {PHOTO: [2, 40, 3, 1 << 40, 1 << 40]}}, FITS),
-        ({}, {"compressed": {PHOTO: [2, 40, -3, -32, 32]}}, FITS),
-        ({}, {"compressed": {PHOTO: [2, 39, 3, 32, 32]}}, FITS),
-        ({}, {"compressed": {PHOTO: [3, 40, 3, 32, 32]}}, FITS),
-        ({}, {"compressed": {PHOTO: [2]}}, FITS),
-        ({}, {"compressed": {PHOTO: [2, 40, 3, 32.0, 32]}}, FITS),
-        ({}, {"compressed": {PHOTO: [2, 40, 3, True, 32]}}, FITS),
-        ({}, {"compressed": {PHOTO: "2, 40"}}, FITS),
+        *(({}, {"compressed": {PHOTO: shape}}, FITS) for shape in SHAPES),
         ({}, {"compressed": {PHOTO: [2, 40]}}, rf"{PHOTO}': expected 80 bytes of images, found more"),
         ({}, {"compressed": {"observed/view": [2, 40, 3]}}, "key 'observed/view': expected compressed images, .*, found nothing"),
         ({}, {"compressed": {"lengths": [2]}}, "key 'lengths': expected compressed images, .*, found int64 of shape"),

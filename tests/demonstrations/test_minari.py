@@ -1,5 +1,6 @@
 """Minari data sets, made here in a temporary folder."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.data import OwnData
 from ftl_lightning.domains.from_file import read_demonstrations, read_own
@@ -21,6 +21,7 @@ pytest.importorskip("h5py", reason="the extra 'minari' is not installed")
 from minari.data_collector import EpisodeBuffer  # noqa: E402
 
 from ftl_lightning.demonstrations.minari import read_minari, write_minari  # noqa: E402
+from tests.conftest import ROOT, succeed  # noqa: E402
 from tests.demonstrations.recorded import everything, expect_same  # noqa: E402
 
 VECTOR = gymnasium.spaces.Box(-1, 1, (3,), np.float64)
@@ -53,23 +54,13 @@ def vectors(steps: int, value: float = 0.5) -> list[np.ndarray[Any, Any]]:
 
 
 def own() -> Demonstrations:
-    states = torch.rand(6, 5, 2)
-    lengths = torch.tensor([5, 3, 4, 5, 2, 5])
-    for row, length in enumerate(lengths.tolist()):
-        states[row, length:] = states[row, length - 1]
-    concepts = ("up", "up", "up", "down", "down", "down")
-    return Demonstrations(states, lengths, "", ("x", "y"), ("m", "m"), concepts)
+    """Of states alone."""
+    return replace(everything(), domain="", observed={}, per_step=(), scenes=None, provenance={})
 
 
 def test_what_is_written_is_read_back() -> None:
-    written = own()
-    write_minari(written, "strokes/test-v0")
-    found = read_minari("strokes/test-v0")
-    assert torch.equal(found.states, written.states)
-    assert torch.equal(found.lengths, written.lengths)
-    for name in ("concepts", "state_names", "state_units", "domain"):
-        assert getattr(found, name) == getattr(written, name)
-    assert found.observed == {}
+    write_minari(own(), "strokes/test-v0")
+    expect_same(read_minari("strokes/test-v0"), own(), provenance=False)
     episodes = list(minari.load_dataset("strokes/test-v0"))
     assert [len(one) for one in episodes] == [4, 2, 3, 4, 1, 4]
     assert episodes[0].truncations.tolist() == [False, False, False, True]
@@ -115,11 +106,8 @@ def test_a_texts_place_is_the_episode_then_its_metadata_then_the_data_set() -> N
     assert found.concepts == ("go left", "go right", "wait")
     assert found.states.dtype == torch.float32
     assert found.states[:, 0, 0].tolist() == [0.0, 0.25, 0.5]
-
-
-def test_episodes_of_different_lengths_are_padded() -> None:
     make("long-v0", [episode(vectors(2), 2), episode(vectors(5), 5)])
-    found = read_minari("long-v0")
+    found = read_minari("long-v0")  # a shorter episode is padded
     assert found.lengths.tolist() == [3, 6]
     assert found.states.shape == (2, 6, 3)
 
@@ -174,7 +162,7 @@ def test_the_name_of_a_data_set_stands_for_a_file() -> None:
     write_minari(own(), "strokes/own-v0")
     assert read_own("strokes/own-v0").concepts == own().concepts
     data = OwnData("strokes/own-v0", encoder="hashing", validation_share=0.4)
-    assert data.domain.concepts.training == ("up", "down")
+    assert data.domain.concepts.training == ("go up", "go dówn")
     data.setup("fit")
     assert len(data.training) == 4
     with pytest.raises(UserError, match=r"strokes/own-v0: key 'states': expected shape \(demo, time, 21\)"):
@@ -182,8 +170,8 @@ def test_the_name_of_a_data_set_stands_for_a_file() -> None:
 
 
 def test_demonstrations_of_a_domain_are_generated_into_a_data_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples" / "ftl-strokes")
-    assert main(["generate", "ftl_strokes:DOMAIN", "--task=arc upwards", "--count=3", "--out=minari:strokes/arcs-v0"]) == 0
+    monkeypatch.syspath_prepend(ROOT / "examples" / "ftl-strokes")
+    succeed("generate", "ftl_strokes:DOMAIN", "--task=arc upwards", "--count=3", "--out=minari:strokes/arcs-v0")
     strokes = load_domain("ftl_strokes:DOMAIN")
     found = read_demonstrations("strokes/arcs-v0", strokes)
     assert torch.equal(found.states, strokes.source(None).draw("arc upwards", 3, 0).states)

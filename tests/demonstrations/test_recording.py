@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.errors import UserError
-from tests.conftest import ROOT
+from tests.conftest import ROOT, succeed
 
 gymnasium = pytest.importorskip("gymnasium", reason="no extra with gymnasium is installed")
 
@@ -45,9 +44,7 @@ class Point(gymnasium.Env[Any, Any]):  # type: ignore[misc,name-defined]
 class Seeing(Point):
     """The same with a target and a picture."""
 
-    observation_space = gymnasium.spaces.Dict(
-        {"observation": PLACE, "target": PLACE, "picture": Box(0, 255, (4, 5, 3), np.uint8)},
-    )
+    observation_space = gymnasium.spaces.Dict({"observation": PLACE, "target": PLACE, "picture": Box(0, 255, (4, 5, 3), np.uint8)})
 
     def seen(self) -> Any:
         picture = np.zeros((4, 5, 3), np.uint8)
@@ -59,11 +56,6 @@ def run(env: Any, steps: int) -> None:
     env.reset(seed=0)
     for _ in range(steps):
         env.step([1.0, 0.5])
-
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def test_vectors_are_recorded_without_arguments() -> None:
@@ -91,14 +83,8 @@ def test_episodes_that_were_reset_early_are_dropped_unless_they_are_asked_for() 
 
 
 def test_texts_names_and_features_are_those_that_are_asked_for() -> None:
-    env = Recorder(
-        Seeing(),
-        observed=["target", "picture"],
-        concept="go right",
-        state_names=("x", "y"),
-        state_units=("m", "m"),
-        domain="points",
-    )
+    names = {"state_names": ("x", "y"), "state_units": ("m", "m"), "domain": "points"}
+    env = Recorder(Seeing(), observed=["target", "picture"], concept="go right", **names)
     run(env, 3)
     env.concept = "go far right"
     run(env, 3)
@@ -160,15 +146,8 @@ def test_navigation_is_recorded(capsys: pytest.CaptureFixture[str]) -> None:
 
     domain = load_domain("agent")
     (feature,) = domain.observed
-    env = Recorder(
-        AgentEnvironment(),
-        state=lambda seen: seen[feature][:STATE],
-        observed=[feature],
-        concept="go straight on",
-        keep_unfinished=True,
-        state_names=domain.plans.columns,
-        domain="agent",
-    )
+    names = {"concept": "go straight on", "state_names": domain.plans.columns, "domain": "agent"}
+    env = Recorder(AgentEnvironment(), state=lambda seen: seen[feature][:STATE], observed=[feature], keep_unfinished=True, **names)
     for seed in range(3):
         env.reset(seed=seed)
         for _ in range(12):
@@ -178,5 +157,5 @@ def test_navigation_is_recorded(capsys: pytest.CaptureFixture[str]) -> None:
     assert found.states.shape == (3, 13, STATE)
     assert (found.states == found.observed[feature][..., :STATE]).all()
     assert found.states[0, -1, 2] > found.states[0, 0, 2]
-    assert main(["check", "agent.safetensors"]) == 0
+    succeed("check", "agent.safetensors")
     assert "go straight on: 3 demonstrations of 13 steps" in capsys.readouterr().out

@@ -6,20 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.cli import main
 from ftl_lightning.domains.from_file import read_own
 from ftl_lightning.errors import UserError
+from tests.conftest import refused
 
 
 @pytest.fixture(autouse=True)
-def _not_installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def _not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
 
     def find(name: str, package: str | None = None) -> ModuleSpec | None:
         return None if name in ("minari", "pyarrow") else found(name, package)
 
     monkeypatch.setattr(importlib.util, "find_spec", find)
-    monkeypatch.chdir(tmp_path)
 
 
 def test_reading_a_data_set_needs_the_extra() -> None:
@@ -36,10 +35,7 @@ def test_reading_a_data_set_needs_the_extra() -> None:
 @pytest.mark.parametrize(("out", "package"), [("minari:a-v0", "minari"), ("lerobot:a", "pyarrow")])
 def test_writing_a_data_set_needs_the_extra(out: str, package: str, capsys: pytest.CaptureFixture[str]) -> None:
     for verb in (["generate", "object_rearrangement"], ["sample", "--pretrained=object_rearrangement"]):
-        assert main([*verb, "--count=2", f"--out={out}"]) == 2
-        told = capsys.readouterr().err
-        assert told.startswith(
-            f"error: out: {out}: this data set needs the package {package}, which is not installed; pip install "
-        )
+        told = refused(capsys, [*verb, "--count=2", f"--out={out}"])
+        expected = f"error: out: {out}: this data set needs the package {package}, which is not installed; pip install "
+        assert told.startswith(expected)
         assert told.count("\n") == 1
-    assert not list(Path().iterdir())

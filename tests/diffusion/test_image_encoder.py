@@ -156,25 +156,24 @@ def trainer(**options: Any) -> Trainer:
 
 
 SMALL: dict[str, Any] = {"image_encoder": {"widths": [8, 16], "keypoints": 4}, "feature_dropout": {"place": 0.4}}
+BOTH = (ways("to", 12, 0), ways("away", 12, 1))
+
+
+def own(file: str, steps: int = 3, batch_size: int = 8, **options: int) -> OwnData:
+    return OwnData(file, batch_size=batch_size, steps_per_epoch=steps, encoder="hashing", **options)
+
+
+def pretraining(output: Path, width: int = 16, learning_rate: float = 1e-2, **options: Any) -> PretrainingModule:
+    network = {"hidden_dim": width, "depth": 2, "condition_dim": width // 2}
+    options |= {"learning_rate": learning_rate, "diffusion_steps": 20, "output": str(output)}
+    return PretrainingModule(denoiser_args=network, **SMALL, **options)
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a small model that sees pictures, and beside it the file that it was fitted to."""
+    """Folder of a model that has hardly learned to see pictures, and beside it the file that it was fitted to."""
     folder = tmp_path_factory.mktemp("seen")
-    file = write(folder / "ways.npz", ways("to", 300, 0), ways("away", 300, 1))
-    module = PretrainingModule(
-        denoiser_args={"hidden_dim": 64, "depth": 2, "condition_dim": 32},
-        diffusion_steps=20,
-        prediction="clean",
-        loss=LossOptions(kind="clean"),
-        learning_rate=3e-3,
-        warmup_steps=20,
-        ema_decay=0.98,
-        output=str(folder / "model"),
-        **SMALL,
-    )
-    trainer(max_steps=600).fit(module, datamodule=OwnData(file, batch_size=64, steps_per_epoch=600, encoder="hashing"))
+    trainer(max_steps=3).fit(pretraining(folder / "model"), datamodule=own(write(folder / "ways.npz", *BOTH)))
     return folder / "model"
 
 
@@ -187,26 +186,27 @@ def error(model: GenerativeModel, concept: str) -> float:
     return float((plans[:, -1] - torch.from_numpy(new["states"][:, -1])).norm(dim=-1).mean())
 
 
-def test_a_model_sees_where_to_go(fitted: Path) -> None:
+@pytest.mark.slow
+def test_a_model_sees_where_to_go(tmp_path: Path) -> None:
+    learned = {"diffusion_steps": 20, "prediction": "clean", "loss": LossOptions(kind="clean")}
+    module = pretraining(tmp_path / "model", 64, 3e-3, warmup_steps=20, ema_decay=0.98, **learned)
+    file = write(tmp_path / "ways.npz", ways("to", 300, 0), ways("away", 300, 1))
+    trainer(max_steps=500).fit(module, datamodule=own(file, 500, 64))
+    for concept in ("to", "away"):
+        assert error(module.model, concept) < 1.5  # by chance 5
+
+
+def test_a_model_that_sees_comes_back_from_its_folder(fitted: Path) -> None:
     model = load_model(fitted)
     assert isinstance(model, GenerativeModel)
     assert model.config.image_dim == 12
     assert dict(model.config.feature_dropout) == {"place": 0.4}
-    for concept in ("to", "away"):
-        assert error(model, concept) < 1.5  # by chance 5
     again = read_model(GenerativeModel, fitted)
     assert again.hash == model.hash
 
 
 def test_the_encoder_is_part_of_the_running_average(tmp_path: Path) -> None:
-    file = write(tmp_path / "ways.npz", ways("to", 12, 0), ways("away", 12, 1))
-    module = PretrainingModule(
-        denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 8},
-        learning_rate=1e-2,
-        warmup_steps=0,
-        output="model",
-        **SMALL,
-    )
+    module = pretraining(tmp_path / "model", warmup_steps=0)
     seen: list[dict[str, Tensor]] = []
     plain = module.on_train_start
 
@@ -215,7 +215,7 @@ def test_the_encoder_is_part_of_the_running_average(tmp_path: Path) -> None:
         seen.append({name: value.clone() for name, value in module.model.named_parameters()})
 
     module.on_train_start = begin  # type: ignore[method-assign]
-    trainer(max_steps=3).fit(module, datamodule=OwnData(file, batch_size=8, steps_per_epoch=3, encoder="hashing"))
+    trainer(max_steps=3).fit(module, datamodule=own(write(tmp_path / "ways.npz", *BOTH)))
     raw, average = dict(module.raw.named_parameters()), dict(module.model.named_parameters())
     images = [name for name in average if name.startswith("images.")]
     assert images
@@ -232,23 +232,26 @@ def test_vectors_are_hidden_in_training_alone(fitted: Path) -> None:
     torch.manual_seed(0)
     part = model.train().vector(observed)
     model.eval()
-    assert whole is not None
-    assert part is not None
     hidden = (part[:, :2] == 0).all(dim=1)
     assert 0.3 < hidden.float().mean() < 0.5
     torch.testing.assert_close(part[~hidden], whole[~hidden])
     torch.testing.assert_close(part[:, 2:], whole[:, 2:])
 
 
-def test_images_are_read_once_a_plan_and_concepts_are_learned_through_them(fitted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, calls = load_model(fitted), []
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many images were read at once, each time that some were."""
+    found: list[int] = []
     plain = ImageEncoder.forward
-    monkeypatch.setattr(ImageEncoder, "forward", lambda self, images: calls.append(len(images)) or plain(self, images))  # type: ignore[func-returns-value]
-    assert isinstance(model, GenerativeModel)
-    error(model, "to")
+    monkeypatch.setattr(ImageEncoder, "forward", lambda self, images: found.append(len(images)) or plain(self, images))  # type: ignore[func-returns-value]
+    return found
+
+
+def test_images_are_read_once_a_plan_and_concepts_are_learned_through_them(fitted: Path, calls: list[int]) -> None:
+    error(read_model(GenerativeModel, fitted), "to")
     assert calls == [40]
     calls.clear()
-    file = write(fitted.parent / "new.npz", ways("away", 5, 11))
+    file = write(Path("new.npz"), ways("away", 5, 11))
     module = InversionModule(str(fitted), budget=BudgetOptions(samples=16), components=1, output="concepts", form="paper")
     trainer(max_epochs=1).invert(module, InversionData("own", demonstrations=file, steps=4))
     # Once a step; the rest is where demonstrations are checked, and the learned concept and its samples are looked at.
@@ -260,41 +263,33 @@ def test_images_are_read_once_a_plan_and_concepts_are_learned_through_them(fitte
 def test_mistakes_in_what_is_hidden(fitted: Path) -> None:
     with pytest.raises(UserError, match=r"model\.feature_dropout\.place: expected a number from 0 to 1, found 2.0"):
         PretrainingModule(feature_dropout={"place": 2.0})
-    data = OwnData(str(fitted.parent / "ways.npz"), encoder="hashing")
     with pytest.raises(UserError, match=r"model\.feature_dropout: expected one of place, found 'view'"):
-        trainer(max_steps=1).fit(PretrainingModule(feature_dropout={"view": 0.5}), datamodule=data)
+        trainer(max_steps=1).fit(PretrainingModule(feature_dropout={"view": 0.5}), datamodule=own(str(fitted.parent / "ways.npz")))
 
 
-def test_cloning_looks_once_and_in_context_learning_takes_a_trained_encoder(fitted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = str(fitted.parent / "ways.npz")
+def test_cloning_looks_once_and_in_context_learning_takes_a_trained_encoder(fitted: Path, calls: list[int]) -> None:
     cloning = CloningPretraining(hidden_dim=16, output="bc", plan_horizon=2, **SMALL)
-    data = OwnData(file, batch_size=8, steps_per_epoch=2, horizon=2, encoder="hashing")
-    trainer(max_steps=2).fit(cloning, datamodule=data)
+    trainer(max_steps=2).fit(cloning, datamodule=own(str(fitted.parent / "ways.npz"), 2, horizon=2))
     observed = {name: torch.from_numpy(ways("to", 3, 0)[f"observed/{name}"]) for name in ("view", "place")}
     model = load_model("bc")
-    calls: list[int] = []
-    plain = ImageEncoder.forward
-    monkeypatch.setattr(ImageEncoder, "forward", lambda self, images: calls.append(len(images)) or plain(self, images))  # type: ignore[func-returns-value]
+    calls.clear()
     composition = Composition(model.concept("to")[None, None], torch.ones(1))
     assert model.sample([composition], 3, Sampling(), [generator("cpu", 0)], observed).shape == (1, 3, 2, 2)
     assert calls == [3]
 
-    parts = [ways("to", 12, 0), ways("away", 12, 1)]
-    for part in parts:  # at every time, as in-context learning asks for
-        for name in ("observed/view", "observed/place"):
-            part[name] = np.repeat(part[name][:, None], TIME, axis=1)
+    # At every time, as in-context learning asks for.
+    parts = [
+        {key: np.repeat(values[:, None], TIME, axis=1) if key.startswith("observed/") else values for key, values in part.items()}
+        for part in BOTH
+    ]
     seen = write(Path("seen.npz"), *parts, per_step=np.array(["view", "place"]))
     options: dict[str, Any] = {"tokens": 3, "bins": 4, "width": 8, "layers": 1, "heads": 2, "prompts": 2, "plan_horizon": 2}
-    data = OwnData(seen, batch_size=8, steps_per_epoch=2, horizon=2, encoder="hashing")
+    data = own(seen, 2, horizon=2)
     with pytest.raises(UserError, match=r"model\.images: expected the folder of a model that reads these images, found none"):
         trainer(max_steps=2).fit(InContextPretraining(**options), datamodule=data)
-    module = InContextPretraining(**options, images=str(fitted), output="icl")
-    trainer(max_steps=2).fit(module, datamodule=data)
+    trainer(max_steps=2).fit(InContextPretraining(**options, images=str(fitted), output="icl"), datamodule=data)
     source, read = load_model(fitted).images, load_model("icl").images
-    assert source is not None
-    assert read is not None
     for name, weight in source.state_dict().items():
         assert torch.equal(read.state_dict()[name], weight), name
-    adaptation = LearnerAdaptation("icl", output="prompts")
-    trainer(max_epochs=1).invert(adaptation, InversionData("own", demonstrations=seen, steps=1))
+    trainer(max_epochs=1).invert(LearnerAdaptation("icl", output="prompts"), InversionData("own", demonstrations=seen, steps=1))
     assert sorted(path.name for path in Path("prompts").iterdir()) == ["away.safetensors", "to.safetensors"]

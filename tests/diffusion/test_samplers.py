@@ -46,9 +46,13 @@ def betas() -> Any:
     return (1 - alpha).numpy()
 
 
-def test_the_schedule_is_the_cosine_one() -> None:
+def test_the_schedule_is_the_cosine_one_and_timesteps_cover_it() -> None:
     theirs = DDPMScheduler(num_train_timesteps=100, beta_schedule="squaredcos_cap_v2").alphas_cumprod
     assert torch.allclose(ALPHA_BAR, theirs, atol=1e-5)
+    assert timesteps(100, 100) == list(range(99, -1, -1))
+    assert timesteps(100, 12) == [99, 90, 81, 72, 63, 54, 45, 36, 27, 18, 9, 0]
+    with pytest.raises(ValueError, match="expected 1 to 100"):
+        timesteps(100, 101)
 
 
 def test_ddpm_equals_diffusers() -> None:
@@ -95,17 +99,11 @@ def test_every_sampler_finds_the_distribution(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
-def test_a_seed_repeats_and_a_low_temperature_narrows(name: str) -> None:
+def test_a_seed_repeats_a_low_temperature_narrows_and_a_sampling_runs_with_its_own(name: str) -> None:
     first, again, cold = (SAMPLERS[name](exact, noise(), ALPHA_BAR, 20, alpha) for alpha in (1.0, 1.0, 0.1))
     assert torch.equal(first, again)
     assert cold.std() < 0.6 * first.std()
-
-
-def test_timesteps_cover_the_schedule() -> None:
-    assert timesteps(100, 100) == list(range(99, -1, -1))
-    assert timesteps(100, 12) == [99, 90, 81, 72, 63, 54, 45, 36, 27, 18, 9, 0]
-    with pytest.raises(ValueError, match="expected 1 to 100"):
-        timesteps(100, 101)
+    assert torch.equal(Sampling(name, 12, 0.3).run(exact, noise(), ALPHA_BAR), SAMPLERS[name](exact, noise(), ALPHA_BAR, 12, 0.3))
 
 
 def test_noise_can_be_taken_off_again() -> None:
@@ -115,13 +113,10 @@ def test_noise_can_be_taken_off_again() -> None:
     assert torch.allclose(clean_from_epsilon(add_noise(clean, noise, alpha_bar), noise, alpha_bar), clean, atol=1e-4)
 
 
-def test_the_loss_of_the_true_noise_is_zero() -> None:
+def test_the_loss_of_the_true_noise_is_zero_and_a_discount_weighs_states_by_its_powers() -> None:
     noise = torch.randn(4, 1, 3)
     t = torch.tensor([0, 10, 50, 99])
     assert torch.equal(denoising_loss(lambda x, t: noise, torch.zeros(4, 1, 3), noise, t, ALPHA_BAR), torch.zeros(4))
-
-
-def test_a_discount_weighs_states_by_its_powers() -> None:
     noise = torch.randn(2, 3, 2)
     one, t = torch.zeros_like(noise), torch.tensor([0, 50])
     alike = denoising_loss(lambda x, t: one, one, noise, t, ALPHA_BAR)
@@ -129,12 +124,6 @@ def test_a_discount_weighs_states_by_its_powers() -> None:
     each = noise.square().mean(dim=2)
     assert torch.allclose(alike, each.mean(dim=1))
     assert torch.allclose(half, (each * torch.tensor([1, 0.5, 0.25])).sum(dim=1) / 1.75)
-
-
-@pytest.mark.parametrize("name", SAMPLERS)
-def test_a_sampling_runs_its_sampler_with_its_steps_and_temperature(name: str) -> None:
-    found = Sampling(name, 12, 0.3).run(exact, noise(), ALPHA_BAR)
-    assert torch.equal(found, SAMPLERS[name](exact, noise(), ALPHA_BAR, 12, 0.3))
 
 
 @pytest.mark.parametrize(

@@ -1,27 +1,27 @@
 """Plans as cosines over time: the transform itself, its scales, and what it does to a model's plans."""
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.cli import main
 from ftl_lightning.diffusion.prediction import Prediction
 from ftl_lightning.diffusion.spectrum import Spectrum
+from ftl_lightning.domains.data import OwnData
+from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.testing.strokes import strokes
-from tests.conftest import CONF
-
-SMALL = ["--trainer.max_steps=2", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--evaluation.samples=2"]
+from ftl_lightning.trainer import Trainer
 
 
 def paths(count: int) -> Tensor:
     return torch.from_numpy(strokes("wave", count, 0))
 
 
-def test_a_fitted_spectrum_puts_out_plans_of_the_means_and_spreads_that_it_saw() -> None:
+def test_a_fitted_spectrum_puts_out_plans_of_the_means_and_spreads_that_it_saw_with_smoother_errors_than_in_states() -> None:
     spectrum, plans = Spectrum(40, 2), paths(200)
     spectrum.fit(plans)
     mean = spectrum(torch.zeros(1, 40, 2))[0]
@@ -31,11 +31,6 @@ def test_a_fitted_spectrum_puts_out_plans_of_the_means_and_spreads_that_it_saw()
     assert torch.allclose(back, plans, atol=1e-4)
     drawn = spectrum(torch.randn(4000, 40, 2, generator=torch.Generator().manual_seed(0)))
     assert drawn.std(dim=0).mean() == pytest.approx(float(plans.std(dim=0).mean()), rel=0.1)
-
-
-def test_the_same_error_is_smoother_in_cosines_than_in_states() -> None:
-    spectrum, plans = Spectrum(40, 2), paths(200)
-    spectrum.fit(plans)
     error = torch.randn(500, 40, 2, generator=torch.Generator().manual_seed(1))
 
     def roughness(noise: Tensor) -> float:
@@ -54,15 +49,20 @@ def test_what_does_not_vary_stays_as_it_is() -> None:
     assert single(torch.ones(2, 1, 3)).isfinite().all()
 
 
-def test_a_model_of_cosines_keeps_its_scales_in_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_model_of_cosines_keeps_its_scales_in_its_folder() -> None:
     kinds = ("line", "wave")
     np.savez("strokes.npz", states=np.concatenate([strokes(kind, 20, 0) for kind in kinds]), concepts=np.repeat(kinds, 20))
-    arguments = ["fit", "--config", str(CONF / "own.yaml"), "--data.demonstrations=strokes.npz", *SMALL]
-    assert main([*arguments, "--model.output=made"]) == 0
+
+    def fit(**options: Any) -> None:
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "limit_val_batches": 0}
+        data = OwnData("strokes.npz", encoder="hashing", batch_size=8, steps_per_epoch=2)
+        module = PretrainingModule(prediction="cosines", output="made", **options)
+        Trainer(max_steps=2, accelerator="cpu", **quiet).fit(module, data)
+
+    fit(denoiser_args={"hidden_dim": 16, "depth": 2, "condition_dim": 16})
     denoiser = FewShot.from_pretrained("made").model.denoiser
     assert isinstance(denoiser, Prediction)
-    assert denoiser.spectrum is not None
     assert (denoiser.spectrum.scale[0] > 5 * denoiser.spectrum.scale[20]).all()  # slow cosines vary more than fast ones
-    capsys.readouterr()
-    assert main([*arguments, "--model.denoiser=TemporalUNet", "--model.denoiser_args={width: 8}"]) == 2
-    assert "prediction: expected clean for TemporalUNet, whose output is smooth by itself, found cosines" in capsys.readouterr().err
+    expected = "prediction: expected clean for TemporalUNet, whose output is smooth by itself, found cosines"
+    with pytest.raises(UserError, match=expected):
+        fit(denoiser="TemporalUNet", denoiser_args={"width": 8})

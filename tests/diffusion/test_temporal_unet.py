@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.diffusion import MLPDenoiser, TemporalUNet
@@ -19,7 +20,7 @@ FEATURE = Feature((10,), entities=ENTITIES)
 SIZES = Sizes(horizon=16, state_dim=5, concept_dim=7, observed={"world": FEATURE})
 
 
-def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
+def inputs(batch: int = 3, horizon: int = 16) -> tuple[Tensor, ...]:
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(batch, horizon, 5, generator=draw)
     initial = torch.randn(batch, 10, generator=draw)
@@ -28,16 +29,9 @@ def inputs(batch: int = 3, horizon: int = 16) -> tuple[torch.Tensor, ...]:
     return x, t, torch.randn(2, 1, 7, generator=draw), index, initial
 
 
-def noise(
-    net: TemporalUNet | MLPDenoiser,
-    x: torch.Tensor,
-    t: torch.Tensor,
-    concepts: torch.Tensor,
-    index: torch.Tensor,
-    initial: torch.Tensor,
-) -> torch.Tensor:
+def noise(net: TemporalUNet | MLPDenoiser, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, initial: Tensor) -> Tensor:
     """What a network estimates, with what it reads of the observed vectors."""
-    out: torch.Tensor = net(x, t, concepts, index, net.observe(initial))
+    out: Tensor = net(x, t, concepts, index, net.observe(initial))
     return out
 
 
@@ -97,7 +91,6 @@ def test_a_gradient_reaches_the_concept_through_the_attention_alone() -> None:
     encoder = EntityEncoder(SIZES, 8)
     concept = torch.randn(3, 7, requires_grad=True)
     encoder.attend(encoder.observe(inputs()[-1]), concept).sum().backward()
-    assert concept.grad is not None
     assert concept.grad.abs().max() > 0
 
 

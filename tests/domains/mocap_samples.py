@@ -1,9 +1,14 @@
 """A small skeleton, motions of it, and folders of made-up recordings: no recorded motion comes with the project."""
 
+import importlib.util
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 
@@ -102,3 +107,21 @@ def folder(path: Path, concepts: Sequence[str] = ()) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     recordings(trials).save(path / FILE)
     return path
+
+
+def script(name: str) -> ModuleType:
+    """A script of the benchmarks as a module."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "benchmarks" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def named_recordings(inside: str = "") -> Path:
+    """The folder of recordings that ``FTL_LIGHTNING_DATA`` names; a test without one is skipped."""
+    named = os.environ.get("FTL_LIGHTNING_DATA")
+    if not named or not (Path(named) / inside).is_dir():
+        pytest.skip(f"FTL_LIGHTNING_DATA names no folder of recordings {inside}".rstrip())
+    return Path(named)

@@ -1,45 +1,45 @@
-"""Navigation through the command line: pretraining, inversion, closed loop, sampling, mistakes."""
+"""Navigation through the command line: inversion, closed loop, sampling, mistakes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.agent.scenes import OBSERVED
-from tests.conftest import CONF
+from ftl_lightning.domains.data import InversionData, PretrainingData
+from ftl_lightning.errors import UserError
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.methods.ftl_igm.model import build_denoiser
+from tests import tiny
+from tests.conftest import CONF, ROOT, refused, succeed
 
-FIT = ["--config", str(CONF / "agent.yaml")]
-INVERT = ["--config", str(CONF / "agent.yaml")]
-SMALL = [
-    "--model.denoiser_args={width: 8, multipliers: [1, 2], initial_encoder: entities}",
-    "--data.samples_per_concept=4",
-    "--data.validation_per_concept=1",
-    "--data.batch_size=8",
-    "--data.steps_per_epoch=10",
-    "--trainer.max_steps=20",
-]
-QUICK = ["--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.replan=32", "--evaluation.figures=2"]
-QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+SHIPPED = ROOT / "pretrained" / "agent"
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def model(tiny_of: Callable[[str], Path], drawn: None) -> Path:
     """Folder of a small pretrained model."""
-    folder = tmp_path_factory.mktemp("agent")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        assert main(["fit", *FIT, *SMALL, *QUICK, *QUIET, f"--trainer.logger.init_args.save_dir={folder}"]) == 0
-    return folder / "agent" / "fit" / "pretrained"
+    return tiny_of("agent")
 
 
-def test_invert_judges_plans_and_executes_them(model: Path) -> None:
-    options = ["--data.steps=3", "--model.budget.samples=2", "--data.demonstrations_per_concept=2"]
-    assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET]) == 0
+@pytest.fixture
+def invert(model: Path) -> list[str]:
+    """Arguments of an inversion through it."""
+    quick = ["--model.budget.samples=2", "--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.replan=64"]
+    return ["invert", f"--config={CONF / 'agent.yaml'}", f"--model.pretrained={model}", *quick, *tiny.QUIET]
+
+
+@pytest.mark.slow
+def test_invert_judges_plans_and_executes_them(invert: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftl_lightning.domains.agent.rendering.FRAMES", 2)
+    succeed(*invert, "--data.steps=2", "--data.demonstrations_per_concept=2", "--evaluation.figures=1")
     rows = pd.read_csv("logs/agent/invert/results.csv", keep_default_na=False)
     ours = rows[rows["K"] == 2]
     executed = {"closed loop success", "closed loop distractor", "closed loop progress"}
@@ -58,66 +58,68 @@ def test_invert_judges_plans_and_executes_them(model: Path) -> None:
     assert "test results/closed loop success/new initial state" in events.Tags()["scalars"]
 
 
-def test_sample_starts_from_new_or_given_initial_states(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    common = ["sample", f"--pretrained={model}", "--compose=go to bowl:1.6", "--steps=2"]
-    assert main([*common, "--goal=go to bowl", "--count=3", "--figure=plans.png"]) == 0
+@pytest.mark.slow
+def test_sample_starts_from_new_or_given_initial_states(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["sample", f"--pretrained={SHIPPED}", "--compose=go to bowl:1.6", "--steps=2"]
+    succeed(*common, "--goal=go to bowl", "--count=3", "--figure=plans.png")
     drawn = Demonstrations.load("states.safetensors")
     assert drawn.states.shape == (3, 128, 13)
     assert drawn.observed[OBSERVED].shape == (3, 52)
     assert drawn.scenes is not None
     assert torch.equal(drawn.scenes, drawn.observed[OBSERVED])
     assert Path("plans.png").is_file()
-    assert main([*common, "--initial=states.safetensors", "--out=again.safetensors"]) == 0
-    again = Demonstrations.load("again.safetensors")
-    assert (again.states == drawn.states).all()
-    assert main([*common, "--count=3", "--out=own.safetensors"]) == 0  # the composed text names a task to start from
+    succeed(*common, "--initial=states.safetensors", "--out=again.safetensors")
+    assert (Demonstrations.load("again.safetensors").states == drawn.states).all()
+    succeed(*common, "--count=3", "--out=own.safetensors")  # the composed text names a task to start from
     assert (Demonstrations.load("own.safetensors").states == drawn.states).all()
-    capsys.readouterr()
-    assert main(["sample", f"--pretrained={model}"]) == 2
-    assert "goal, initial: expected" in capsys.readouterr().err
+    refused(capsys, ["sample", f"--pretrained={SHIPPED}"], "goal, initial: expected")
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--data.horizon=60"], "horizon: expected a multiple of 8"),
-        (["--data.horizon=0"], "data.horizon: expected 1 or more"),
-        (["--evaluation.replan=0"], "evaluation.replan: expected 1 or more"),
-        (["--model.prediction=x"], "prediction: expected one of epsilon, v, clean, displacement"),
-        (["--model.denoiser_args={initial_encoder: deep}"], "initial_encoder: expected one of flat, joint, entities"),
-    ],
-)
-def test_mistakes(options: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
-    small = [one for one in SMALL if "denoiser_args" not in one]
-    assert main(["fit", *FIT, *small, *QUIET, *options]) == 2
-    assert expected in capsys.readouterr().err
-
-
-def test_a_checkpoint_of_another_horizon_is_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    checkpoint = model.parent / "checkpoints" / "last.ckpt"
-    assert main(["fit", *FIT, *SMALL, *QUIET, "--data.horizon=64", f"--ckpt_path={checkpoint}"]) == 2
-    assert "key 'horizon': expected 64, found 128" in capsys.readouterr().err
-
-
-def test_demonstrations_without_observed_features_are_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import numpy as np
-
+def test_mistakes_and_demonstrations_without_observed_features(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UserError, match=r"data.horizon: expected 1 or more"):
+        PretrainingData("agent", horizon=0)
+    with pytest.raises(UserError, match=r"evaluation.replan: expected 1 or more"):
+        Evaluator(replan=0)
+    config = load_model(SHIPPED).config
+    deep = {"denoiser_args": config.denoiser_args | {"initial_encoder": "deep"}}
+    for changes, expected in (
+        ({"horizon": 60}, "horizon: expected a multiple of 8"),
+        ({"prediction": "x"}, "prediction: expected one of epsilon, v, clean, displacement"),
+        (deep, "initial_encoder: expected one of flat, joint, entities"),
+    ):
+        with pytest.raises(UserError, match=expected):
+            build_denoiser(replace(config, **changes))
     np.savez("plain.npz", states=np.zeros((2, 150, 13), dtype=np.float32))
-    assert main(["invert", *INVERT, f"--model.pretrained={model}", "--data.demonstrations=plain.npz", *QUIET]) == 2
     expected = "plain.npz: key 'observed/world': expected float32 of shape (52,) each, found none"
-    assert expected in capsys.readouterr().err
-    assert main(["sample", f"--pretrained={model}", "--compose=go to bowl", "--initial=plain.npz"]) == 2
-    assert expected in capsys.readouterr().err
-    assert not Path("states.safetensors").exists()
+    with pytest.raises(UserError) as found:
+        InversionData("agent", demonstrations="plain.npz")
+    assert expected in str(found.value)
+    refused(capsys, ["sample", f"--pretrained={SHIPPED}", "--compose=go to bowl", "--initial=plain.npz"], expected)
 
 
-def test_demonstrations_whose_first_observations_alone_are_known(model: Path) -> None:
-    assert main(["generate", "agent", "--task=go to red bowl", "--count=3", "--out=whole.safetensors"]) == 0
+@pytest.mark.slow
+def test_a_checkpoint_of_another_horizon_is_refused(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint, fit = model.parent / "checkpoints" / "last.ckpt", tiny.fit(Path("agent.yaml"), "--data.horizon=64")
+    refused(capsys, [*fit, f"--ckpt_path={checkpoint}"], "key 'horizon': expected 64, found 128")
+
+
+@pytest.fixture
+def first_seen() -> Path:
+    """A file of drives of which the first observation alone is known."""
+    succeed("generate", "agent", "--task=go to red bowl", "--count=2", "--out=whole.safetensors")
     whole = Demonstrations.load("whole.safetensors")
     first = whole.observed[OBSERVED][:, 0]
-    replace(whole, observed={OBSERVED: first}, per_step=()).save("first.safetensors")
     assert torch.equal(whole.initial_states.observed[OBSERVED], first)
-    assert torch.equal(Demonstrations.load("first.safetensors").initial_states.observed[OBSERVED], first)
-    options = ["--data.steps=2", "--model.budget.samples=2", "--evaluation.suites=[paper]", "--evaluation.closed_loop=false"]
-    own = ["--data.demonstrations=first.safetensors"]
-    assert main(["invert", *INVERT, f"--model.pretrained={model}", *own, *options, *QUICK, *QUIET]) == 0
+    replace(whole, observed={OBSERVED: first}, per_step=()).save("first.safetensors")
+    return Path("first.safetensors")
+
+
+def test_demonstrations_whose_first_observations_alone_are_known(first_seen: Path) -> None:
+    found = InversionData("agent", demonstrations=str(first_seen)).demonstrations
+    assert torch.equal(found.initial_states.observed[OBSERVED], Demonstrations.load("whole.safetensors").observed[OBSERVED][:, 0])
+
+
+@pytest.mark.slow
+def test_first_observations_are_enough_to_learn_from(first_seen: Path, invert: list[str]) -> None:
+    plain = ["--evaluation.closed_loop=false", "--evaluation.suites=[]", "--evaluation.diversity=false", "--evaluation.figures=0"]
+    succeed(*invert, f"--data.demonstrations={first_seen}", "--data.steps=2", *plain)

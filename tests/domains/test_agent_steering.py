@@ -1,7 +1,8 @@
 """Drives that a hand leads are drives like the expert's."""
 
-import time
+from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.agent.domain import DOMAIN
+from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.rendering import SEEN
@@ -18,8 +20,8 @@ from ftl_lightning.domains.recorder import Scene, expect_path
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
 
+assert DOMAIN.recorder is not None
 RECORDER = DOMAIN.recorder
-assert RECORDER is not None
 GOAL = "go to red bowl"
 
 
@@ -34,7 +36,6 @@ def places(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64], NDAr
 
 def led(scene: Scene, to: NDArray[np.float64], bow: float = 0.0, trembling: float = 0.01) -> Demonstrations:
     """A drive along a hand's way to a place, which bows aside and trembles."""
-    assert RECORDER is not None
     start, count = np.array(scene.pieces[0].at), 90
     share = np.linspace(0, 1, count)[:, None]
     aside = np.array([-(to - start)[1], (to - start)[0]]) / np.linalg.norm(to - start)
@@ -56,7 +57,6 @@ def roughness(drive: Demonstrations, row: int = 0) -> float:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("bow", [0.0, 0.25])
 def test_a_way_led_to_the_red_bowl_is_a_demonstration_of_it(seed: int, bow: float) -> None:
-    assert RECORDER is not None
     scene = RECORDER.scene(GOAL, seed)
     start, bowl, other = places(scene)
     aside = np.array([-(bowl - start)[1], (bowl - start)[0]])
@@ -71,7 +71,6 @@ def test_a_way_led_to_the_red_bowl_is_a_demonstration_of_it(seed: int, bow: floa
 
 
 def test_a_trembling_hand_leads_as_smooth_a_drive_as_the_experts() -> None:
-    assert RECORDER is not None
     starts = DOMAIN.source(None).starts(GOAL, 4, 0)
     expert = DOMAIN.source(None).draw(GOAL, 4, 0)  # in the same scenes
     led_roughly, usual = [], []
@@ -86,13 +85,17 @@ def test_a_trembling_hand_leads_as_smooth_a_drive_as_the_experts() -> None:
     assert np.mean(led_roughly) < 1.35 * np.mean(usual)
 
 
-def test_a_drive_has_all_that_the_experts_have_and_is_made_while_one_waits() -> None:
-    assert RECORDER is not None
-    scene = RECORDER.scene("", 1)
-    led(scene, places(scene)[1])  # imports the simulator
-    begun = time.perf_counter()
+def test_a_drive_has_all_that_the_experts_have_and_is_made_while_one_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, done, step = RECORDER.scene("", 1), Counter[str](), AgentEnvironment.step
+
+    def counted(self: AgentEnvironment, action: NDArray[np.float32]) -> Any:
+        done["step"] += 1
+        return step(self, action)
+
+    monkeypatch.setattr(AgentEnvironment, "step", counted)
+    monkeypatch.setattr(AgentEnvironment, "render", lambda self: done.update(["picture"]))
     drive = led(scene, places(scene)[1])
-    assert time.perf_counter() - begun < 0.5
+    assert done == {"step": int(drive.lengths[0]) - 1}  # one pass of the simulator, without a picture
     expert = DOMAIN.source(None).draw(GOAL, 1, 0)
     assert drive.features == expert.features
     assert drive.per_step == expert.per_step
@@ -104,8 +107,7 @@ def test_a_drive_has_all_that_the_experts_have_and_is_made_while_one_waits() -> 
     assert torch.equal(drive.states, drive.observed[OBSERVED][..., :13])
 
 
-def test_a_long_way_ends_within_a_demonstrations_length_at_rest_and_in_sight() -> None:
-    assert RECORDER is not None
+def test_a_long_way_ends_within_a_demonstrations_length_at_rest_and_in_sight_and_no_way_shows_nothing() -> None:
     scene = RECORDER.scene(GOAL, 0)
     start = np.array(scene.pieces[0].at)
     angle = np.linspace(0, 40, 2000)
@@ -116,18 +118,12 @@ def test_a_long_way_ends_within_a_demonstrations_length_at_rest_and_in_sight() -
     outside = RECORDER.record(scene, *expect_path(scene, [[[start[0], 3.0]]], [0.0]))
     (_, (_, high)) = SEEN
     assert outside.states[0, :, 2].max() < high + 0.02
-
-
-def test_the_agent_that_does_not_go_anywhere_shows_nothing() -> None:
-    assert RECORDER is not None
-    scene = RECORDER.scene(GOAL, 0)
-    x, z = scene.pieces[0].at
+    x, z = start
     with pytest.raises(UserError, match="lead the agent further"):
         RECORDER.record(scene, *expect_path(scene, [[[x, z]], [[x + 0.05, z]]], [0.0, 1.0]))
 
 
-def test_scenes_are_those_of_their_task_and_move_the_agent_alone() -> None:
-    assert RECORDER is not None
+def test_scenes_are_those_of_their_task_and_move_the_agent_alone_and_need_the_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"go to bowl", GOAL, "go to green cone"} <= set(RECORDER.tasks)
     for task in RECORDER.tasks:
         scene = RECORDER.scene(task, 2)
@@ -142,12 +138,7 @@ def test_scenes_are_those_of_their_task_and_move_the_agent_alone() -> None:
     with pytest.raises(UserError, match="agent task"):
         RECORDER.scene("go to blue bowl", 0)
     assert torch.equal(RECORDER.scene("", 5).starts.observed[OBSERVED], RECORDER.scene("", 5).starts.observed[OBSERVED])  # type: ignore[union-attr]
-    different = [RECORDER.scene("", seed).starts.observed[OBSERVED] for seed in (5, 6)]  # type: ignore[union-attr]
-    assert not torch.equal(*different)
-
-
-def test_without_the_simulator_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert RECORDER is not None
+    assert not torch.equal(*(RECORDER.scene("", seed).starts.observed[OBSERVED] for seed in (5, 6)))  # type: ignore[union-attr]
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserError, match="pip install 'ftl-lightning\\[navigation\\]'"):
         RECORDER.scene(GOAL, 0)

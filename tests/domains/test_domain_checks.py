@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import ClosedLoop, Domain, Metric
@@ -25,34 +24,21 @@ def with_metric(values: Any) -> Domain:
     return replace(DOMAIN, metrics={"mine": Metric(lambda goal, states, starts: values)})
 
 
-@pytest.mark.parametrize("values", [torch.zeros(5, 5), torch.zeros(3), [True] * 5, STATES.numpy()[:, 0, 0]], ids=str)
-def test_a_metric_of_another_shape_is_refused(values: Any) -> None:
-    with pytest.raises(UserError, match=r"metric 'mine': expected a tensor of shape \(5,\) or \(\), found"):
-        Judged.of(EvaluationTask("s", GOAL), STATES, None, with_metric(values))
-
-
-@pytest.mark.parametrize("values", [torch.ones(5), torch.tensor(0.5)], ids=str)
-def test_a_number_for_each_plan_or_for_all_is_accepted(values: Tensor) -> None:
-    assert with_metric(values).measure(GOAL, STATES, None) == {"mine": values}
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "expected"),
-    [
+def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> None:
+    for wrong in (torch.zeros(5, 5), torch.zeros(3), [True] * 5, STATES.numpy()[:, 0, 0]):
+        with pytest.raises(UserError, match=r"metric 'mine': expected a tensor of shape \(5,\) or \(\), found"):
+            Judged.of(EvaluationTask("s", GOAL), STATES, None, with_metric(wrong))
+    for values in (torch.ones(5), torch.tensor(0.5)):  # for each plan, or for all
+        assert with_metric(values).measure(GOAL, STATES, None) == {"mine": values}
+    rollout = Rollout(InitialStates({}, torch.zeros(2, 1)), {}, torch.zeros(2, dtype=torch.bool), [{}, {}])
+    for outcomes, expected in (
         ({"success": torch.ones(2, 2, dtype=torch.bool)}, r"outcome 'success': expected a tensor of shape \(2,\)"),
         ({"crash": torch.ones(2)}, "expected outcomes by name, 'success' among them, found crash"),
         (torch.ones(2), "expected outcomes by name, 'success' among them, found Tensor"),
-    ],
-    ids=str,
-)
-def test_a_judge_of_another_shape_is_refused(outcomes: Any, expected: str) -> None:
-    loop = ClosedLoop(lambda: None, lambda plans, step, observed: plans, 1, lambda goal, rollout: outcomes)  # type: ignore[arg-type,return-value]
-    rollout = Rollout(InitialStates({}, torch.zeros(2, 1)), {}, torch.zeros(2, dtype=torch.bool), [{}, {}])
-    with pytest.raises(UserError, match=expected):
-        replace(DOMAIN, closed_loop=loop).judge(GOAL, rollout)
-
-
-def test_a_reference_line_of_another_shape_is_refused() -> None:
+    ):
+        loop = ClosedLoop(lambda: None, lambda plans, step, observed: plans, 1, lambda *_, said=outcomes: said)  # type: ignore[arg-type,misc,return-value]
+        with pytest.raises(UserError, match=expected):
+            replace(DOMAIN, closed_loop=loop).judge(GOAL, rollout)
     domain = replace(DOMAIN, name="other", references={"mine": lambda goal, count, starts, seed: torch.zeros(count, 2, 21)})
     one = Judged.of(EvaluationTask("s", GOAL), STATES, None, domain)
     with pytest.raises(UserError, match=r"reference 'mine': expected plans \(5, 1, 21\), found \(5, 2, 21\)"):

@@ -1,6 +1,9 @@
 """Driving: scenarios, the faster simulation, save and restore, expert, planner."""
 
+import multiprocessing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +15,16 @@ from ftl_lightning.domains.driving.environment import DrivingEnvironment
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, observe
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.simulation import advance, restore, save
-from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.domains.driving.traffic import NAMES, OBSERVED, SCENARIO, SCENE, STEP, TRAFFIC, decision_seconds, origin, scene
 from ftl_lightning.errors import UserError
 
-PAPER = ("highway", "exit", "merge", "intersection", "roundabout")
+
+def slow(*names: str) -> list[Any]:
+    """Scenarios that only a full run looks at."""
+    return [pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+SIMULATED = ["merge", "intersection", *slow(*(name for name in SCENARIOS if name not in ("merge", "intersection")))]
 
 
 def places(env: object) -> np.ndarray:
@@ -29,19 +37,25 @@ def start(name: str, seed: int = 0, fast: bool = True) -> object:
     return env
 
 
-# Scenarios
-
-
-def test_scenarios_are_known_without_the_simulator() -> None:
+def test_scenarios_are_known_without_the_simulator_and_the_exit_is_entered_from_any_lane() -> None:
     assert tuple(SCENARIOS) == NAMES
     for name, found in SCENARIOS.items():
         assert decision_seconds(name) == 1 / (found.environment.default_config() | found.config)["policy_frequency"]
+    with pytest.raises(UserError, match="expected one of highway, exit, merge"):
+        make("motorway")
+    env = make("exit")
+    lanes = set()
+    for seed in range(14):
+        env.reset(seed=seed)
+        lanes.add(env.vehicle.lane_index[2])
+    assert lanes == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", SIMULATED)
 def test_the_seed_decides_an_episode(name: str) -> None:
     first, again, other = start(name, 3), start(name, 3), start(name, 4)
     for env in (first, again, other):
+        assert not arrived(env, name)  # nobody starts where a scenario ends
         env.step(1)
     assert np.array_equal(places(first), places(again))
     assert places(first).shape != places(other).shape or not np.array_equal(places(first), places(other))
@@ -59,30 +73,13 @@ def test_no_state_leaks_from_one_scenario_to_the_next() -> None:
     assert {name: value for name, value in vars(IDMVehicle).items() if name.isupper()} == before
 
 
-def test_an_unknown_scenario() -> None:
-    with pytest.raises(UserError, match="expected one of highway, exit, merge"):
-        make("motorway")
-
-
-def test_the_exit_is_entered_from_any_lane() -> None:
-    env = make("exit")
-    lanes = set()
-    for seed in range(24):
-        env.reset(seed=seed)
-        lanes.add(env.vehicle.lane_index[2])
-    assert lanes == {0, 1, 2, 3}
-
-
-# The same simulation, faster
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_the_faster_simulation_is_the_published_one(name: str) -> None:
+@pytest.mark.parametrize("name", SIMULATED)
+@pytest.mark.parametrize(("seeds", "decisions"), [pytest.param((0,), 10, marks=pytest.mark.slow), ((2,), 3)], ids=["many", "few"])
+def test_the_faster_simulation_is_the_published_one(name: str, seeds: tuple[int, ...], decisions: int) -> None:
     draw = np.random.default_rng(0)
-    for seed in range(2):
+    for seed in seeds:
         fast, published = start(name, seed), start(name, seed, fast=False)
-        ended = False
-        for _ in range(4 if name == "highway" else 12):
+        for _ in range(min(decisions, 4) if name == "highway" else decisions):
             decision = int(draw.integers(fast.action_space.n))
             seen, reward, ended, late, _ = fast.step(decision)
             expected, expected_reward, expected_end, expected_late, _ = published.step(decision)
@@ -94,15 +91,12 @@ def test_the_faster_simulation_is_the_published_one(name: str) -> None:
                 break
 
 
-# Save and restore
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", SIMULATED)
 def test_save_and_restore_are_exact(name: str) -> None:
     env = start(name, 1)
     advance(env, 1)
     saved, draw = save(env), np.random.default_rng(0)
-    futures = [draw.integers(env.action_space.n, size=3).tolist() for _ in range(10)]
+    futures = [draw.integers(env.action_space.n, size=3).tolist() for _ in range(4)]
 
     def go(decisions: list[int]) -> list[tuple[float, bool, bytes, bytes]]:
         restore(env, saved)
@@ -119,32 +113,31 @@ def test_save_and_restore_are_exact(name: str) -> None:
     assert len({str(one) for one in first}) > 1
 
 
-# Expert
+SHORT = 8
+"""Decisions that an expert simulates who searches a tenth as much, which is enough here."""
 
 
-@pytest.mark.parametrize("name", ["roundabout", "merge"])
-def test_the_expert_arrives(name: str) -> None:
+@pytest.mark.parametrize(("name", "budget"), [("roundabout", SHORT), pytest.param("merge", 75, marks=pytest.mark.slow)])
+def test_the_expert_arrives(name: str, budget: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(expert.SEARCH, name, replace(expert.SEARCH[name], budget=budget))
     env = make(name)
-    for seed in range(2):
-        seen, succeeded = expert.drive(name, seed, env)
-        assert succeeded
-        assert arrived(env, name)
-        assert not env.vehicle.crashed
-        assert seen.shape[1:] == (5, 7)
-    again, _ = expert.drive(name, 1)
-    assert np.array_equal(seen, again)
+    seen, succeeded = expert.drive(name, 1, env)
+    assert succeeded
+    assert arrived(env, name)
+    assert not env.vehicle.crashed
+    assert seen.shape[1:] == (5, 7)
 
 
-def test_planning_leaves_the_simulation_as_it_was() -> None:
+def test_an_expert_drives_the_same_again_and_planning_leaves_the_simulation_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(expert.SEARCH, "roundabout", replace(expert.SEARCH["roundabout"], budget=3))
+    assert np.array_equal(expert.drive("roundabout", 1)[0], expert.drive("roundabout", 1)[0])
+    monkeypatch.setitem(expert.SEARCH, "roundabout", replace(expert.SEARCH["roundabout"], budget=SHORT))
     env = start("roundabout")
     before, random = places(env), env.np_random.bit_generator.state
     assert expert.plan(env, "roundabout") == expert.plan(env, "roundabout")
     assert np.array_equal(places(env), before)
     assert env.np_random.bit_generator.state == random
     assert env.config["simulation_frequency"] == 15
-
-
-# Closed loop
 
 
 def scene_of(name: str, seed: int) -> np.ndarray:
@@ -165,7 +158,8 @@ def follow(actions: list[np.ndarray], seed: int = 0) -> tuple[np.ndarray, dict[s
     return np.stack(seen), info
 
 
-def test_the_planner_does_what_the_expert_did() -> None:
+def test_the_planner_does_what_the_expert_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(expert.SEARCH, "roundabout", replace(expert.SEARCH["roundabout"], budget=SHORT))
     seen, succeeded = expert.drive("roundabout", 5)
     assert succeeded
     driven, info = follow(list(seen[1:, 0]), seed=5)
@@ -195,57 +189,39 @@ def test_an_episode_repeats_and_starts_where_its_numbers_say() -> None:
     seen, _ = env.reset(options={"scene": given})
     assert np.array_equal(seen[TRAFFIC], first[0])
     assert np.array_equal(given[:OBSERVED], first[0])
-    assert seen[SCENARIO].tolist() == [PAPER.index("roundabout")]
+    assert seen[SCENARIO].tolist() == [NAMES.index("roundabout")]
     other.reset(options={"scene": given})
     assert env.np_random.random() == other.np_random.random()  # draws among equal decisions
     with pytest.raises(UserError, match="expected the start of 'roundabout'"):
         env.reset(options={"scene": np.concatenate((first[2], given[OBSERVED:]))})
 
 
-def test_without_a_scene_the_seed_and_the_task_decide_where_an_episode_starts() -> None:
+def test_without_a_scene_the_seed_and_the_task_decide_and_scenes_and_actions_that_are_none_are_refused() -> None:
     env = DrivingEnvironment()
     first, again, other = (env.reset(seed=seed, options={"task": "merge"})[0] for seed in (3, 3, 4))
-    assert first[SCENARIO].tolist() == [PAPER.index("merge")]
+    assert first[SCENARIO].tolist() == [NAMES.index("merge")]
     assert np.array_equal(first[TRAFFIC], again[TRAFFIC])
     assert not np.array_equal(first[TRAFFIC], other[TRAFFIC])
     assert env.observation_space.contains(first)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "expected"),
-    [
+    for wrong, expected in (
         (np.zeros(35), "expected 37 finite numbers"),
         (np.full(SCENE, np.nan), "expected 37 finite numbers"),
         (np.concatenate((np.zeros(OBSERVED), [99, 0])), "a scenario from 0 to"),
         (np.concatenate((np.zeros(OBSERVED), [0, 0.5])), "and a seed, found 0 and 0.5"),
-    ],
-)
-def test_scenes_that_are_none(wrong: np.ndarray, expected: str) -> None:
-    with pytest.raises(UserError, match=expected):
-        DrivingEnvironment().reset(options={"scene": wrong})
-
-
-def test_actions_that_are_none() -> None:
-    env = DrivingEnvironment()
+    ):
+        with pytest.raises(UserError, match=expected):
+            env.reset(options={"scene": wrong})
     env.reset(seed=0)
     for wrong in (np.zeros(3), np.full(7, np.nan)):
         with pytest.raises(UserError, match="driving action: expected 7 finite numbers, 4 or 1"):
             env.step(wrong)
-
-
-def test_what_no_model_sees_stands_last() -> None:
     row = scene(np.ones((5, 7), dtype=np.float32), "merge", 12345)
     assert row.shape == (SCENE,)
     assert (row[:OBSERVED] == 1).all()
     assert origin(row) == ("merge", 12345)
 
 
-def test_nobody_starts_where_a_scenario_ends() -> None:
-    for name in PAPER:
-        assert not arrived(start(name), name)
-
-
-@pytest.mark.parametrize("name", TRAINING_CONCEPTS)
+@pytest.mark.parametrize("name", ["merge", *slow("highway", "exit", "intersection")])
 def test_who_drives_as_a_recorded_episode_succeeds_as_it_did(name: str) -> None:
     recorded = training_set("train", 1).select(name)
     env = DrivingEnvironment(STEP)
@@ -263,60 +239,69 @@ def test_who_drives_as_a_recorded_episode_succeeds_as_it_did(name: str) -> None:
     env.close()
 
 
-# Demonstrations
+WHOLE = np.ones((3, 5, 7), dtype=np.float32)
 
 
-def test_demonstrations_do_not_depend_on_workers_and_go_on_where_they_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "one"))
+def test_demonstrations_drive_on_and_go_on_where_they_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    driven: list[int] = []
+    again = np.random.default_rng(0)
+
+    def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
+        driven.append(seed)
+        return WHOLE * again.random(dtype=np.float32), seed != generation.episode_seed(0, 1)
+
+    monkeypatch.setattr(expert, "drive", drive)
     told: list[int] = []
-    alone = generation.demonstrations("merge", 2, 0, 1, lambda: told.append(1))
+    found = generation.demonstrations("merge", 2, 0, 1, lambda: told.append(1))
     assert len(told) == 2
-    assert torch.equal(alone.states, alone.observed[TRAFFIC][..., :7])
-    scenes = alone.initial_states.require_scenes()
-    assert alone.provenance["rejected"] == alone.provenance["driven"] - 2
-    for row, (length, start) in enumerate(zip(alone.lengths.tolist(), scenes.numpy(), strict=True)):
-        beyond = torch.arange(1, alone.states.shape[1] - length + 1)  # seconds
+    assert torch.equal(found.states, found.observed[TRAFFIC][..., :7])
+    assert (found.provenance["driven"], found.provenance["rejected"]) == (3, 1)
+    scenes = found.initial_states.require_scenes().numpy()
+    for row, (length, begun) in enumerate(zip(found.lengths.tolist(), scenes, strict=True)):
+        beyond = torch.arange(1, found.states.shape[1] - length + 1)  # seconds
         assert len(beyond) >= 8
-        torch.testing.assert_close(
-            alone.states[row, length:, 1], alone.states[row, length - 1, 1] + beyond * alone.states[row, -1, 3]
-        )
-        assert origin(start) == ("merge", generation.episode_seed(0, row))
-    (tmp_path / "two").mkdir()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "two"))
-    first = generation.shard("merge", generation.episode_seed(0, 0))
-    generation.episode("merge", generation.episode_seed(0, 0))
-    first.write_bytes(first.read_bytes()[:-20])  # damaged: driven again
-    two = generation.demonstrations("merge", 2, 0, 2, lambda: None)
-    assert two.hash == alone.hash
-    monkeypatch.setattr(expert, "drive", lambda *_, **options: pytest.fail("driven though it was kept"))
-    assert generation.demonstrations("merge", 2, 0, 1, lambda: None).hash == alone.hash
+        straight = found.states[row, length - 1, 1] + beyond * found.states[row, -1, 3]
+        torch.testing.assert_close(found.states[row, length:, 1], straight)
+        assert origin(begun) == ("merge", generation.episode_seed(0, 2 * row))
+    shard = generation.shard("merge", driven[-1])
+    shard.write_bytes(shard.read_bytes()[:-20])  # damaged: driven again
+    other = generation.demonstrations("merge", 2, 0, 1, lambda: None)
+    assert driven == [generation.episode_seed(0, number) for number in (0, 1, 2, 2)]
+    assert other.hash != found.hash
+    assert generation.demonstrations("merge", 2, 0, 1, lambda: None).hash == other.hash
+    assert len(driven) == 4
 
 
-def test_an_episode_that_raises_counts_as_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    whole = np.ones((3, 5, 7), dtype=np.float32)
+@pytest.mark.slow
+def test_demonstrations_do_not_depend_on_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(expert.SEARCH, "roundabout", replace(expert.SEARCH["roundabout"], budget=SHORT))
+    fork = multiprocessing.get_context("fork")  # whose processes know the smaller budget
+    monkeypatch.setattr(multiprocessing, "get_context", lambda kind: fork)
+    found = []
+    for workers in (1, 2):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / f"{workers}"))
+        found.append(generation.demonstrations("roundabout", 1, 0, workers, lambda: None))
+    assert found[0].hash == found[1].hash
 
+
+def test_an_episode_that_raises_counts_as_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     def drive(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
         if seed == generation.episode_seed(0, 0):
             raise RuntimeError("the simulator broke")
-        return whole, seed != generation.episode_seed(0, 1)
+        return WHOLE, seed != generation.episode_seed(0, 1)
 
     monkeypatch.setattr(expert, "drive", drive)
     found = generation.demonstrations("merge", 2, 0, 1, lambda: None)
     assert (found.provenance["driven"], found.provenance["rejected"]) == (4, 2)
     assert not generation.shard("merge", generation.episode_seed(0, 0)).exists()  # next time it is driven again
     assert generation.shard("merge", generation.episode_seed(0, 1)).exists()
-    monkeypatch.setattr(expert, "drive", lambda *_, **options: (whole, False))
+    monkeypatch.setattr(expert, "drive", lambda *_, **options: (WHOLE, False))
     with pytest.raises(UserError, match="expected 1 successful episodes of 4, found 0"):
         generation.demonstrations("exit", 1, 0, 1, lambda: None)
 
 
 @pytest.mark.parametrize("failure", [MemoryError(), OSError(24, "Too many open files")])
-def test_a_machine_that_fails_decides_nothing(failure: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-
+def test_a_machine_that_fails_decides_nothing(failure: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(name: str, seed: int, blind: bool) -> tuple[np.ndarray, bool]:
         raise failure
 
@@ -324,7 +309,7 @@ def test_a_machine_that_fails_decides_nothing(failure: Exception, tmp_path: Path
         broken.setattr(expert, "drive", fail)
         with pytest.raises(UserError, match=r"driving 'merge', seed \d+: the machine failed"):
             generation.demonstrations("merge", 1, 0, 1, lambda: None)
-    monkeypatch.setattr(expert, "drive", lambda *_, **options: (np.ones((3, 5, 7), dtype=np.float32), True))
+    monkeypatch.setattr(expert, "drive", lambda *_, **options: (WHOLE, True))
     assert generation.demonstrations("merge", 1, 0, 1, lambda: None).provenance["rejected"] == 0
 
 

@@ -1,7 +1,7 @@
 """What five drives teach: agreement of decisions and errors of distance, of policies of which it is known."""
 
 import runpy
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,16 +16,21 @@ from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, decision_seconds
 from ftl_lightning.evaluation.closed_loop import PlanFollower
 from ftl_lightning.seeding import EVALUATION_SEED
+from tests.conftest import ROOT
 
 TASK = "roundabout third exit"
 
 
 @pytest.fixture(scope="module")
 def benchmark() -> dict[str, Any]:
-    return runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "driving" / "decisions.py"))
+    return runpy.run_path(str(ROOT / "benchmarks" / "driving" / "decisions.py"))
 
 
-def test_who_plans_what_the_expert_drives_agrees_and_drives_as_far(benchmark: dict[str, Any]) -> None:
+@pytest.mark.slow
+def test_who_plans_what_the_expert_drives_agrees_and_drives_as_far(
+    benchmark: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(expert.SEARCH, TASK, replace(expert.SEARCH[TASK], budget=6))  # whatever the expert decides
     loop = DOMAIN.closed_loop
     assert loop is not None
     starts = DOMAIN.source(None).starts(TASK, 1, EVALUATION_SEED + benchmark["SEED"])
@@ -54,9 +59,7 @@ def test_who_plans_what_the_expert_drives_agrees_and_drives_as_far(benchmark: di
 
 def test_go_is_speeding_up_and_wait_is_all_else(benchmark: dict[str, Any]) -> None:
     said = [
-        {"drive": 0.0, "go": 1.0, "agreed": 1.0},
-        {"drive": 0.0, "go": 0.0, "agreed": 0.0},
-        {"drive": 1.0, "go": 0.0, "agreed": 1.0},
+        {"drive": drive, "go": go, "agreed": agreed} for drive, go, agreed in ((0.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
     ]
     found = benchmark["summary"](said)
     assert found["agreement"] == pytest.approx(2 / 3)

@@ -1,47 +1,43 @@
-"""Driving through the command line: pretraining, inversion, closed loop, mistakes."""
+"""Driving through the command line: inversion, closed loop, mistakes."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import pandas as pd
 import pytest
 import torch
 
-from ftl_lightning.cli import main
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.domains.driving.expert import SEARCH
+from ftl_lightning.domains.driving.foresight import VETOES, Foresight
 from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.shipped import training_set
-from ftl_lightning.domains.driving.traffic import SCENARIO, STATE, TRAFFIC, origin
+from ftl_lightning.domains.driving.traffic import BELIEF, SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.views import VIEWS
+from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import planner
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.learning.model_config import find_view
 from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.seeding import generator
-from tests.conftest import CONF, ROOT
-
-FIT = ["--config", str(CONF / "driving.yaml")]
-INVERT = ["--config", str(CONF / "driving.yaml")]
-SMALL = [
-    "--model.denoiser_args={hidden_dim: 16, depth: 2}",
-    "--data.samples_per_concept=6",
-    "--data.validation_per_concept=2",
-    "--data.batch_size=16",
-    "--data.steps_per_epoch=10",
-    "--trainer.max_steps=20",
-]
-QUICK = ["--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.figures=2"]
-QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+from tests import tiny
+from tests.conftest import CONF, ROOT, refused, succeed
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a small pretrained model."""
-    folder = tmp_path_factory.mktemp("driving")
-    assert main(["fit", *FIT, *SMALL, *QUICK, *QUIET, f"--trainer.logger.init_args.save_dir={folder}"]) == 0
-    return folder / "driving" / "fit" / "pretrained"
+@pytest.fixture
+def short_sighted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An expert that searches a tenth as much, which is enough, and a veto that imagines a tenth as much."""
+    monkeypatch.setitem(SEARCH, "roundabout", replace(SEARCH["roundabout"], budget=8))
+    monkeypatch.setitem(VETOES, BELIEF, Foresight(2, 2))
 
 
 def test_the_shipped_demonstrations() -> None:
@@ -59,26 +55,39 @@ def test_the_shipped_demonstrations() -> None:
         scenario = part.initial_states.require_scenes()[:, None, -2]
         assert torch.equal(part.observed[SCENARIO][..., 0], scenario.expand(part.states.shape[:2]))
     # Each is where the seed in its card puts it.
-    again = source.starts("exit", 40, 0)
+    again = source.starts("exit", 1, 0)
     assert again is not None
-    first = train.select("exit").initial_states.require_scenes()[0]
-    assert any(torch.allclose(first, row, atol=1e-3) for row in again.require_scenes())
+    first = train.select("exit").initial_states.require_scenes()[:1]
+    torch.testing.assert_close(first, again.require_scenes(), atol=1e-3, rtol=0)
 
 
-def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
-    options = ["--data.steps=3", "--model.budget.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
-    beside = "--evaluation.environments=[step veto]"
-    assert main(["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, beside]) == 0
-    rows = pd.read_csv("logs/driving/invert/results.csv", keep_default_na=False)
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_sighted")
+def test_invert_learns_the_roundabout_and_drives_it(tiny_of: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inverting again, with another K, drives none of the reference lines again."""
+    monkeypatch.setattr("ftl_lightning.domains.driving.rendering.BETWEEN", 1)
+    made: list[str] = []
+
+    def recorded(name: str, make: Any) -> Any:
+        return lambda goal, *rest: (made.append(name), make(goal, *rest))[1]
+
+    for name, make in list(POLICIES.items()):
+        monkeypatch.setitem(POLICIES, name, recorded(name, make))
+    options = ["--data.steps=2", "--model.budget.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
+    options += ["--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=1", "--evaluation.results=r.csv"]
+    options += ["--evaluation.environments=[step veto]", *tiny.QUIET]
+    run = ["invert", f"--config={CONF / 'driving.yaml'}", f"--model.pretrained={tiny_of('driving')}", *options]
+    succeed(*run)
+    rows = pd.read_csv("r.csv", keep_default_na=False)
     ours = rows[rows["K"] == 2]
     names = ("success", "strict success", "crash", "return", "length")
     outcomes = {f"closed loop {name}{veto}" for name in names for veto in ("", " (step veto)")}
     assert outcomes <= set(ours["metric"])
-    assert {metric for metric in set(ours["metric"]) - outcomes if not metric.startswith(("won against", "lost against"))} == {
-        "novelty"
-    }
+    rest = {metric for metric in set(ours["metric"]) - outcomes if not metric.startswith(("won against", "lost against"))}
+    assert rest == {"novelty"}
     regressions = ("nearest demonstration", "ridge regression", "MLP regression")
     policies = ("IDLE", "random", "FASTER", *regressions, "expert (oracle)")
+    assert sorted(set(made)) == sorted(policies) == sorted(POLICIES)
     for outcome in ("won", "lost"):
         shown = {metric for metric in set(ours["metric"]) if metric.startswith(outcome)}
         assert shown == {f"{outcome} against {name}{veto}" for name in policies for veto in ("", " (step veto)")}
@@ -90,29 +99,9 @@ def test_invert_learns_the_roundabout_and_drives_it(model: Path) -> None:
             assert won - lost == pytest.approx(rates[0] - rates[1])
         oracle = rows[(rows["method"] == "expert (oracle)") & (rows["metric"] == f"closed loop strict success{veto}")]
         assert oracle["value"].tolist() == [1.0]
-
-
-def test_an_environment_that_there_is_not(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = ["invert", *INVERT, f"--model.pretrained={model}", *QUIET, "--data.demonstrations_per_concept=2"]
-    assert main([*run, "--evaluation.environments=[crystal ball]"]) == 2
-    told = "evaluation.environments: expected one of simulation veto, step veto, found 'crystal ball'"
-    assert told in capsys.readouterr().err
-
-
-def test_cells_share_what_reference_policies_did(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Inverting again, with another K, drives none of them again."""
-    made: list[str] = []
-
-    def recorded(name: str, make: Any) -> Any:
-        return lambda goal, *rest: (made.append(name), make(goal, *rest))[1]
-
-    for name, make in list(POLICIES.items()):
-        monkeypatch.setitem(POLICIES, name, recorded(name, make))
-    options = ["--data.steps=2", "--model.budget.samples=2", "--data.demonstrations_per_concept=2", "--evaluation.suites=[paper]"]
-    for components in (1, 2):
-        run = ["invert", *INVERT, f"--model.pretrained={model}", *options, *QUICK, *QUIET, "--seed_everything=5"]
-        assert main([*run, f"--model.components={components}", "--evaluation.samples=1", "--evaluation.results=r.csv"]) == 0
-    assert sorted(made) == sorted(POLICIES)
+    before = list(made)
+    succeed(*run, "--model.components=1", "--evaluation.figures=0")
+    assert made == before
     rows = pd.read_csv("r.csv", keep_default_na=False)
     assert set(rows[rows["K"] > 0]["K"]) == {1, 2}
     assert set(rows[rows["K"] == 0]["method"]) == set(POLICIES)
@@ -136,37 +125,32 @@ def test_the_shipped_model_knows_the_training_scenarios() -> None:
         assert (plans[:, 1] - following).norm(dim=1).mean() < 0.9 * (kept - following).norm(dim=1).mean()
 
 
-def test_generate_writes_what_invert_reads(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["generate", "driving", "--task=merge", "--count=2", "--out=demos.safetensors"]) == 0
-    found = Demonstrations.load("demos.safetensors")
+@pytest.mark.usefixtures("short_sighted")
+def test_generate_writes_what_invert_reads() -> None:
+    succeed("generate", "driving", "--task=roundabout", "--count=1", "--out=demos.safetensors")
+    found = InversionData("driving", demonstrations="demos.safetensors").demonstrations
     assert found.states.shape[2] == 7
     assert {name: values.shape[2:] for name, values in found.observed.items()} == {TRAFFIC: (35,), SCENARIO: (1,)}
     assert found.scenes is not None
-    assert found.scenes.shape == (2, 37)
-    capsys.readouterr()
-    for arguments, expected in (
-        (["generate", "driving", "--task=motorway"], "driving task: expected one of highway"),
-        (["generate", "driving", "--task=merge", "--workers=0"], "workers: expected 1 or more"),
-        (["fit", *FIT, *SMALL, *QUIET, "--data.samples_per_concept=101"], "expected at most 100 episodes"),
-        (["fit", *FIT, *SMALL, *QUIET, "--model.view=map", "--model.perturb=true"], "model.perturb: expected a view that can"),
-        (["fit", *FIT, *SMALL, *QUIET, "--model.view=mirror"], "model.view: expected one of '', 'map', 'steps'"),
-    ):
-        assert main(arguments) == 2
-        assert expected in capsys.readouterr().err
+    assert found.scenes.shape == (1, 37)
 
 
-def test_a_file_whose_states_do_not_fit(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wide = Demonstrations(
-        states=torch.zeros(1, 9, 8),
-        lengths=torch.tensor([9]),
-        domain="driving",
-        state_names=tuple("abcdefgh"),
-        state_units=("",) * 8,
-        concepts=("roundabout",),
-        observed={TRAFFIC: torch.zeros(1, 9, 35), SCENARIO: torch.zeros(1, 9, 1)},
-        per_step=(TRAFFIC, SCENARIO),
-        scenes=torch.zeros(1, 37),
-    )
+def test_mistakes_and_a_file_whose_states_do_not_fit(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UserError, match=r"data.samples_per_concept: expected at most 100 episodes"):
+        training_set("train", 101)
+    with pytest.raises(UserError, match=r"model.view: expected one of '', 'map', 'steps'"):
+        find_view(DOMAIN, "mirror")
+    config = read_model(GenerativeModel, ROOT / "pretrained" / "driving").config
+    with pytest.raises(UserError, match=r"model.perturb: expected a view that can"):
+        GenerativeModel(Prepared(replace(config, view="map", perturb=True), DOMAIN, Mock(), MagicMock()))
+    environments = "evaluation.environments: expected one of simulation veto, step veto, found 'crystal ball'"
+    with pytest.raises(UserError, match=environments):
+        Evaluator(environments=["crystal ball"]).on_fit_start(Mock(), Mock(domain=DOMAIN, model=Mock(max_steps=100)))
+    refused(capsys, ["generate", "driving", "--task=motorway"], "driving task: expected one of highway")
+    refused(capsys, ["generate", "driving", "--task=merge", "--workers=0"], "workers: expected 1 or more")
+    seen = {TRAFFIC: torch.zeros(1, 9, 35), SCENARIO: torch.zeros(1, 9, 1)}
+    more = {"observed": seen, "per_step": (TRAFFIC, SCENARIO), "scenes": torch.zeros(1, 37), "concepts": ("roundabout",)}
+    wide = Demonstrations(torch.zeros(1, 9, 8), torch.tensor([9]), "driving", tuple("abcdefgh"), ("",) * 8, **more)  # type: ignore[arg-type]
     wide.save("wide.safetensors")
-    assert main(["invert", *INVERT, *QUIET, f"--model.pretrained={model}", "--data.demonstrations=wide.safetensors"]) == 2
-    assert "expected shape (demo, time, 7), found (1, 9, 8)" in capsys.readouterr().err
+    with pytest.raises(UserError, match=r"expected shape \(demo, time, 7\), found \(1, 9, 8\)"):
+        InversionData("driving", demonstrations="wide.safetensors")

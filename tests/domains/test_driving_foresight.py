@@ -1,16 +1,22 @@
 """The planner's veto: how far it looks, and that beliefs know nothing that cannot be seen."""
 
+import itertools
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ftl_lightning.domains.driving.environment import DrivingEnvironment
-from ftl_lightning.domains.driving.expert import BLIND, plan_blind
-from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Worlds
+from ftl_lightning.domains.driving.expert import BLIND, Blind, plan_blind
+from ftl_lightning.domains.driving.foresight import FRAMES, VETOES, Beliefs, Foresight, Worlds
 from ftl_lightning.domains.driving.scenarios import EXITS, SCENARIOS, make
 from ftl_lightning.domains.driving.simulation import save
 from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
+
+
+def slow(*cases: Any) -> list[Any]:
+    """Cases that only a full run looks at."""
+    return [pytest.param(*([case] if isinstance(case, str) else case), marks=pytest.mark.slow) for case in cases]
 
 
 def start(name: str, seed: int) -> Any:
@@ -47,16 +53,14 @@ def test_who_looks_ahead_sees_a_crash_that_cannot_be_averted_any_more(veto: str,
     found = risks(env, "merge", veto)
     assert (found[named["IDLE"]] == 0) == keeps
     assert found[named["LANE_LEFT"]] == 0
+    assert risks(blocked(20.0), "merge", veto)[named["IDLE"]] == 1  # everybody sees a crash in the next step
 
 
-@pytest.mark.parametrize("veto", VETOES)
-def test_everybody_sees_a_crash_in_the_next_step(veto: str) -> None:
-    env = blocked(20.0)
-    assert risks(env, "merge", veto)[env.action_type.actions_indexes["IDLE"]] == 1
+FAST = [("merge", BELIEF), ("roundabout", SIMULATION), ("intersection", STEP)]
+PAIRS = itertools.product(("roundabout", "intersection", "merge"), VETOES)
 
 
-@pytest.mark.parametrize("veto", VETOES)
-@pytest.mark.parametrize("name", ["roundabout", "intersection", "merge"])
+@pytest.mark.parametrize(("name", "veto"), [*FAST, *slow(*(pair for pair in PAIRS if pair not in FAST))])
 def test_looking_ahead_leaves_the_simulation_as_it_was(name: str, veto: str) -> None:
     env = start(name, 3)
     before, config = save(env), dict(env.config)
@@ -64,12 +68,8 @@ def test_looking_ahead_leaves_the_simulation_as_it_was(name: str, veto: str) -> 
     after = save(env)
     assert first == again
     assert env.config == config
-    assert (after.time, after.steps, after.road_steps, after.random) == (
-        before.time,
-        before.steps,
-        before.road_steps,
-        before.random,
-    )
+    counters = ("time", "steps", "road_steps", "random")
+    assert [getattr(after, name) for name in counters] == [getattr(before, name) for name in counters]
     for (one, was), (other, now) in zip(before.vehicles, after.vehicles, strict=True):
         assert one is other
         assert was.keys() == now.keys()
@@ -91,18 +91,17 @@ def hide(env: Any, rng: np.random.Generator) -> None:
     env.np_random.bit_generator.state = np.random.default_rng(rng.integers(99)).bit_generator.state
 
 
-@pytest.mark.parametrize("name", ["roundabout", "intersection", "merge"])
+@pytest.mark.parametrize("name", ["merge", *slow("roundabout", "intersection")])
 def test_beliefs_know_nothing_that_cannot_be_seen(name: str) -> None:
     told = []
-    for seed in range(4):
-        for hidden in (None, 0, 1):
-            env = start(name, seed)
-            if hidden is not None:
-                hide(env, np.random.default_rng([seed, hidden]))
-            looked = worlds(env, name, BELIEF)
-            decisions = range(env.action_space.n)
-            told.append([(looked.risk(one), None if (at := looked.state(one)) is None else at.tolist()) for one in decisions])
-        assert told[-3] == told[-2] == told[-1]
+    for hidden in (None, 0, 1):
+        env = start(name, 0)
+        if hidden is not None:
+            hide(env, np.random.default_rng(hidden))
+        looked = worlds(env, name, BELIEF)
+        decisions = range(env.action_space.n)
+        told.append([(looked.risk(one), None if (at := looked.state(one)) is None else at.tolist()) for one in decisions])
+    assert told[0] == told[1] == told[2]
 
 
 def test_the_simulation_knows_what_is_hidden() -> None:
@@ -151,7 +150,7 @@ def test_an_episode_repeats(veto: str) -> None:
         env = DrivingEnvironment(veto)
         env.reset(seed=5, options={"task": "roundabout"})
         faster = np.array([env._env.action_type.actions_indexes["FASTER"]], dtype=np.float32)
-        ways.append([env.step(faster)[0]["traffic"].tolist() for _ in range(3)])
+        ways.append([env.step(faster)[0]["traffic"].tolist() for _ in range(2)])
     assert ways[0] == ways[1]
 
 
@@ -161,9 +160,11 @@ def decided(env: Any, name: str) -> int:
     return plan_blind(env, name, beliefs, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("name", ["roundabout", "merge"])
-def test_the_blind_expert_knows_nothing_that_cannot_be_seen(name: str) -> None:
-    for seed in range(3):
+@pytest.mark.parametrize("name", ["merge", *slow("roundabout")])
+def test_the_blind_expert_knows_nothing_that_cannot_be_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftl_lightning.domains.driving.expert.BLIND", Blind(beliefs=2, expansions=2))
+    monkeypatch.setitem(VETOES, BELIEF, Foresight(2, 2))
+    for seed in range(2):
         env, other = start(name, seed), start(name, seed)
         hide(other, np.random.default_rng(seed))
         assert decided(env, name) == decided(other, name)

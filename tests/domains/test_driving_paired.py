@@ -1,13 +1,14 @@
 """Which method is ahead in driving, episode by episode."""
 
 import runpy
-from pathlib import Path
 
 import torch
 
+from tests.conftest import ROOT
+
 
 def test_episodes_from_the_same_starts_are_paired() -> None:
-    compared = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "driving" / "paired.py"))["compared"]
+    compared = runpy.run_path(str(ROOT / "benchmarks" / "driving" / "paired.py"))["compared"]
     all_but_one = torch.arange(20) != 3
     every = {
         "ours": {"belief": all_but_one, "step": all_but_one},

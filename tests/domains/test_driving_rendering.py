@@ -1,13 +1,18 @@
+"""Figures and films of traffic."""
+
 import itertools
 
+import pytest
 import torch
 from matplotlib.figure import Figure
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.driving.rendering import BETWEEN, film, render
+from ftl_lightning.domains.driving.rendering import film, render
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.driving.traffic import TRAFFIC
 from ftl_lightning.domains.rollout import Rollout
+
+EXIT = Demonstrations.load(SHIPPED / "exit.safetensors").rows([0])
 
 
 def panels(figure: Figure) -> int:
@@ -29,28 +34,27 @@ def test_a_figure_shows_at_most_eight_plans_and_says_what_the_colours_mean() -> 
     assert few.get_suptitle() == "exit"
 
 
-def test_an_episodes_pictures_have_one_size_and_end_when_nothing_moves() -> None:
-    shipped = Demonstrations.load(SHIPPED / "exit.safetensors").rows([0])
-    states = shipped.states[0]
-    observed = {name: values[:, :1].repeat(1, 6, 1) for name, values in shipped.observed.items()}
-    observed[TRAFFIC][0, :4, :7] = states[:4]  # the vehicle moves three times
-    observed[TRAFFIC][0, 4:, :7] = states[3]
-    episode = Rollout(shipped.initial_states, observed, torch.zeros(1, dtype=torch.bool), [{}])
-    pictures = film(episode, torch.stack([states[:8]] * 5))
-    assert len(pictures) == 3 * BETWEEN + 1
+def episode(seen: torch.Tensor, **info: bool) -> Rollout:
+    """An episode from the shipped exit in which the controlled vehicle is seen in these states ``(time, 7)``."""
+    observed = {name: values[:, :1].repeat(1, len(seen), 1) for name, values in EXIT.observed.items()}
+    observed[TRAFFIC][0, :, :7] = seen
+    return Rollout(EXIT.initial_states, observed, torch.zeros(1, dtype=torch.bool), [info])
+
+
+@pytest.mark.slow
+def test_pictures_of_an_episode_have_one_size_end_when_nothing_moves_and_tell_a_crash_and_an_arrival(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ftl_lightning.domains.driving.rendering.BETWEEN", 2)
+    states = EXIT.states[0]
+    moving = episode(states[[0, 1, 1, 1]])  # the vehicle moves once
+    pictures = film(moving, torch.stack([states[:8]] * 3))
+    assert len(pictures) == 2 + 1
     assert all((one != other).any() for one, other in itertools.pairwise(pictures))  # between decisions, too
     assert len({picture.shape for picture in pictures}) == 1
-
-
-def test_a_crash_and_an_arrival_are_captioned() -> None:
-    shipped = Demonstrations.load(SHIPPED / "exit.safetensors").rows([0])
-    states = shipped.states[0]
-    observed = {name: values[:, :1].repeat(1, 3, 1) for name, values in shipped.observed.items()}
-    observed[TRAFFIC][0, :, :7] = states[:3]
-    films = []
-    for told in ({"crashed": True}, {"arrived": True, "crashed": False}, {"arrived": False}):
-        episode = Rollout(shipped.initial_states, observed, torch.zeros(1, dtype=torch.bool), [told])
-        films.append(film(episode, torch.stack([states[:8]] * 2)))
-    for one, other in ((0, 1), (0, 2), (1, 2)):
-        assert (films[one][0] == films[other][0]).all()
-        assert (films[one][-1] != films[other][-1]).any()
+    monkeypatch.setattr("ftl_lightning.domains.driving.rendering.BETWEEN", 1)
+    infos = ({"crashed": True}, {"arrived": True, "crashed": False}, {"arrived": False})
+    films = [film(episode(states[:2], **info), states[None, :8]) for info in infos]
+    for one, other in itertools.combinations(films, 2):
+        assert (one[0] == other[0]).all()
+        assert (one[-1] != other[-1]).any()

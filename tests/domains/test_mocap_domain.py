@@ -1,6 +1,5 @@
 """Motion capture as a domain: body, concepts, demonstrations from a folder, and where behaviour starts."""
 
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,45 +10,40 @@ import torch
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.data import InversionData, PretrainingData, shares
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.mocap import DOMAIN
+from ftl_lightning.domains.mocap import DOMAIN, skeleton
 from ftl_lightning.domains.mocap.measures import MEASURES, bone_error
 from ftl_lightning.domains.mocap.recordings import FILE, Recordings
 from ftl_lightning.domains.mocap.segments import SEGMENTS
-from ftl_lightning.domains.mocap.skeleton import (
-    BONES,
-    COLUMNS,
-    GROUPS,
-    HORIZON,
-    JOINTS,
-    LEFT,
-    MIRROR,
-    NECK,
-    R_SHOULDER,
-    R_WRIST,
-    RIGHT,
-    WRISTS,
-    as_joints,
-    bone_lengths,
-    mirrored,
-)
+from ftl_lightning.domains.mocap.skeleton import HORIZON, R_WRIST, as_joints, bone_lengths, mirrored
 from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, at_rest, glitches, hang_down, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
 from ftl_lightning.domains.mocap.views import with_rigid_bones
 from ftl_lightning.errors import UserError
-from tests.domains.mocap_samples import folder, motion, recordings
+from tests.domains.mocap_samples import folder, motion, named_recordings, recordings
 
 NAME = "ftl_lightning.domains.mocap:DOMAIN"
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return folder(tmp_path / "recordings")
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of recordings that no test changes."""
+    return folder(tmp_path_factory.mktemp("recordings"))
 
 
-def test_every_column_belongs_to_one_part_of_the_body() -> None:
-    assert sorted(column for group in GROUPS.values() for column in group) == list(range(len(COLUMNS)))
-    assert {COLUMNS[column].split(".")[0] for column in GROUPS["arms"]} == {"RElbow", "RWrist", "LElbow", "LWrist"}
+def test_every_column_belongs_to_one_part_of_the_body_and_compositions_are_told_with_the_whole_and_by_its_parts() -> None:
+    assert sorted(column for group in skeleton.GROUPS.values() for column in group) == list(range(len(skeleton.COLUMNS)))
+    arms = {skeleton.COLUMNS[column].split(".")[0] for column in skeleton.GROUPS["arms"]}
+    assert arms == {"RElbow", "RWrist", "LElbow", "LWrist"}
+    tasks = SUITES["composition"].tasks
+    parts = {task.setting: dict(task.on) for task in tasks if task.goal == "jumping jacks + walk"}
+    assert parts == {
+        "new + training": {},
+        "new + training, by parts of the body": {"jumping jacks": ("arms", "trunk"), "walk": ("legs",)},
+    }
+    every = [column for groups in parts["new + training, by parts of the body"].values() for column in DOMAIN.plans.grouped(groups)]
+    assert sorted(every) == list(range(42))
+    with pytest.raises(UserError, match="expected one of arms, legs, trunk after '@', found 'leg'"):
+        DOMAIN.plans.grouped(("leg",))
 
 
 def test_generated_bones_are_as_long_as_at_the_start_and_recorded_ones_stay_as_they_are() -> None:
@@ -63,8 +57,8 @@ def test_generated_bones_are_as_long_as_at_the_start_and_recorded_ones_stay_as_t
     assert (rigid - generated).abs().max() < 0.3
     assert bone_error("walk", generated, InitialStates(start)).min() > 0.02
     assert bone_error("walk", rigid, InitialStates(start)).max() < 1e-5
-    moved = [as_joints(rigid)[..., joint, :] - as_joints(generated)[..., joint, :] for joint in (R_SHOULDER, NECK)]
-    assert not torch.stack(moved).any()  # no rigid bone leads there
+    for joint in (skeleton.R_SHOULDER, skeleton.NECK):  # no rigid bone leads there
+        assert torch.equal(as_joints(rigid)[..., joint, :], as_joints(generated)[..., joint, :])
 
 
 def test_the_mirror_image_exchanges_left_and_right() -> None:
@@ -72,15 +66,15 @@ def test_the_mirror_image_exchanges_left_and_right() -> None:
     states[:, 3 * R_WRIST] += 0.3
     other = mirrored(states)
     assert torch.equal(mirrored(other), states)
-    assert [JOINTS[joint] for joint in MIRROR][:2] == ["LHip", "LKnee"]
-    assert torch.equal(as_joints(other)[:, LEFT, 0], -as_joints(states)[:, RIGHT, 0])
-    assert torch.equal(as_joints(other)[:, LEFT, 1:], as_joints(states)[:, RIGHT, 1:])
+    assert [skeleton.JOINTS[joint] for joint in skeleton.MIRROR][:2] == ["LHip", "LKnee"]
+    assert torch.equal(as_joints(other)[:, skeleton.LEFT, 0], -as_joints(states)[:, skeleton.RIGHT, 0])
+    assert torch.equal(as_joints(other)[:, skeleton.LEFT, 1:], as_joints(states)[:, skeleton.RIGHT, 1:])
     lengths = bone_lengths(states)
-    assert lengths.shape == (5, len(BONES))
+    assert lengths.shape == (5, len(skeleton.BONES))
     assert lengths.sort(dim=1).values == pytest.approx(bone_lengths(other).sort(dim=1).values)
 
 
-def test_texts_are_cleaned_and_mirrored() -> None:
+def test_texts_are_cleaned_and_mirrored_and_goals_may_join_several_concepts_some_of_them_new() -> None:
     assert cleaned("charleston_side_by_side_female ") == "charleston side by side female"
     assert cleaned("ZombieWalk") == "zombie walk"
     assert mirrored_text("walk, 90-degree left turn") == "walk, 90-degree right turn"
@@ -88,9 +82,6 @@ def test_texts_are_cleaned_and_mirrored() -> None:
     assert mirrored_text("climb, left, right, upright") == "climb, right, left, upright"
     assert all(cleaned(text) == text for text in TRAINING_CONCEPTS)
     assert len(set(TRAINING_CONCEPTS)) == len(TRAINING_CONCEPTS)
-
-
-def test_new_concepts_are_no_training_concepts_and_goals_may_join_several() -> None:
     assert not set(NEW_CONCEPTS) & set(TRAINING_CONCEPTS)
     assert not [text for text in TRAINING_CONCEPTS if "jumping jack" in text]
     reads = DOMAIN.concepts.reads
@@ -104,19 +95,8 @@ def test_new_concepts_are_no_training_concepts_and_goals_may_join_several() -> N
     assert all(
         reads(goal) for name in ("training", "paper", "composition", "validation") for goal in DOMAIN.concepts.suites[name].goals
     )
-
-
-def test_compositions_are_told_with_the_whole_body_and_by_its_parts() -> None:
-    tasks = SUITES["composition"].tasks
-    parts = {task.setting: dict(task.on) for task in tasks if task.goal == "jumping jacks + walk"}
-    assert parts == {
-        "new + training": {},
-        "new + training, by parts of the body": {"jumping jacks": ("arms", "trunk"), "walk": ("legs",)},
-    }
-    every = [column for groups in parts["new + training, by parts of the body"].values() for column in DOMAIN.plans.grouped(groups)]
-    assert sorted(every) == list(range(42))
-    with pytest.raises(UserError, match="expected one of arms, legs, trunk after '@', found 'leg'"):
-        DOMAIN.plans.grouped(("leg",))
+    data = PretrainingData(domain=NAME, root="/nowhere")  # nothing is read before it is needed
+    assert data.encoder(DOMAIN.concepts.descriptions).shape == (len(DOMAIN.concepts.descriptions), 384)
 
 
 def test_a_frozen_frame_is_still_has_its_bones_and_is_no_action() -> None:
@@ -129,11 +109,6 @@ def test_a_frozen_frame_is_still_has_its_bones_and_is_no_action() -> None:
     assert found["bone error"].max() < 1e-4
 
 
-def test_the_table_holds_every_description() -> None:
-    data = PretrainingData(domain=NAME, root="/nowhere")  # nothing is read before it is needed
-    assert data.encoder(DOMAIN.concepts.descriptions).shape == (len(DOMAIN.concepts.descriptions), 384)
-
-
 def test_trials_are_cut_at_glitches_and_into_parts_that_lose_no_window() -> None:
     states = motion(400, 1)
     states[150:] += 0.5
@@ -141,15 +116,15 @@ def test_trials_are_cut_at_glitches_and_into_parts_that_lose_no_window() -> None
     assert glitches(flat) == [150]
     found = pieces(flat)
     assert [len(piece) for piece in found] == [128, 53, 128, 128, 56]
-    starts = sum(len(piece) - HORIZON + 1 for piece in found)
-    assert starts == (150 - HORIZON + 1) + (250 - HORIZON + 1)
+    assert sum(len(piece) - HORIZON + 1 for piece in found) == (150 - HORIZON + 1) + (250 - HORIZON + 1)
     assert [len(piece) for piece in pieces(flat, longest=None)] == [150, 250]
     assert not pieces(flat[:31])
     assert max(len(piece) for piece in found) == LONGEST
 
 
-def test_training_has_every_piece_and_its_mirror_image(root: Path) -> None:
-    found = Recorded(root).split("train", 1, 0)
+def test_training_has_every_piece_and_its_mirror_image_and_validation_is_of_other_trials(shared: Path, tmp_path: Path) -> None:
+    source = Recorded(shared)
+    found = source.split("train", 1, 0)
     assert found.concepts.count("walk") == 8  # one of five trials is held out
     assert found.concepts.count("walk, veer left") == found.concepts.count("walk, veer right") == 2
     right = "basketball - forward dribble, 90-degree right turns, crossover dribble"
@@ -159,24 +134,17 @@ def test_training_has_every_piece_and_its_mirror_image(root: Path) -> None:
     assert torch.equal(mirrored(found.states[half[0], :70]), found.states[half[4], :70])
     assert torch.equal(found.observed[POSE], found.states)
     assert found.lengths.min() >= HORIZON
-
-
-def test_validation_is_of_other_trials(root: Path) -> None:
-    source = Recorded(root)
-    train, validation = source.split("train", 1, 0), source.split("validation", 1, 0)
-    assert validation.provenance["trials"] == ["02_05"]
-    assert not set(validation.provenance["trials"]) & set(train.provenance["trials"])
-    assert not set(HELD_OUT) & {*train.provenance["trials"], *validation.provenance["trials"]}
-
-
-def test_other_figures_and_other_descriptions_stay_out(tmp_path: Path) -> None:
+    validation = source.split("validation", 1, 0).provenance["trials"]
+    assert validation == ["02_05"]
+    assert not {*validation, *HELD_OUT} & set(found.provenance["trials"])
+    assert not set(HELD_OUT) & set(validation)
     recordings({"02_01": ("walk", motion(60, 1))}, kind="bvh_daz").save(tmp_path / FILE)
     with pytest.raises(UserError, match="expected trials of the training concepts for train, found none"):
         Recorded(tmp_path).split("train", 1, 0)
 
 
-def test_new_concepts_are_demonstrated_by_windows_that_start_at_rest(root: Path) -> None:
-    source = Recorded(root)
+def test_new_concepts_are_demonstrated_by_windows_of_a_folder_that_start_at_rest(shared: Path) -> None:
+    source = Recorded(shared)
     shown = [piece.states for piece in source._shown("jumping jacks")]
     assert sorted(map(len, shown)) == [54, 117]
     rest = [states[start : start + HORIZON] for states in shown for start in at_rest(states)]
@@ -190,17 +158,20 @@ def test_new_concepts_are_demonstrated_by_windows_that_start_at_rest(root: Path)
     assert torch.equal(source.draw("jumping jacks", len(rest) + 3, 0).states, more.states)
     assert not torch.equal(source.draw("jumping jacks", len(rest) + 3, 1).states, more.states)
     assert set(source.draw("walk", 9, 3).concepts) == {"walk"}
+    data = InversionData(NAME, root=str(shared), demonstrations_per_concept=3, suite="validation")
+    assert data.concepts == ("knee raise", "squat")
+    assert len(data.demonstrations) == 6
+    with pytest.raises(UserError, match="found 'chop wood', which none does"):
+        InversionData(NAME, root=str(shared), suite="database")
 
 
-def test_segments_of_ones_own_take_the_place_of_the_shipped_ones(root: Path) -> None:
+def test_segments_of_ones_own_take_the_place_of_the_shipped_ones_and_whole_trials_show_what_they_say(tmp_path: Path) -> None:
+    root = folder(tmp_path / "recordings")
     (root / SEGMENTS).write_text("trial_id,label,start30,stop30\n13_29,knee raise,10,70\n")
     source = Recorded(root)
     assert [len(piece.states) for piece in source._shown("knee raise")] == [60]
     with pytest.raises(UserError, match=r"task: expected a concept that trials in .* show, found 'jumping jacks', which none does"):
         source.draw("jumping jacks", 1, 0)
-
-
-def test_whole_trials_demonstrate_what_they_show(tmp_path: Path) -> None:
     trials = {"79_01": ("chop wood", motion(90, 1)), "80_71": ("chop wood", motion(100, 2))}
     recordings(trials).save(tmp_path / FILE)
     assert [len(piece.states) for piece in Recorded(tmp_path)._shown("chop wood")] == [90, 100]
@@ -209,12 +180,12 @@ def test_whole_trials_demonstrate_what_they_show(tmp_path: Path) -> None:
 def test_a_window_starts_where_a_motion_that_goes_to_and_fro_is_nearest_to_standing() -> None:
     states = torch.from_numpy(motion(1, 0)).reshape(1, 42).repeat(120, 1)
     lift = 0.5 - 0.5 * torch.cos(torch.arange(120) * 2 * torch.pi / 30)
-    states[:, [3 * WRISTS[0] + 2, 3 * WRISTS[1] + 2]] += lift[:, None]
+    states[:, [3 * skeleton.WRISTS[0] + 2, 3 * skeleton.WRISTS[1] + 2]] += lift[:, None]
     assert at_rest(states) == [0, 30, 60]
 
 
-def test_behaviour_starts_with_arms_down_in_trials_of_no_training_split(root: Path) -> None:
-    source = Recorded(root)
+def test_behaviour_starts_with_arms_down_in_trials_of_no_training_split_or_in_people_of_different_sizes(shared: Path) -> None:
+    source = Recorded(shared)
     found = source.starts("jumping jacks", 20, 0)
     poses = found.observed[POSE]
     assert poses.shape == (20, 42)
@@ -227,9 +198,6 @@ def test_behaviour_starts_with_arms_down_in_trials_of_no_training_split(root: Pa
     assert hang_down(source.starts("backflip", 20, 0).observed[POSE]).all()  # no trial shows it
     train = source.split("train", 1, 0).states.flatten(0, 1)
     assert torch.cdist(poses, train).min() > 0
-
-
-def test_without_recordings_people_of_different_sizes_stand_or_walk_with_their_arms_down() -> None:
     poses = Recorded(None).starts("walk", 5, 0).observed[POSE]
     assert hang_down(poses).all()
     assert len(poses.unique(dim=0)) == 5
@@ -239,24 +207,20 @@ def test_without_recordings_people_of_different_sizes_stand_or_walk_with_their_a
 
 
 @pytest.mark.parametrize("made", [None, "nowhere", "empty", "other", "file"])
-def test_a_missing_root_is_told_in_one_line(made: str | None, tmp_path: Path) -> None:
-    found = None if made is None else tmp_path / made
-    if found is not None and made in ("empty", "other"):
-        found.mkdir()
-    if found is not None and made == "other":
-        (found / "holiday.jpg").write_text("")
-    if found is not None and made == "file":
-        found.write_text("")
-    data = PretrainingData(domain=NAME, root=None if found is None else str(found))
+def test_a_missing_root_is_told_in_one_line(made: str | None) -> None:
+    if made in ("empty", "other"):
+        Path(made).mkdir()
+    if made in ("other", "file"):
+        Path("file" if made == "file" else "other/holiday.jpg").write_text("")
     with pytest.raises(UserError, match=r"mocap\.cs\.cmu\.edu.*python -m ftl_lightning prepare mocap --root") as told:
-        data.setup("fit")
+        PretrainingData(domain=NAME, root=made).setup("fit")
     assert "\n" not in str(told.value)
     with pytest.raises(UserError, match="prepare mocap"):
-        InversionData(NAME, root=None if found is None else str(found))
+        InversionData(NAME, root=made)
 
 
-def test_batches_are_windows_that_start_in_the_observed_pose(root: Path) -> None:
-    data = PretrainingData(domain=NAME, root=str(root), batch_size=64)
+def test_batches_are_windows_that_start_in_the_observed_pose(shared: Path) -> None:
+    data = PretrainingData(domain=NAME, root=str(shared), batch_size=64)
     data.setup("fit")
     batch = data.batch(3)
     assert batch.states.shape == (64, HORIZON, 42)
@@ -264,30 +228,22 @@ def test_batches_are_windows_that_start_in_the_observed_pose(root: Path) -> None
     assert not (batch.states[:, -1] == batch.states[:, -2]).all(dim=1).any()  # none reaches past an end
     every = data.every_window()
     assert len(every.states) == int((data.training.lengths - HORIZON + 1).sum())
+    resting = PretrainingData(domain=NAME, root=str(shared), batch_size=64)
+    resting.domain = replace(DOMAIN, plans=replace(DOMAIN.plans, at_rest=True))
+    resting.setup("fit")
+    still = resting.batch(3).states  # of a domain that comes to rest, windows reach past the end
+    assert (still[:, -1] == still[:, -2]).all(dim=1).any()
 
 
-def test_a_domain_that_comes_to_rest_lets_windows_reach_past_the_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    resting: Domain = replace(DOMAIN, plans=replace(DOMAIN.plans, at_rest=True))
-    monkeypatch.setattr("ftl_lightning.domains.mocap.DOMAIN", resting)
-    data = PretrainingData(domain="ftl_lightning.domains.mocap.domain:DOMAIN", root=str(root), batch_size=64)
-    data.domain = resting
-    data.setup("fit")
-    still = (data.batch(3).states[:, -1] == data.batch(3).states[:, -2]).all(dim=1)
-    assert still.any()
-
-
-def test_concepts_are_drawn_by_a_power_of_their_size() -> None:
+def test_concepts_are_drawn_by_a_power_of_their_size_where_a_balance_is_given(shared: Path) -> None:
     lengths = torch.tensor([10, 30, 60])
     found = Demonstrations(torch.zeros(3, 60, 1), lengths, "", ("x",), ("",), ("few", "many", "few"))
     assert shares(found, 1) == pytest.approx([0.1, 0.3, 0.6])
     assert shares(found, 0) == pytest.approx([0.5 / 7, 0.5, 3 / 7])
     few, many = 70**0.5, 30**0.5
     assert shares(found, 0.5)[1].item() == pytest.approx(many / (few + many))
-
-
-def test_balance_changes_what_is_drawn_and_none_does_not(root: Path) -> None:
-    plain = PretrainingData(domain=NAME, root=str(root), batch_size=512)
-    even = PretrainingData(domain=NAME, root=str(root), batch_size=512, balance=0)
+    plain = PretrainingData(domain=NAME, root=str(shared), batch_size=512)
+    even = PretrainingData(domain=NAME, root=str(shared), batch_size=512, balance=0)
     for data in (plain, even):
         data.setup("fit")
     assert "balance" not in plain.hparams
@@ -299,20 +255,10 @@ def test_balance_changes_what_is_drawn_and_none_does_not(root: Path) -> None:
         PretrainingData(domain=NAME, balance=2)
 
 
-def test_new_concepts_are_learned_from_what_a_folder_holds(root: Path) -> None:
-    data = InversionData(NAME, root=str(root), demonstrations_per_concept=3, suite="validation")
-    assert data.concepts == ("knee raise", "squat")
-    assert len(data.demonstrations) == 6
-    with pytest.raises(UserError, match="found 'chop wood', which none does"):
-        InversionData(NAME, root=str(root), suite="database")
-
-
 def test_recordings_give_every_training_concept() -> None:
     """Where recordings are named: all concepts, new ones too, and people to start from."""
-    named = os.environ.get("FTL_LIGHTNING_DATA")
-    if not named:
-        pytest.skip("FTL_LIGHTNING_DATA names no folder of recordings")
-    source = Recorded(Path(named))
+    named = named_recordings()
+    source = Recorded(named)
     train = source.split("train", 1, 0)
     assert set(train.concepts) == set(TRAINING_CONCEPTS)
     assert not set(train.provenance["trials"]) & set(HELD_OUT)
@@ -323,5 +269,5 @@ def test_recordings_give_every_training_concept() -> None:
     assert len(poses.unique(dim=0)) > 80
     lengths = bone_lengths(poses)[:, :2]
     assert ((lengths > 0.3) & (lengths < 0.55)).all()
-    other = Recordings.load(next(path for path in Path(named).glob("*.npz") if "segment" not in path.name))
+    other = Recordings.load(next(path for path in named.glob("*.npz") if "segment" not in path.name))
     assert len(other) == len(source.recordings)

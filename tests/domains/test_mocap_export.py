@@ -1,7 +1,6 @@
 """Motion as BVH files: read back by forward kinematics of their own, as Blender reads them."""
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.export import HIPS, TREE, bvh
@@ -19,17 +17,16 @@ from ftl_lightning.domains.mocap.skeleton import as_joints
 from ftl_lightning.domains.mocap.standing import standing_poses
 from ftl_lightning.domains.mocap.views import with_rigid_bones
 from ftl_lightning.errors import UserError
-from tests.conftest import ROOT
+from tests.conftest import ROOT, refused, succeed
+from tests.domains.mocap_samples import named_recordings
 from tests.domains.test_mocap_rendering import waving
 
 SHIPPED = ROOT / "pretrained" / "mocap"
 JACKS = SHIPPED / "jumping_jacks.safetensors"
+SAMPLE = ["sample", f"--pretrained={SHIPPED}", f"--concept={JACKS}", "--steps=2"]
 ENDS = {
-    "RightLeg": skeleton.R_ANKLE,
-    "LeftLeg": skeleton.L_ANKLE,
-    "RightForeArm": skeleton.R_WRIST,
-    "LeftForeArm": skeleton.L_WRIST,
-}
+    "RightLeg": skeleton.R_ANKLE, "LeftLeg": skeleton.L_ANKLE, "RightForeArm": skeleton.R_WRIST, "LeftForeArm": skeleton.L_WRIST,
+}  # fmt: skip
 
 
 def rotation(axis: str, degrees: float) -> NDArray[np.float64]:
@@ -113,16 +110,13 @@ def test_forward_kinematics_of_a_file_gives_the_joints_back() -> None:
         assert far(rigid) < 1e-4
 
 
-def test_a_file_is_of_metres_y_up_facing_z_at_thirty_frames_a_second() -> None:
+def test_a_file_is_of_metres_y_up_facing_z_at_thirty_frames_a_second_and_somebody_stands_at_rest_in_it() -> None:
     places, seconds = read(bvh(standing_poses(1, torch.Generator().manual_seed(0))))
     assert seconds == pytest.approx(1 / 30, abs=1e-6)
     assert 0.6 < places["Head"][0, 1] < 0.8
     assert places["LeftUpLeg"][0, 0] > 0.08  # the person's left
     assert places["Head"][0, 2] > 0.05  # the head is before the hips
     assert np.allclose(places["Hips"], 0)
-
-
-def test_bones_have_the_first_frames_lengths_and_at_rest_somebody_stands() -> None:
     states = standing_poses(1, torch.Generator().manual_seed(5))
     text = bvh(states)
     rows = text.splitlines()[-1].split()
@@ -153,54 +147,45 @@ def test_half_a_turn_and_a_bone_without_a_direction_are_written() -> None:
         bvh(states * math.nan)
 
 
+@pytest.mark.slow
 def test_samples_are_exported_each_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = ["sample", "--pretrained", str(SHIPPED), "--concept", str(JACKS), "--out", "jj.safetensors", "--steps", "2"]
-    assert main([*told, "--count", "3", "--export", str(tmp_path / "new" / "jj.bvh")]) == 0
+    succeed(*SAMPLE, "--count=3", "--out=jj.safetensors", f"--export={tmp_path / 'new' / 'jj.bvh'}")
     assert "jj_0.bvh to jj_2.bvh" in capsys.readouterr().out
-    states = Demonstrations.load("jj.safetensors").states
-    for number, plan in enumerate(states):
+    for number, plan in enumerate(Demonstrations.load("jj.safetensors").states):
         found = joints((tmp_path / "new" / f"jj_{number}.bvh").read_text())
         assert float((found - as_joints(plan)).abs().max()) < 1e-3
-    assert main([*told, "--count", "1", "--export", str(tmp_path / "one.bvh")]) == 0
+    succeed(*SAMPLE, "--count=1", f"--export={tmp_path / 'one.bvh'}")
     assert sorted(path.name for path in tmp_path.glob("*.bvh")) == ["one.bvh"]
-    assert main([*told, "--count", "11", "--export", "many.bvh"]) == 0
-    assert sorted(path.name for path in Path().glob("*.bvh"))[::10] == ["many_00.bvh", "many_10.bvh"]
+    succeed(*SAMPLE, "--count=11", "--export=many.bvh")
+    assert sorted(path.name for path in Path().glob("many*.bvh"))[::10] == ["many_00.bvh", "many_10.bvh"]
 
 
 @pytest.mark.parametrize(
-    ("export", "expected"),
+    ("arguments", "export", "expected"),
     [
-        ("jj.fbx", "error: export: expected a name that ends in .bvh, found 'jj.fbx'"),
-        ("taken.bvh", "error: export: taken_1.bvh: expected a file or nothing there, found a folder"),
-        ("jj.safetensors/jj.bvh", "error: export: jj.safetensors/jj.bvh: cannot be written"),
-        ("/proc/nowhere/jj.bvh", "error: export: /proc/nowhere/jj.bvh: cannot be written"),
+        (SAMPLE, "jj.fbx", "expected a name that ends in .bvh, found 'jj.fbx'"),
+        (SAMPLE, "taken.bvh", "taken_1.bvh: expected a file or nothing there, found a folder"),
+        (SAMPLE, "jj.safetensors/jj.bvh", "jj.safetensors/jj.bvh: cannot be written"),
+        (SAMPLE, "/proc/nowhere/jj.bvh", "/proc/nowhere/jj.bvh: cannot be written"),
+        (
+            ["sample", "--pretrained=object_rearrangement", "--compose=circle above square"],
+            "scene.bvh",
+            "expected none, as nothing else reads plans of object_rearrangement, found 'scene.bvh'",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_refused_before_anything_is_generated(
-    export: str, expected: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], export: str, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("taken_1.bvh").mkdir()
     Path("jj.safetensors").write_text("of the user")
-    told = ["--concept", str(JACKS), "--out", "out.safetensors", "--count", "2", "--export", export]
-    assert main(["sample", "--pretrained", str(SHIPPED), *told]) == 2
-    found = capsys.readouterr().err
-    assert found.startswith(expected)
+    found = refused(capsys, [*arguments, "--count=2", "--out=out.safetensors", f"--export={export}"])
+    assert found.startswith(f"error: export: {expected}")
     assert found.count("\n") == 1
-    assert not Path("out.safetensors").exists()
-
-
-def test_a_domain_that_exports_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    told = ["--compose", "circle above square", "--export", "scene.bvh"]
-    assert main(["sample", "--pretrained", "object_rearrangement", *told]) == 2
-    told_error = "error: export: expected none, as nothing else reads plans of object_rearrangement, found 'scene.bvh'\n"
-    assert capsys.readouterr().err == told_error
 
 
 def test_recorded_motion_comes_back_too() -> None:
     """Where recordings are named: those whose bones are rigid, as all that ``prepare`` keeps are."""
-    named = os.environ.get("FTL_LIGHTNING_DATA")
-    if not named:
-        pytest.skip("FTL_LIGHTNING_DATA names no folder of recordings")
-    recorded, _ = read_folder(Path(named))
+    recorded, _ = read_folder(named_recordings())
     for number in range(0, len(recorded), 9):
         assert far(torch.from_numpy(recorded.trial(number)[:32])) < 1e-3

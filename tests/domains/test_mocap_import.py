@@ -38,7 +38,7 @@ def moving(frames: int, rate: float = FPS) -> Tensor:
     return with_rigid_bones(states.flatten(1)[None], {"pose": pose[None]})[0]
 
 
-def test_what_was_exported_is_imported(tmp_path: Path) -> None:
+def test_what_was_exported_is_imported_as_it_is_seen_from_the_hips_of_who_walks_and_turns(tmp_path: Path) -> None:
     states = moving(60)
     found = imported(exported(tmp_path / "one.bvh", states))
     assert found.lengths.tolist() == [60]
@@ -48,14 +48,7 @@ def test_what_was_exported_is_imported(tmp_path: Path) -> None:
     assert found.concepts == ("",)
     assert found.fitted(DOMAIN.observed) is found
     assert torch.equal(found.observed["pose"], found.states)
-
-
-def test_a_plan_comes_back_as_one_demonstration(tmp_path: Path) -> None:
-    found = imported(exported(tmp_path / "plan.bvh", moving(HORIZON)))
-    assert found.states.shape == (1, HORIZON, 42)
-
-
-def test_somebody_who_walks_and_turns_is_seen_from_the_hips(tmp_path: Path) -> None:
+    assert imported(exported(tmp_path / "plan.bvh", moving(HORIZON))).states.shape == (1, HORIZON, 42)
     path = exported(tmp_path / "one.bvh", moving(40))
     head, rows = path.read_text().split(f"Frame Time: {1 / FPS:.6f}\n")
     values = np.array([row.split() for row in rows.splitlines()], dtype=float)
@@ -70,18 +63,22 @@ def test_other_rates_are_brought_to_the_domains(rate: int, tmp_path: Path) -> No
     path = exported(tmp_path / "one.bvh", moving(3 * rate, rate))
     path.write_text(path.read_text().replace(f"Frame Time: {1 / FPS:.6f}", f"Frame Time: {1 / rate:.6f}"))
     (states,) = imported(path).states
-    seconds = (3 * rate - 1) / rate
-    assert len(states) == int(seconds * FPS + 1e-6) + 1
+    assert len(states) == int((3 * rate - 1) / rate * FPS + 1e-6) + 1
     assert (states - moving(len(states))).abs().max() < 2e-3
 
 
-def test_long_motion_is_in_parts_and_a_jump_is_cut(tmp_path: Path) -> None:
+def test_long_motion_is_in_parts_a_jump_is_cut_and_a_short_one_or_bytes_that_are_no_text_are_told(tmp_path: Path) -> None:
     long = imported(exported(tmp_path / "long.bvh", moving(200)))
     assert long.states.shape[1] == LONGEST
     assert long.lengths.tolist() == [LONGEST, 200 - (LONGEST - HORIZON + 1)]
     states = moving(100)
     states[50:, 2::3] *= -1
     assert imported(exported(tmp_path / "jump.bvh", states)).lengths.tolist() == [50, 50]
+    with pytest.raises(UserError, match="expected a motion of 32 frames or more at 30 a second, without jumps, found 20 frames"):
+        imported(exported(tmp_path / "short.bvh", moving(20)))
+    (tmp_path / "one.bvh").write_bytes(b"\xff\xfe\x00HIERARCHY")
+    with pytest.raises(UserError, match="expected a BVH file in utf-8"):
+        read_motion(tmp_path / "one.bvh")
 
 
 def test_the_conversion_of_the_database_is_imported_in_metres(tmp_path: Path) -> None:
@@ -122,14 +119,3 @@ def test_a_file_that_cannot_be_read_is_one_line(change: object, expected: str, t
     assert expected in told
     assert "\n" not in told
     assert len(told) <= LINE + len(str(path))
-
-
-def test_a_short_motion_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="expected a motion of 32 frames or more at 30 a second, without jumps, found 20 frames"):
-        imported(exported(tmp_path / "short.bvh", moving(20)))
-
-
-def test_bytes_that_are_no_text_are_told(tmp_path: Path) -> None:
-    (tmp_path / "one.bvh").write_bytes(b"\xff\xfe\x00HIERARCHY")
-    with pytest.raises(UserError, match="expected a BVH file in utf-8"):
-        read_motion(tmp_path / "one.bvh")

@@ -117,10 +117,8 @@ def test_half_of_the_windows_begin_elsewhere_and_go_on_as_recorded() -> None:
     assert torch.equal(begun[~elsewhere], states[~elsewhere])
     assert torch.equal(begun[:, BLENDED[1] :], states[:, BLENDED[1] :])
     assert torch.equal(seen[POSE], begun[:, 0]), "the model observes where the window begins"
-    lengths = with_rigid_bones(begun, observed)
-    assert torch.allclose(lengths[elsewhere, : BLENDED[0]], begun[elsewhere, : BLENDED[0]], atol=1e-5), (
-        "bones are those of the person"
-    )
+    rigid = with_rigid_bones(begun, observed)  # bones are those of the person
+    assert torch.allclose(rigid[elsewhere, : BLENDED[0]], begun[elsewhere, : BLENDED[0]], atol=1e-5)
     again, _ = begun_elsewhere(states, observed, torch.Generator().manual_seed(0))
     assert torch.equal(again, begun)
     assert VIEWS["smooth"].perturb is begun_elsewhere

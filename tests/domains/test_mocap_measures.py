@@ -30,12 +30,14 @@ def judge() -> Judge:
     return Judge().requires_grad_(False)
 
 
-def test_bones_of_the_start_have_no_error_and_longer_ones_their_share() -> None:
+def test_bones_of_the_start_have_no_error_longer_ones_their_share_and_each_window_one_value() -> None:
     states = people(3)
     starts = InitialStates({POSE: states[:, 0]}, torch.zeros(3, 0))
     assert bone_error("walk", states, starts).abs().max() < 1e-6
     assert torch.allclose(bone_error("walk", 1.1 * states, starts), torch.full((3,), 0.1), atol=1e-5)
     assert bone_error("walk", 1.1 * states, None).abs().max() < 1e-6, "without a start, the first frame's lengths are right"
+    for name, measure in MEASURES.items():
+        assert measure("walk", states, None).shape == (3,), name
 
 
 def test_jerk_is_the_size_of_the_third_derivative() -> None:
@@ -56,7 +58,7 @@ def test_arms_rise_only_when_both_go_from_low_to_high() -> None:
     assert rise("jumping jacks", one, None).tolist() == [False]
 
 
-def test_equal_sets_are_near_and_other_ones_far(judge: Judge) -> None:
+def test_sets_are_near_when_equal_and_compared_at_equal_numbers_and_repeatably(judge: Judge) -> None:
     draw = torch.Generator().manual_seed(1)
 
     def trembling(size: float) -> Tensor:
@@ -68,9 +70,6 @@ def test_equal_sets_are_near_and_other_ones_far(judge: Judge) -> None:
     assert same["number"] == 60
     assert other["fid"] > 5 * same["fid"]
     assert other["kid"] > abs(same["kid"]) + 1
-
-
-def test_sets_are_compared_at_equal_numbers_and_repeatably(judge: Judge) -> None:
     states = people(40) + 0.02 * torch.randn(40, HORIZON, 42, generator=torch.Generator().manual_seed(2))
     before = torch.random.get_rng_state()
     first = distances(states[:12], states, seed=3, judge=judge)
@@ -103,10 +102,3 @@ def test_what_is_learned_from_generated_motion_is_tested_on_real_motion() -> Non
     assert learned_elsewhere(generated, {"raise": moved(low, 8, 2), "stand": moved(low, 8, 3)}) == 0.5
     with pytest.raises(UserError, match="expected the same two classes or more"):
         learned_elsewhere(generated, {"raise": moved(up, 8, 2)})
-
-
-def test_metrics_give_one_value_for_each_window() -> None:
-    states = people(4)
-    for name, measure in MEASURES.items():
-        values = measure("walk", states, None)
-        assert values.shape == (4,), name

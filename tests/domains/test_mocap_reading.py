@@ -1,7 +1,6 @@
 """Reading motion capture: kinematics, the folder of a user's own copy, and everything that can be wrong with it."""
 
 import json
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftl_lightning.cli import main
 from ftl_lightning.domains.mocap.asf_amc import INCH, JOINT_BONES, read_amc, read_asf
 from ftl_lightning.domains.mocap.bvh import METRES, NODES, read_bvh
 from ftl_lightning.domains.mocap.normalise import normalised, z_up
@@ -20,7 +18,8 @@ from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments, shippe
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.source import Recorded
 from ftl_lightning.errors import UserError
-from tests.domains.mocap_samples import BONES, amc, asf, database, motion, recordings, swing
+from tests.conftest import refused, succeed
+from tests.domains.mocap_samples import BONES, amc, asf, database, motion, named_recordings, recordings, swing
 
 UNIT = INCH / 0.45
 WALK, TURN = {"02_01": "walk"}, {"02_01": "walk", "02_02": "Walk, Veer_Left"}
@@ -48,21 +47,22 @@ def told(folder: Path) -> str:
 
 
 def test_at_rest_bones_reach_along_their_directions(tmp_path: Path) -> None:
+    assert set(JOINT_BONES) <= set(BONES)
+    assert len(JOINT_BONES) == len(NODES) == len(JOINTS)
     found = joints(tmp_path, {})
     assert at(found, "rradius") == [-11.5, 23, 0]
     assert at(found, "head") == [0, 26.5, 0]
     assert at(found, "lhipjoint") == np.round([2 / np.sqrt(2), 17 - 2 / np.sqrt(2), 0], 6).tolist()
 
 
-def test_rotations_are_applied_x_first_then_y_then_z(tmp_path: Path) -> None:
-    found = joints(tmp_path, {"lhumerus": "90 0 0"}, {"lhumerus": "0 90 0"}, {"lhumerus": "0 90 90"}, {"root": "0 0 0 0 0 90"})
+def test_rotations_are_applied_x_first_then_y_then_z_about_a_bones_own_axes(tmp_path: Path) -> None:
+    arms = [{"lhumerus": turn} for turn in ("90 0 0", "0 90 0", "0 90 90")]
+    found = joints(tmp_path, *arms, {"root": "0 0 0 0 0 90"}, {"thorax": "0 0 90"})
     assert at(found, "lhumerus", 0) == [8, 23, 0]
     assert at(found, "lhumerus", 1) == [3, 23, -5]
     assert at(found, "lhumerus", 2) == [3, 23, -5]  # about y to -z, which z does not move
     assert at(found, "head", 3) == [-9.5, 0, 0]
-
-
-def test_a_bone_turns_about_its_own_axes(tmp_path: Path) -> None:
+    assert at(found, "rradius", 4) == [-6, 17 - 11.5, 0]  # children turn with their parents
     found = joints(tmp_path, {"lradius": "90"}, {"lfemur": "90 0 0"})
     assert at(found, "lradius", 0) == [11.5, 23, 0]  # along its own x axis
     hip, knee = found[1, JOINTS.index("LHip")], found[1, JOINTS.index("LKnee")]
@@ -71,31 +71,21 @@ def test_a_bone_turns_about_its_own_axes(tmp_path: Path) -> None:
     assert knee - hip == pytest.approx(expected, abs=1e-9)
 
 
-def test_children_turn_with_their_parents(tmp_path: Path) -> None:
-    found = joints(tmp_path, {"thorax": "0 0 90"})
-    assert at(found, "rradius") == [-6, 17 - 11.5, 0]
-
-
 def test_orders_units_and_radians_are_read(tmp_path: Path) -> None:
     usual = joints(tmp_path, {"root": "1 2 3 0 30 60"})
     mixed = asf().replace("order TX TY TZ RX RY RZ", "order RZ RY TX TY TZ RX")
-    (tmp_path / "02.asf").write_text(mixed)
+    other = joints(tmp_path, {"root": "60 30 1 2 3 0"}, skeleton=mixed)
+    path, turned = tmp_path / "02_01.amc", f"{np.pi / 3} {np.pi / 6} 1 2 3 0"
+    path.write_text(path.read_text().replace("DEGREES", "RADIANS").replace("60 30 1 2 3 0", turned))
     body = read_asf(tmp_path / "02.asf")
-    text = amc([{"root": "60 30 1 2 3 0"}])
-    (tmp_path / "02_01.amc").write_text(text)
-    other = body.joints(read_amc(tmp_path / "02_01.amc", body)) / UNIT
-    (tmp_path / "02_01.amc").write_text(
-        text.replace("DEGREES", "RADIANS").replace("60 30 1 2 3 0", f"{np.pi / 3} {np.pi / 6} 1 2 3 0")
-    )
-    radians = body.joints(read_amc(tmp_path / "02_01.amc", body)) / UNIT
-    assert radians == pytest.approx(other, abs=1e-6)
+    assert body.joints(read_amc(path, body)) / UNIT == pytest.approx(other, abs=1e-6)
     assert np.linalg.norm(other[0] - other[0, 0], axis=1) == pytest.approx(np.linalg.norm(usual[0] - usual[0, 0], axis=1))
     assert other[0] != pytest.approx(usual[0])  # z first is another turn
     (tmp_path / "02.asf").write_text(asf().replace("length 0.45", "length 0.9"))
     assert read_asf(tmp_path / "02.asf").metres == pytest.approx(INCH / 0.9)
 
 
-def test_hips_are_put_at_the_origin_and_turned_to_the_front(tmp_path: Path) -> None:
+def test_hips_are_put_at_the_origin_and_turned_to_the_front_and_a_knee_bends_backwards(tmp_path: Path) -> None:
     frames = [{"root": f"{frame} 17 5 0 {40 * frame} 0"} for frame in range(9)]
     poses = normalised(z_up(joints(tmp_path, *frames) * UNIT))
     right, left = poses.positions[:, 0], poses.positions[:, 3]
@@ -107,14 +97,11 @@ def test_hips_are_put_at_the_origin_and_turned_to_the_front(tmp_path: Path) -> N
     turns = np.diff(np.unwrap(poses.root[:, 3]))
     assert turns == pytest.approx(np.deg2rad(40))
     assert np.diff(poses.root[:, 2]) == pytest.approx(0)
-
-
-def test_a_knee_bends_backwards_which_is_behind(tmp_path: Path) -> None:
     poses = normalised(z_up(joints(tmp_path, {"rfemur": "-60 0 0", "lfemur": "-60 0 0"}) * UNIT))
     assert (poses.positions[0, [1, 4], 1] > 0.1).all()  # thighs lifted to the front, which is +y
 
 
-def test_a_database_becomes_one_file_and_a_report(tmp_path: Path) -> None:
+def test_a_database_becomes_one_file_and_a_report_and_its_recordings_are_copied(tmp_path: Path) -> None:
     text = prepare(database(tmp_path / "cmu", TURN), tmp_path / "out")
     found = Recordings.load(tmp_path / "out" / FILE)
     assert (found.trial_id, found.label, found.subject) == (("02_01", "02_02"), ("walk", "walk, veer left"), ("02", "02"))
@@ -122,27 +109,25 @@ def test_a_database_becomes_one_file_and_a_report(tmp_path: Path) -> None:
     assert found.positions.shape == (80, 14, 3)  # every fourth of 160 frames, twice
     assert "kept: 2 trials, 80 frames at 30 a second, 2 descriptions" in text
     assert "mocap.cs.cmu.edu" in text
+    prepare(database(tmp_path / "slow", {"87_03": "backflip"}))
+    assert len(Recordings.load(tmp_path / "slow" / FILE).positions) == 80  # every second, since it was recorded at 60 a second
     report = json.loads((tmp_path / "out" / REPORT).read_text())
     assert report["kept"]["02_02"] == {
         "label": "walk, veer left", "kind": "asf_amc", "file": "02_02.amc", "frames": 40, "glitches": 0, "too short": 0,
     }  # fmt: skip
-
-
-def test_slow_recordings_are_thinned_out_less(tmp_path: Path) -> None:
-    prepare(database(tmp_path, {"87_03": "backflip"}))
-    assert len(Recordings.load(tmp_path / FILE).positions) == 80
+    (tmp_path / "out" / FILE).rename(tmp_path / "out" / "cmu14_trials.npz")
+    assert "kept: 2 trials" in prepare(tmp_path / "out", tmp_path / "again")
+    assert Recordings.load(tmp_path / "again" / FILE).label == ("walk", "walk, veer left")
 
 
 def test_the_command_line_prepares(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = database(tmp_path / "cmu", WALK)
     domain = "ftl_lightning.domains.mocap:DOMAIN"
-    assert main(["prepare", domain, "--root", str(folder), "--out", str(tmp_path / "out")]) == 0
+    succeed("prepare", domain, f"--root={folder}", f"--out={tmp_path / 'out'}")
     assert (tmp_path / "out" / FILE).is_file()
     assert "kept: 1 trial" in capsys.readouterr().out
-    assert main(["prepare", domain]) == 2
-    assert "error: root: expected a folder with your copy of the database, found none" in capsys.readouterr().err
-    assert main(["prepare", "agent"]) == 2
-    assert "needs nothing of the kind" in capsys.readouterr().err
+    refused(capsys, ["prepare", domain], "error: root: expected a folder with your copy of the database, found none")
+    refused(capsys, ["prepare", "agent"], "needs nothing of the kind")
 
 
 def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
@@ -155,9 +140,10 @@ def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
     (folder / "02_08.amc").rename(folder / "05_08.amc")
     (folder / "cmu-mocap-index.csv").write_text((folder / "cmu-mocap-index.csv").read_text() + '\n05_08,walk,"someone"')
     (folder / "readme.amc").write_text("")
+    (folder / "02_01.mb.bvh").write_text("not looked at")
     text = prepare(folder)
     assert "kept: 2 trials" in text
-    assert "dropped: 7 files\n     1  " in text
+    assert "dropped: 8 files\n     1  " in text
     assert "     1  description that is no training concept: 02_03 (juggling)\n" in text
     assert "     1  no description in the index: 02_04\n" in text
     assert "     1  shorter than 128 frames: 02_05 (100 frames)\n" in text
@@ -165,14 +151,9 @@ def test_what_was_dropped_is_told_with_its_reason(tmp_path: Path) -> None:
     assert "     1  less than 32 frames without glitches: 02_07 (of 40)\n" in text
     assert "     1  no skeleton of the subject: 05_08 (05.asf)\n" in text
     assert "     1  file not named after a trial, such as 13_29.amc: readme.amc\n" in text
+    assert "     1  trial that was read from another file: 02_01.mb.bvh (02_01 from 02_01.amc)\n" in text
     assert f"or left out: {folder / REPORT}" in text
-    assert len(json.loads((folder / REPORT).read_text())["dropped"]) == 7
-
-
-def test_a_file_of_a_trial_that_was_read_from_another_is_told(tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
-    (folder / "02_01.mb.bvh").write_text("not looked at")
-    assert "     1  trial that was read from another file: 02_01.mb.bvh (02_01 from 02_01.amc)\n" in prepare(folder)
+    assert len(json.loads((folder / REPORT).read_text())["dropped"]) == 8
 
 
 def test_what_pretraining_leaves_out_is_told_with_its_reason(tmp_path: Path) -> None:
@@ -204,34 +185,18 @@ def test_what_pretraining_leaves_out_is_told_with_its_reason(tmp_path: Path) -> 
     assert report["kept"]["05_03"]["too short"] == 50
 
 
-def test_a_glitch_cuts_a_trial_and_does_not_drop_it(tmp_path: Path) -> None:
+def test_a_glitch_cuts_a_trial_first_frames_on_the_floor_are_left_out_and_an_index_as_text_will_do(tmp_path: Path) -> None:
     folder = database(tmp_path, WALK)
     frames = swing(400)
     for frame in frames[200:]:
         frame["thorax"] = "170 0 0"
     (folder / "02_01.amc").write_text(amc(frames))
     assert "kept, cut where a joint is too fast: 1 trial, 1 frame" in prepare(folder)
-
-
-def test_first_frames_that_lie_on_the_floor_are_left_out(tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
     (folder / "02_01.amc").write_text(amc([{"root": "0 0 0 0 0 0"}] * 8 + swing(160)))
-    prepare(folder)
-    assert len(Recordings.load(folder / FILE).positions) == 40
-
-
-def test_an_index_as_text_will_do(tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
     (folder / "cmu-mocap-index.csv").unlink()
     (folder / "cmu-mocap-index-text.txt").write_text("Subject #2\n\n02_01\twalk\n")
     assert "kept: 1 trial" in prepare(folder)
-
-
-def test_recordings_that_are_there_are_listed_and_copied(tmp_path: Path) -> None:
-    prepare(database(tmp_path / "cmu", TURN), tmp_path / "out")
-    (tmp_path / "out" / FILE).rename(tmp_path / "out" / "cmu14_trials.npz")
-    assert "kept: 2 trials" in prepare(tmp_path / "out", tmp_path / "again")
-    assert Recordings.load(tmp_path / "again" / FILE).label == ("walk", "walk, veer left")
+    assert len(Recordings.load(folder / FILE).positions) == 40
 
 
 def test_a_folder_that_holds_nothing_to_read_is_refused(tmp_path: Path) -> None:
@@ -247,82 +212,53 @@ def test_a_folder_that_holds_nothing_to_read_is_refused(tmp_path: Path) -> None:
     assert "expected the index of descriptions, cmu-mocap-index.csv or" in told(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("lradius", "tail", "02_01.amc: line 15: expected a bone of the skeleton, found 'tail'; is it of another subject?"),
-        ("lfemur 0 0 0", "lfemur 0 0", "02_01.amc: line 6: expected 3 numbers for 'lfemur', found 'lfemur 0 0'"),
-        ("lfemur 0 0 0", "lfemur 0 x 0", "02_01.amc: line 6: expected numbers, found 'lfemur 0 x 0'"),
-        ("lfemur 0 0 0", "lfemur 0 nan 0", "02_01.amc: frame 1: expected finite numbers of 'lfemur', found others"),
-        ("lfemur 0 0 0\n", "", "02_01.amc: line 20: expected a frame's number before its bones, and each bone once"),
-        ("ltibia 0\n", "ltibia 0\nltibia 0\n", "02_01.amc: line 8: expected a frame's number before its bones, and each bone once"),
-    ],
-)
-def test_a_malformed_motion_is_told_with_file_and_line(old: str, new: str, expected: str, tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
-    text = (folder / "02_01.amc").read_text()
-    (folder / "02_01.amc").write_text(text.replace(old, new, 1))
-    assert expected in told(folder)
+SKELETON, MOTION = "02.asf", "02_01.amc"
+SEGMENT = "trial_id,label,start30,stop30\n"
+ONCE = "expected a frame's number before its bones, and each bone once"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "expected"),
+    ("file", "old", "new", "expected"),
     [
-        ("name head", "name skull", "02.asf: expected a skeleton of the CMU database, found one without the bone 'head'"),
-        ("length 7.0", "length long", "02.asf: line 20: expected numbers, found 'long'"),
-        ("direction 1 -1 0", "direction 1 -1", "expected 3 finite numbers, found '1 -1'"),
-        ("    direction 1 -1 0\n", "", "expected a bone with name, direction, length and axis (no 'direction' here)"),
-        ("order TX TY TZ RX RY RZ", "order TX TY", "02.asf: line 6: expected TX TY TZ RX RY RZ in some order"),
-        ("    thorax lowerneck", "", "section ':hierarchy': expected what 'lowerneck' hangs on, up to the root"),
-        ("axis 0 0 20 XYZ", "axis 0 0 20 XXZ", "expected an order of axes such as XYZ, found 'XXZ'"),
-        ("length 0.45", "length 0", "02.asf: key 'length': expected a positive number, found 0"),
+        (MOTION, "lradius", "tail", "02_01.amc: line 15: expected a bone of the skeleton, found 'tail'; is it of another subject?"),
+        (MOTION, "lfemur 0 0 0", "lfemur 0 0", "02_01.amc: line 6: expected 3 numbers for 'lfemur', found 'lfemur 0 0'"),
+        (MOTION, "lfemur 0 0 0", "lfemur 0 x 0", "02_01.amc: line 6: expected numbers, found 'lfemur 0 x 0'"),
+        (MOTION, "lfemur 0 0 0", "lfemur 0 nan 0", "02_01.amc: frame 1: expected finite numbers of 'lfemur', found others"),
+        (MOTION, "lfemur 0 0 0\n", "", f"02_01.amc: line 20: {ONCE}"),
+        (MOTION, "ltibia 0\n", "ltibia 0\nltibia 0\n", f"02_01.amc: line 8: {ONCE}"),
+        (SKELETON, "name head", "name skull", "02.asf: expected a skeleton of the CMU database, found one without the bone 'head'"),
+        (SKELETON, "length 7.0", "length long", "02.asf: line 20: expected numbers, found 'long'"),
+        (SKELETON, "direction 1 -1 0", "direction 1 -1", "expected 3 finite numbers, found '1 -1'"),
+        (SKELETON, "    direction 1 -1 0\n", "", "expected a bone with name, direction, length and axis (no 'direction' here)"),
+        (SKELETON, "order TX TY TZ RX RY RZ", "order TX TY", "02.asf: line 6: expected TX TY TZ RX RY RZ in some order"),
+        (SKELETON, "    thorax lowerneck", "", "section ':hierarchy': expected what 'lowerneck' hangs on, up to the root"),
+        (SKELETON, "axis 0 0 20 XYZ", "axis 0 0 20 XXZ", "expected an order of axes such as XYZ, found 'XXZ'"),
+        (SKELETON, "length 0.45", "length 0", "02.asf: key 'length': expected a positive number, found 0"),
+        (MOTION, None, ":FULLY-SPECIFIED\n:DEGREES\n", "02_01.amc: expected frames of motion, found none"),
+        pytest.param(MOTION, None, amc(swing(20)), "02_01: shorter than 128 frames: 20 frames", id="short"),
+        (SEGMENTS, None, "", "segments.csv: line 1: expected trial_id,label,start30,stop30, found nothing"),
+        (SEGMENTS, None, "a,b\n", "segments.csv: line 1: expected trial_id,label,start30,stop30, found a,b"),
+        (SEGMENTS, None, f"{SEGMENT}\n02_01,walk,9,3\n", "segments.csv: line 3: expected a trial, a label"),
+        (SEGMENTS, None, f"{SEGMENT}02_01,walk,0\n", "segments.csv: line 2: expected a trial, a label"),
     ],
-)
-def test_a_malformed_skeleton_is_told_with_file_and_line(old: str, new: str, expected: str, tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
-    assert old in asf()
-    (folder / "02.asf").write_text(asf().replace(old, new, 1))
-    assert expected in told(folder)
+)  # fmt: skip
+def test_a_malformed_file_is_told_with_file_and_line(file: str, old: str | None, new: str, expected: str, tmp_path: Path) -> None:
+    path = database(tmp_path, WALK) / file
+    text = new
+    if old is not None:
+        assert old in path.read_text()
+        text = path.read_text().replace(old, new, 1)
+    path.write_text(text)
+    assert expected in told(tmp_path)
 
 
-def test_a_trial_shorter_than_a_window_is_told(tmp_path: Path) -> None:
-    assert "02_01: shorter than 128 frames: 20 frames" in told(database(tmp_path, WALK, frames=20))
-
-
-def test_an_empty_motion_is_told(tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
-    (folder / "02_01.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n")
-    assert "02_01.amc: expected frames of motion, found none" in told(folder)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", "segments.csv: line 1: expected trial_id,label,start30,stop30, found nothing"),
-        ("a,b\n", "segments.csv: line 1: expected trial_id,label,start30,stop30, found a,b"),
-        (
-            "trial_id,label,start30,stop30\n\n02_01,walk,9,3\n",
-            "segments.csv: line 3: expected a trial, a label",
-        ),
-        ("trial_id,label,start30,stop30\n02_01,walk,0\n", "segments.csv: line 2: expected a trial, a label"),
-    ],
-)
-def test_malformed_segments_are_told_with_file_and_line(text: str, expected: str, tmp_path: Path) -> None:
-    folder = database(tmp_path, WALK)
-    (folder / SEGMENTS).write_text(text)
-    assert expected in told(folder)
-
-
-def test_segments_of_ones_own_come_along(tmp_path: Path) -> None:
+def test_segments_of_ones_own_come_along_with_the_shipped_ones_that_show_the_new_concepts(tmp_path: Path) -> None:
     folder = database(tmp_path / "cmu", WALK)
-    (folder / SEGMENTS).write_text("trial_id,label,start30,stop30\n02_01,arm circle,3,39\n")
+    (folder / SEGMENTS).write_text(f"{SEGMENT}02_01,arm circle,3,39\n")
     prepare(folder, tmp_path / "out")
     _, segments = read_folder(tmp_path / "out")
     assert [(one.label, one.start, one.stop) for one in segments if one.trial_id == "02_01"] == [("arm circle", 3, 39)]
     assert "chop wood" in {one.label for one in segments}
-
-
-def test_the_shipped_segments_show_the_new_concepts() -> None:
     assert sum(one.label == "jumping jacks" and one.trial_id.startswith("13") for one in shipped_segments()) == 3
     assert all(one.stop is None or one.stop > one.start for one in shipped_segments())
     with pytest.raises(UserError, match="expected a table of segments"):
@@ -415,13 +351,11 @@ def test_a_damaged_file_of_recordings_is_told(change: object, expected: str, tmp
 
 def test_recorded_motion_is_read_as_it_was_before(tmp_path: Path) -> None:
     """Where recordings are named: their raw samples give the same poses as the file that was made elsewhere."""
-    named = os.environ.get("FTL_LIGHTNING_DATA")
-    if not named or not (Path(named) / "raw_samples").is_dir():
-        pytest.skip("FTL_LIGHTNING_DATA names no folder with raw samples")
-    expected = read_folder(Path(named))[0]
+    named = named_recordings("raw_samples")
+    expected = read_folder(named)[0]
     for amc_too in (True, False):
         folder = tmp_path / str(amc_too)
-        shutil.copytree(Path(named) / "raw_samples", folder)
+        shutil.copytree(named / "raw_samples", folder)
         folder.chmod(0o755)
         if not amc_too:
             for path in folder.glob("*.amc"):
@@ -437,8 +371,3 @@ def test_recorded_motion_is_read_as_it_was_before(tmp_path: Path) -> None:
             start, stop = expected.offsets[same : same + 2]
             roots = found.root[found.offsets[number] : found.offsets[number + 1]]
             assert np.abs(roots - expected.root[start:stop]).max() < 1e-5
-
-
-def test_every_joint_hangs_on_a_bone_of_the_sample() -> None:
-    assert set(JOINT_BONES) <= set(BONES)
-    assert len(JOINT_BONES) == len(NODES) == len(JOINTS)

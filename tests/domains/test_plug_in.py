@@ -5,7 +5,8 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,62 +21,60 @@ from ftl_lightning.domains.registry import domain_names, load_domain, recorded_n
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Once, python, refused, succeed
+from tests.domains.test_registry import offering
 
-PUSHES = ROOT / "examples" / "ftl-pushes"
-EXAMPLE = ROOT / "examples" / "ftl-strokes"
-SMALL = [
-    "--trainer.enable_progress_bar=false",
-    "--trainer.accelerator=cpu",
-    "--evaluation.samples=4",
-    "--evaluation.steps=3",
-    "--evaluation.figures=0",
-]
-Run = Callable[..., str]
+EXAMPLES = ROOT / "examples"
+EXAMPLE = EXAMPLES / "ftl-strokes"
+SMALL = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--model.denoiser_args={hidden_dim: 16, depth: 1}"]
+SMALL += ["--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.sampler=ddim"]
+SMALL += ["--evaluation.references=false", "--evaluation.diversity=false"]
+FIT = ["fit", f"--config={EXAMPLE / 'strokes.yaml'}", *SMALL, "--trainer.max_steps=2", "--data.steps_per_epoch=2"]
+FIT += ["--data.samples_per_concept=2", "--data.batch_size=8"]
+INVERT = ["invert", f"--config={EXAMPLE / 'strokes_invert.yaml'}", *SMALL[:2], *SMALL[3:], "--data.steps=2"]
+INVERT += ["--model.budget.samples=2"]
+FOLDER = "logs/strokes/fit/pretrained"
+SAMPLE = ["sample", f"--pretrained={FOLDER}", "--count=3", "--steps=2", "--sampler=ddim"]
+LEARNED = ["--concept=logs/strokes/invert/concepts/wave_upwards.safetensors", "--goal=wave upwards"]
+VERBS = """
+import json, sys
+from ftl_lightning.cli import main
+for arguments in map(json.loads, sys.argv[1:]):
+    if code := main(arguments):
+        sys.exit(code)
+"""
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder into which the example was installed as a package."""
-    folder = tmp_path_factory.mktemp("installed")
-    shutil.copytree(EXAMPLE, folder / "source", ignore=shutil.ignore_patterns("logs", "build", "*.egg-info", "__pycache__"))
+def installed(folder: Path) -> None:
+    """Install examples as packages into ``packages``, with one start of pip."""
+    sources = [folder / name for name in ("ftl-strokes", "ftl-flow")]
+    for source in sources:
+        shutil.copytree(EXAMPLES / source.name, source, ignore=shutil.ignore_patterns("logs", "build", "*.egg-info", "__pycache__"))
     options = ["--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--target", str(folder / "packages")]
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(folder / "source")], check=True)
-    return folder / "packages"
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, *map(str, sources)], check=True)
 
 
-def runner(packages: Path) -> Run:
-    """The program, with another folder of packages."""
-
-    def run(*arguments: str, code: int = 0) -> str:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (packages, ROOT))), "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, "-m", "ftl_lightning", *arguments]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == code, done.stderr
-        return done.stdout + done.stderr
-
-    return run
+@pytest.fixture
+def offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The example as if it were installed: its module and its entry points are on Python's path."""
+    groups = tomllib.loads((EXAMPLE / "pyproject.toml").read_text("utf-8"))["project"]["entry-points"]
+    ((group, points),) = groups.items()
+    monkeypatch.syspath_prepend(EXAMPLE)
+    text = "\n".join((f"[{group}]", *(f"{name} = {value}" for name, value in points.items())))
+    with offering(tmp_path / "packages", "ftl-strokes", text, monkeypatch):
+        yield
 
 
-def learn(run: Run, *options: str) -> Path:
-    """A little pretraining and a little learning; the folder of the pretrained model."""
-    fit = ["--trainer.max_steps=60", "--data.steps_per_epoch=60", "--data.samples_per_concept=20", "--data.batch_size=32"]
-    run("fit", "--config", str(EXAMPLE / "strokes.yaml"), *SMALL, *fit, *options)
-    run("invert", "--config", str(EXAMPLE / "strokes_invert.yaml"), *SMALL, "--data.steps=5", *options)
-    return Path("logs/strokes/fit/pretrained")
-
-
-def test_an_installed_domain_is_used_by_its_name(installed: Path) -> None:
-    run = runner(installed)
-    folder = learn(run)
-    assert json.loads((folder / "config.json").read_text())["domain"] == "strokes"
+@pytest.mark.release
+def test_an_installed_domain_is_used_by_its_name(once: Once) -> None:
+    path = os.pathsep.join(map(str, (once("plug_ins", installed) / "packages", ROOT)))
+    sample = [*SAMPLE, *LEARNED, "--figure=s.png", "--animation=s.gif"]
+    done = python("-c", VERBS, *map(json.dumps, (FIT, INVERT, sample)), PYTHONPATH=path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(Path(FOLDER, "config.json").read_text())["domain"] == "strokes"
     assert sorted(path.stem for path in Path("logs/strokes/invert/concepts").iterdir()) == ["wave_upwards", "zigzag_leftwards"]
-    rows = Path("logs/strokes/invert/results.csv").read_text()
-    assert "new concept,wave upwards" in rows
-    learned = "--concept=logs/strokes/invert/concepts/wave_upwards.safetensors"
-    options = ["--goal=wave upwards", "--count=3", "--steps=3", "--sampler=dpm_solver", "--figure=s.png", "--animation=s.gif"]
-    told = run("sample", f"--pretrained={folder}", learned, *options)
-    assert "accuracy on 'wave upwards'" in told
+    assert "new concept,wave upwards" in Path("logs/strokes/invert/results.csv").read_text()
+    assert "accuracy on 'wave upwards'" in done.stdout
     samples = Demonstrations.load("states.safetensors")
     assert samples.domain == "strokes"
     assert samples.states.shape == (3, 32, 2)
@@ -83,22 +82,28 @@ def test_an_installed_domain_is_used_by_its_name(installed: Path) -> None:
     assert Path("s.gif").stat().st_size > 0
 
 
-def test_a_domain_that_is_not_installed_is_used_by_its_module() -> None:
-    run = runner(EXAMPLE)
-    folder = learn(run, "--data.domain=ftl_strokes:DOMAIN")
+def test_a_domain_that_an_entry_point_offers_is_used_by_its_name(offered: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "strokes" in domain_names()
+    assert recorded_name("ftl_strokes:DOMAIN") == "strokes"
+    succeed(*FIT)
+    assert json.loads(Path(FOLDER, "config.json").read_text())["domain"] == "strokes"
+    succeed(*SAMPLE, "--compose=arc upwards", "--goal=arc upwards")
+    assert "accuracy on 'arc upwards'" in capsys.readouterr().out
+    assert Demonstrations.load("states.safetensors").domain == "strokes"
+
+
+@pytest.mark.slow
+def test_a_domain_that_is_not_installed_is_used_by_its_module(strokes: Domain, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (FIT, INVERT):
+        succeed(*arguments, "--data.domain=ftl_strokes:DOMAIN")
     # By this name, and no other, the domain is found again.
-    assert json.loads((folder / "config.json").read_text())["domain"] == "ftl_strokes:DOMAIN"
-    sample = ["sample", "--pretrained", str(folder), "--compose=arc upwards", "--count=2", "--steps=3", "--sampler=dpm_solver"]
-    assert "give --trust ftl_strokes" in run(*sample, code=2)  # a folder names no code: a person does
-    run(*sample, "--trust=ftl_strokes")
-    run(*sample, f"--settings={EXAMPLE / 'strokes_invert.yaml'}", "--trust=ftl_strokes")
-    told = run("generate", "strokes", code=2)
+    assert json.loads(Path(FOLDER, "config.json").read_text())["domain"] == "ftl_strokes:DOMAIN"
+    sample = [*SAMPLE, "--compose=arc upwards"]
+    refused(capsys, sample, "give --trust ftl_strokes")  # a folder names no code: a person does
+    succeed(*sample, "--trust=ftl_strokes")
+    succeed(*sample, f"--settings={EXAMPLE / 'strokes_invert.yaml'}", "--trust=ftl_strokes")
     names = "agent, driving, mocap, object_rearrangement, tabletop, tabletop_wide"
-    assert f"domain: expected one of {names}, or package.module:DOMAIN, found 'strokes'" in told
-
-
-def test_the_example_is_small() -> None:
-    assert len((EXAMPLE / "ftl_strokes.py").read_text().splitlines()) <= 50
+    refused(capsys, ["generate", "strokes"], f"domain: expected one of {names}, or package.module:DOMAIN, found 'strokes'")
 
 
 @pytest.fixture
@@ -107,17 +112,18 @@ def strokes(monkeypatch: pytest.MonkeyPatch) -> Domain:
     return load_domain("ftl_strokes:DOMAIN")
 
 
-def test_the_strokes_of_each_kind_are_recognised_as_that_kind_alone(strokes: Domain) -> None:
+def test_the_example_is_small_and_its_strokes_of_each_kind_are_recognised_as_that_kind_alone(strokes: Domain) -> None:
     source, measure = strokes.source(None), strokes.metrics["accuracy"].measure
     for kind in strokes.concepts.descriptions:
         drawn = source.draw(kind, 50, 0).states
         for goal in strokes.concepts.descriptions:
             assert measure(goal, drawn, None).float().mean() == float(goal == kind)
     assert not measure("arc upwards", torch.randn(50, 32, 2), None).any()
+    assert len((EXAMPLE / "ftl_strokes.py").read_text().splitlines()) <= 50
 
 
 def test_the_expert_s_pushes_are_right_in_open_and_closed_loop_and_a_random_target_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(PUSHES)
+    monkeypatch.syspath_prepend(EXAMPLES / "ftl-pushes")
     pushes = load_domain("ftl_pushes:DOMAIN")
     source, measure, loop = pushes.source(None), pushes.metrics["accuracy"].measure, pushes.closed_loop
     assert loop is not None
@@ -139,9 +145,8 @@ def test_a_domain_is_recorded_by_the_name_that_a_package_offers(strokes: Domain)
     assert recorded_name("ftl_lightning.domains.agent:DOMAIN") == "agent"
     assert recorded_name("ftl_strokes:DOMAIN") == "ftl_strokes:DOMAIN"
     assert PretrainingData("ftl_strokes:DOMAIN", encoder="hashing").domain_name == "ftl_strokes:DOMAIN"
-    assert (
-        InversionData("ftl_lightning.domains.object_rearrangement:DOMAIN", suite="validation").domain_name == "object_rearrangement"
-    )
+    rearranged = InversionData("ftl_lightning.domains.object_rearrangement:DOMAIN", suite="validation")
+    assert rearranged.domain_name == "object_rearrangement"
     with pytest.raises(UserError, match=r"domain 'ftl_strokes:NONE': cannot be imported"):
         recorded_name("ftl_strokes:NONE")
     assert "strokes" not in domain_names()

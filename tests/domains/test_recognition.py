@@ -1,6 +1,5 @@
 """Behaviour is recognised by its examples: real behaviour is, whatever is not like it is not."""
 
-import time as clock
 import zlib
 from collections.abc import Callable
 
@@ -62,6 +61,7 @@ def series(kind: int, count: int, seed: int) -> Array:
 
 
 FAMILIES = {"paths": paths, "states": states, "series": series}
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("states", "series")]
 
 
 def known(behaviour: dict[str, Array], lengths: NDArray[np.int64] | None = None) -> Demonstrations:
@@ -72,13 +72,16 @@ def known(behaviour: dict[str, Array], lengths: NDArray[np.int64] | None = None)
     return Demonstrations(values, ends, "", tuple(f"c{index}" for index in range(columns)), ("",) * columns, texts)
 
 
-def accepted(examples: Demonstrations, goal: str, plans: Array, share: float = 0.98) -> float:
-    """Share of plans that are recognised."""
-    measure = METRICS["recognised"](examples, plans.shape[1], share).measure
-    found = measure(goal, torch.from_numpy(plans).float(), None)
-    assert found.dtype == torch.bool
-    assert found.shape == (len(plans),)
-    return float(found.float().mean())
+def rates(examples: Demonstrations, behaviour: dict[str, Array], share: float = 0.98) -> list[float]:
+    """Share of plans that are recognised, of each goal."""
+    metric = METRICS["recognised"](examples, next(iter(behaviour.values())).shape[1], share)
+    found = [metric.measure(goal, torch.from_numpy(plans).float(), None) for goal, plans in behaviour.items()]
+    assert [(one.dtype, one.shape) for one in found] == [(torch.bool, (len(plans),)) for plans in behaviour.values()]
+    return [float(one.float().mean()) for one in found]
+
+
+def accepted(examples: Demonstrations, goal: str, plans: Array) -> float:
+    return rates(examples, {goal: plans})[0]
 
 
 def jagged(real: Array, times: float = 3.0) -> Array:
@@ -111,52 +114,36 @@ def drawn(name: str, seed: int) -> Demonstrations:
     return known({str(kind): FAMILIES[name](kind, 10 if kind < KINDS else 5, seed) for kind in range(KINDS + NEW)})
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
+@pytest.fixture(scope="module", params=["paths", *SLOW])
 def family(request: pytest.FixtureRequest) -> tuple[str, Demonstrations, dict[str, Array]]:
     """Its name, examples, and fresh behaviour of each kind."""
     name = request.param
     return name, drawn(name, 0), {str(kind): FAMILIES[name](kind, 40, 1000) for kind in range(KINDS + NEW)}
 
 
-def rates(examples: Demonstrations, behaviour: dict[str, Array]) -> list[float]:
-    metric = METRICS["recognised"](examples, next(iter(behaviour.values())).shape[1], 0.98)
-    return [float(metric.measure(goal, torch.from_numpy(plans).float(), None).float().mean()) for goal, plans in behaviour.items()]
-
-
-def test_real_behaviour_is_recognised(family: tuple[str, Demonstrations, dict[str, Array]]) -> None:
+@pytest.mark.slow
+def test_real_behaviour_is_recognised_and_that_of_other_kinds_is_not(
+    family: tuple[str, Demonstrations, dict[str, Array]],
+) -> None:
     # Five examples may happen to be alike, so several draws of them.
     name, examples, fresh = family
-    found = np.mean([rates(some, fresh) for some in (examples, *(drawn(name, seed) for seed in range(1, 6)))], axis=0)
+    found = np.mean([rates(some, fresh) for some in (examples, *(drawn(name, seed) for seed in range(1, 4)))], axis=0)
     assert np.mean(found[:KINDS]) >= 0.95
     assert np.mean(found[KINDS:]) >= 0.93
     assert min(found) >= 0.85
-
-
-def test_copies_are_recognised(family: tuple[str, Demonstrations, dict[str, Array]]) -> None:
-    _, examples, _ = family
     copies = {goal: examples.select(goal).states.double().numpy() for goal in dict.fromkeys(examples.concepts)}
     assert np.mean(rates(examples, copies)) >= 0.98
-
-
-def test_behaviour_of_other_kinds_is_not_recognised(family: tuple[str, Demonstrations, dict[str, Array]]) -> None:
-    name, examples, fresh = family
     goals = list(fresh)
     assert np.mean(rates(examples, {goal: fresh[goals[index - 1]] for index, goal in enumerate(goals)})) <= 0.02
     never_seen = FAMILIES[name]  # nor is what is of no kind with examples
     assert np.mean(rates(examples, {goal: never_seen(100 + index, 40, 1000) for index, goal in enumerate(goals)})) <= 0.05
 
 
-@pytest.mark.parametrize("family", ["paths", "series"], indirect=True)  # single states have no time
+@pytest.mark.parametrize("family", ["paths", SLOW[1]], indirect=True)  # single states have no time
 @pytest.mark.parametrize(
     "change",
-    [
-        jagged,
-        shuffled,
-        straight,
-        smaller,
-        pytest.param(lambda real: frozen_after(real, 0), id="frozen"),
-        pytest.param(lambda real: frozen_after(real, real.shape[1] // 3), id="frozen after a third"),
-    ],
+    [jagged, shuffled, straight, smaller, lambda real: frozen_after(real, 0), lambda real: frozen_after(real, real.shape[1] // 3)],
+    ids=["jagged", "shuffled", "straight", "smaller", "frozen", "frozen after a third"],
 )
 def test_what_real_behaviour_never_does_is_not_recognised(
     family: tuple[str, Demonstrations, dict[str, Array]], change: Callable[[Array], Array]
@@ -165,16 +152,12 @@ def test_what_real_behaviour_never_does_is_not_recognised(
     assert np.mean(rates(examples, {goal: change(real) for goal, real in fresh.items()})) <= 0.05
 
 
-def test_single_states_that_are_mixed_up_or_faint_are_not_recognised() -> None:
+def test_single_states_that_are_mixed_up_or_faint_and_a_jump_in_one_small_column_beside_large_ones_are_not_recognised() -> None:
     examples = known({str(kind): states(kind, 10, 0) for kind in range(6)})
-    draw = rng("mixed")
     fresh = states(2, 40, 1)
     assert accepted(examples, "2", fresh) >= 0.9
-    assert accepted(examples, "2", fresh[..., draw.permutation(64)]) == 0
+    assert accepted(examples, "2", fresh[..., rng("mixed").permutation(64)]) == 0
     assert accepted(examples, "2", 0.4 * fresh) == 0
-
-
-def test_a_jump_in_one_small_column_is_seen_beside_large_ones() -> None:
     examples = known({str(kind): series(kind, 10, 0) for kind in range(4)})
     fresh = series(1, 40, 1)
     broken = fresh.copy()
@@ -183,6 +166,7 @@ def test_a_jump_in_one_small_column_is_seen_beside_large_ones() -> None:
     assert accepted(examples, "1", broken) == 0
 
 
+@pytest.mark.slow
 def test_pace_and_length_do_not_matter() -> None:
     draw = rng("lengths")
 
@@ -195,9 +179,9 @@ def test_pace_and_length_do_not_matter() -> None:
             way[length:] = way[length - 1]
         return ways, lengths
 
-    drawn = {str(kind): some(kind, 10 if kind < 5 else 5, 0) for kind in range(7)}
+    drawn = {str(kind): some(kind, 10 if kind < 4 else 5, 0) for kind in range(5)}
     examples = known({kind: ways for kind, (ways, _) in drawn.items()}, np.concatenate([ends for _, ends in drawn.values()]))
-    fresh = {str(kind): some(kind, 40, 1)[0] for kind in range(7)}
+    fresh = {str(kind): some(kind, 20, 1)[0] for kind in range(5)}
     assert np.mean(rates(examples, fresh)) >= 0.93
     assert np.mean(rates(examples, {goal: jagged(real) for goal, real in fresh.items()})) <= 0.05
     assert np.mean(rates(examples, {goal: frozen_after(real, 8) for goal, real in fresh.items()})) <= 0.05
@@ -235,39 +219,20 @@ def test_columns_that_never_change_do_not_matter() -> None:
     assert accepted(still, "high", np.zeros((2, 12, 2))) == 0
 
 
-def test_plans_that_are_not_finite_are_not_recognised() -> None:
-    examples = known({str(kind): paths(kind, 5, 0) for kind in range(3)})
-    plans = paths(1, 3, 0)
-    plans[0, 4, 1], plans[1, 0, 0] = np.nan, np.inf
-    found = METRICS["recognised"](examples, TIME, 1).measure("1", torch.from_numpy(plans).float(), None)
-    assert found.tolist() == [False, False, True]
-
-
-def test_more_is_accepted_the_greater_the_share() -> None:
+def test_more_is_accepted_the_greater_the_share_and_plans_that_are_not_finite_are_not() -> None:
     examples = known({str(kind): paths(kind, 20, 0) for kind in range(5)})
     fresh = {str(kind): paths(kind, 40, 1) for kind in range(5)}
-    found = []
-    for share in (0.5, 0.8, 0.98):
-        measure = METRICS["recognised"](examples, TIME, share).measure
-        right = [measure(goal, torch.from_numpy(real).float(), None) for goal, real in fresh.items()]
-        found.append(float(torch.stack(right).float().mean()))
+    found = [np.mean(rates(examples, fresh, share)) for share in (0.5, 0.8, 0.98)]
     assert 0.4 < found[0] < found[1] < found[2]
     assert found[0] < 0.85  # limits are wider than the share says, as five concepts say little about others
     assert found[2] > 0.95
     for number in (0, -1, 1.5):
         with pytest.raises(UserError, match=r"data\.metrics\.recognised: expected a share .* above 0, at most 1, found"):
             METRICS["recognised"](examples, TIME, number)
-
-
-def test_judging_takes_well_under_a_second() -> None:
-    examples = known({str(kind): paths(kind, 20, 0) for kind in range(11)})
-    plans = paths(3, 50, 1)
-    accepted(examples, "3", plans)
-    before = clock.process_time()
-    accepted(examples, "3", plans)
-    assert clock.process_time() - before < 1
-
-
-def test_it_is_what_data_of_ones_own_are_judged_by() -> None:
+    examples = known({str(kind): paths(kind, 5, 0) for kind in range(3)})
+    plans = paths(1, 3, 0)
+    plans[0, 4, 1], plans[1, 0, 0] = np.nan, np.inf
+    found = METRICS["recognised"](examples, TIME, 1).measure("1", torch.from_numpy(plans).float(), None)
+    assert found.tolist() == [False, False, True]
     settings = yaml.safe_load((ROOT / "conf" / "own.yaml").read_text("utf-8"))
     assert settings["fit"]["data"]["init_args"]["metrics"] == {"recognised": 0.98}

@@ -1,7 +1,6 @@
 """Behaviour shown by hand: what comes in is checked, and what becomes of it is behaviour of the domain."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,9 @@ from ftl_lightning.domains.vector_film import VectorFilm, still
 from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.testing.strokes import recognised, strokes
 
+SHAPES = load_domain("object_rearrangement")
+assert SHAPES.recorder is not None
+ARRANGED = SHAPES.recorder
 EMPTY = Scene(VectorFilm((still("line", [(0, 0), (1, 1)], "#000000"),), (0.0, 0.0, 10.0, 10.0), 1.0))
 
 
@@ -47,32 +49,28 @@ def as_hand(line: np.ndarray, rng: np.random.Generator, pixel: float) -> list[An
     return on_grid
 
 
-@pytest.mark.parametrize(
-    ("path", "seconds", "expected"),
-    [
-        ([], [], "shape (step, 1, 2)"),
-        ([[[0, 0], [1, 1]]], [0], "shape (step, 1, 2)"),
-        ([[[0, 0]], [[1]]], [0, 1], "numbers in lists of equal lengths"),
-        ([[["0", "0"]]], [0], "numbers in lists of equal lengths"),
-        ([[[None, 0]]], [0], "numbers in lists of equal lengths"),
-        ({"x": 1}, [0], "numbers in lists of equal lengths"),
+def test_a_path_that_is_none_is_one_plain_line_and_one_near_what_is_in_sight_is_taken_as_it_is() -> None:
+    path: Any
+    shape, lists = "shape (step, 1, 2)", "numbers in lists of equal lengths"
+    for path, seconds, expected in (
+        ([], [], shape),
+        ([[[0, 0], [1, 1]]], [0], shape),
+        ([[[0, 0]], [[1]]], [0, 1], lists),
+        ([[["0", "0"]]], [0], lists),
+        ([[[None, 0]]], [0], lists),
+        ({"x": 1}, [0], lists),
         ([[[0, float("nan")]]], [0], "finite"),
         ([[[0, 0]]], [float("inf")], "finite"),
         ([[[0, 0]], [[1, 1]]], [0], "a time for each of 2 steps"),
         ([[[0, 0]], [[1, 1]]], [1, 0.5], "never go back"),
         ([[[0, 0]]] * (MOST_STEPS + 1), [0] * (MOST_STEPS + 1), "at most 20,000"),
         ([[[5 + 10 * (AROUND + 0.51), 5]]], [0], "near what is in sight"),
-    ],
-)
-def test_a_path_that_is_none_is_one_plain_line(path: Any, seconds: Any, expected: str) -> None:
-    with pytest.raises(UserError) as error:
-        expect_path(EMPTY, path, seconds)
-    assert expected in str(error.value)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) <= LONGEST
-
-
-def test_a_path_near_what_is_in_sight_is_taken_as_it_is() -> None:
+    ):
+        with pytest.raises(UserError) as error:
+            expect_path(EMPTY, path, seconds)
+        assert expected in str(error.value)
+        assert "\n" not in str(error.value)
+        assert len(str(error.value)) <= LONGEST
     places, times = expect_path(EMPTY, [[[-3, 12]], [[4, 5.5]], [[4, 5.5]]], [0, 0.1, 0.1])
     assert places.tolist() == [[[-3, 12]], [[4, 5.5]], [[4, 5.5]]]
     assert times.tolist() == [0, 0.1, 0.1]
@@ -111,62 +109,46 @@ def test_smoothing_takes_the_pixels_and_leaves_the_ends_and_the_corners() -> Non
     assert turns < 0.2 * rough
 
 
-def test_a_slip_of_the_hand_is_no_line() -> None:
+def test_lines_are_drawn_within_a_square_around_the_examples_and_slips_and_other_behaviour_are_not() -> None:
     recorder = drawn()
-    left, lower, width, height = recorder.scene("", 0).film.window
-    x, y = left + width / 2, lower + height / 2
-    for length in (0.0, 0.019):
-        with pytest.raises(UserError, match="draw it again"):
-            shown(recorder, [[[x, y]], [[x + length * width, y]]])
-    assert shown(recorder, [[[x, y]], [[x + 0.03 * width, y]]]).states.shape == (1, 40, 2)
-
-
-def test_lines_are_drawn_within_a_square_around_the_examples() -> None:
-    scene = drawn().scene("any", 3)
+    scene = recorder.scene("any", 3)
     left, lower, width, height = scene.film.window
     assert width == height
     states = examples().states.numpy()
     assert (states > (left, lower)).all()
     assert (states < (left + width, lower + height)).all()
     assert scene.film.frames == 1
+    x, y = left + width / 2, lower + height / 2
+    for length in (0.0, 0.019):
+        with pytest.raises(UserError, match="draw it again"):
+            shown(recorder, [[[x, y]], [[x + length * width, y]]])
+    assert shown(recorder, [[[x, y]], [[x + 0.03 * width, y]]]).states.shape == (1, 40, 2)
+    for horizon, columns in ((1, 2), (40, 4)):
+        assert own_domain(examples(horizon, columns), ("heart",), horizon, {}).recorder is None
 
 
-@pytest.mark.parametrize(("horizon", "columns"), [(1, 2), (40, 4)])
-def test_other_behaviour_of_ones_own_is_not_drawn(horizon: int, columns: int) -> None:
-    assert own_domain(examples(horizon, columns), ("heart",), horizon, {}).recorder is None
-
-
-def test_shapes_are_put_where_they_belong() -> None:
-    domain = load_domain("object_rearrangement")
-    assert domain.recorder is not None
-    seen = [domain.recorder.scene("", seed) for seed in range(20)]
+def test_shapes_are_put_where_they_belong_and_judged_as_any_scene() -> None:
+    seen = [ARRANGED.scene("", seed) for seed in range(20)]
     states = torch.stack([scene.state for scene in seen if scene.state is not None])
     assert not overlap(states).any()
     assert not any(holds(relation, states, relaxed=False).any() for relation in TRAINING_RELATIONS)
     assert len({tuple(row) for row in states.tolist()}) == 20
-    again = domain.recorder.scene("", 3).state
-    assert again is not None
-    assert torch.equal(states[3], again)
+    assert torch.equal(states[3], ARRANGED.scene("", 3).state)  # type: ignore[arg-type]
     scene = seen[0]
     assert [piece.name for piece in scene.pieces] == ["circle", "triangle", "square"]
     for piece in scene.pieces:
         (number,) = piece.shapes
         assert np.allclose(scene.film.shapes[number].points[0].mean(axis=0), piece.at, atol=1e-5)
     path = [[[4.5, 2.0], [0.5, 0.4], [-0.7, 5.9]]]
-    found = domain.recorder.record(scene, *expect_path(scene, path, [0]))
+    found = ARRANGED.record(scene, *expect_path(scene, path, [0]))
     before, after = states[0].reshape(3, 7), found.states[0, 0].reshape(3, 7)
     assert torch.equal(after[:, 2:], before[:, 2:])
     assert torch.allclose(after[:, :2], torch.tensor([[4.5, 2.0], [0.5, 0.4], [0.0, EXTENT]]))
-    assert found.state_names == domain.plans.columns
+    assert found.state_names == SHAPES.plans.columns
     assert found.concepts == ("",)
-
-
-def test_what_was_arranged_is_judged_as_any_scene(tmp_path: Path) -> None:
-    domain = load_domain("object_rearrangement")
-    assert domain.recorder is not None
-    scene = domain.recorder.scene("", 1)
-    found = domain.recorder.record(scene, *expect_path(scene, [[[4.5, 1.0], [2.5, 4.5], [1.0, 1.0]]], [0]))
-    found.save(tmp_path / "one.safetensors")
-    states = Demonstrations.load(tmp_path / "one.safetensors").states
-    assert domain.metrics["accuracy"].measure("circle right of square", states, None).all()
-    assert not domain.metrics["accuracy"].measure("square right of circle", states, None).any()
+    scene = ARRANGED.scene("", 1)
+    found = ARRANGED.record(scene, *expect_path(scene, [[[4.5, 1.0], [2.5, 4.5], [1.0, 1.0]]], [0]))
+    found.save("one.safetensors")
+    states = Demonstrations.load("one.safetensors").states
+    assert SHAPES.metrics["accuracy"].measure("circle right of square", states, None).all()
+    assert not SHAPES.metrics["accuracy"].measure("square right of circle", states, None).any()

@@ -1,6 +1,7 @@
 """Domains are found by the name under which a package offers them, or where they are."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -26,34 +27,33 @@ checkers = not_installed_anywhere:DOMAIN
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An installed package that offers two domains, of which one cannot be imported."""
     (tmp_path / "chess_domain.py").write_text(MODULE)
-    card = tmp_path / "chess_domain-1.0.dist-info"
-    card.mkdir()
-    (card / "METADATA").write_text("Metadata-Version: 2.1\nName: chess-domain\nVersion: 1.0\n")
-    (card / "entry_points.txt").write_text(OFFERED)
-    monkeypatch.syspath_prepend(tmp_path)
+    with offering(tmp_path, "chess-domain", OFFERED, monkeypatch):
+        yield
+
+
+@contextmanager
+def offering(folder: Path, name: str, points: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A folder on Python's path in which a package of some entry points is installed."""
+    card = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    card.mkdir(parents=True)
+    (card / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (card / "entry_points.txt").write_text(points)
+    monkeypatch.syspath_prepend(folder)
     load_domain.cache_clear()
     yield
     load_domain.cache_clear()
 
 
-def test_the_built_in_domains_are_offered_like_any_other() -> None:
-    assert set(BUILT_IN) <= set(domain_names())
+def test_the_built_in_domains_and_that_of_a_package_are_offered_alike_and_also_named_by_where_they_are(package: None) -> None:
+    assert domain_names() == tuple(sorted((*BUILT_IN, "chess", "checkers")))
+    found = load_domain("chess")
+    assert found.name == load_domain("chess_domain:DOMAIN").name == "chess"
+    assert load_domain("chess") is found
+    assert found.plans == DOMAIN.plans
+    assert load_domain("ftl_lightning.domains.object_rearrangement:DOMAIN") is DOMAIN
     for name in BUILT_IN:
         assert load_domain(name).name == name
     assert load_domain("object_rearrangement") is DOMAIN
-
-
-def test_a_package_of_ones_own_offers_a_domain(package: None) -> None:
-    assert domain_names() == tuple(sorted((*BUILT_IN, "chess", "checkers")))
-    found = load_domain("chess")
-    assert found.name == "chess"
-    assert load_domain("chess") is found
-    assert found.plans == DOMAIN.plans
-
-
-def test_a_domain_is_named_by_where_it_is(package: None) -> None:
-    assert load_domain("chess_domain:DOMAIN").name == "chess"
-    assert load_domain("ftl_lightning.domains.object_rearrangement:DOMAIN") is DOMAIN
 
 
 @pytest.mark.parametrize(

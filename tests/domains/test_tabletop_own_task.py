@@ -1,7 +1,6 @@
 """A task of one's own, from arrays: what the page says to do."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,11 +9,13 @@ from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.interface import IMAGE, POSE
 from ftl_lightning.domains.tabletop.tasks import PUSH_TO_WHITE
 from ftl_lightning.few_shot import FewShot
+from tests.conftest import ROOT
 
-PAGE = Path(__file__).parents[2] / "docs" / "domains" / "table-top.md"
-COUNT = 3
+PAGE = ROOT / "docs" / "domains" / "table-top.md"
+COUNT = 2
 
 
+@pytest.mark.slow
 def test_a_task_of_ones_own_is_learned_from_arrays(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     drawn = DOMAIN.source(None).draw(PUSH_TO_WHITE, COUNT, 5)

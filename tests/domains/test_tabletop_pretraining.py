@@ -1,28 +1,31 @@
 """Pretraining on the table-top: demonstrations that begin elsewhere, corrections from a file, and eyes that are taught places."""
 
 import runpy
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import PretrainingData
-from ftl_lightning.domains.tabletop import DOMAIN
-from ftl_lightning.domains.tabletop.interface import IMAGE, PLACES, POSE
+from ftl_lightning.domains.tabletop import source
+from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
 from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.seeding import generator
+from ftl_lightning.seeding import generator, task_key
 from ftl_lightning.trainer import Trainer
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).parents[2]
+perturb = VIEWS["points"].perturb
+assert perturb is not None
 SIZES: dict[str, Any] = {"samples_per_concept": 1, "validation_per_concept": 1, "batch_size": 8, "steps_per_epoch": 4}
 POINTS = {"widths": [8], "stride": 2, "head": "points", "keypoints": 8, "points": 5, "origin": "origin"}
 SMALL: dict[str, Any] = {
@@ -34,34 +37,66 @@ SMALL: dict[str, Any] = {
 }
 
 
+@pytest.fixture
+def pretrained(tiny_of: Callable[[str], Path], drawn: None) -> Path:
+    """Folder of a small pretrained model."""
+    return tiny_of("tabletop")
+
+
+def made_up(self: source.Expert, task: str, count: int, seed: int, **_: bool) -> Demonstrations:
+    """Demonstrations in which everything is anywhere, in place of the simulator's."""
+    draw = generator("cpu", seed, task_key(task))
+    anywhere = torch.rand(count, 6, 5, 4, generator=draw) * torch.tensor([1, 0.4, 0.4, 0.1]) + torch.tensor([0, 0.3, -0.2, 0])
+    anywhere[..., 0] = (anywhere[..., 0] > 0.3).float()
+    pose = torch.zeros(count, 6, 8)
+    pose[..., :3] = anywhere[:, :, 0, 1:]
+    image = torch.randint(256, (count, 6, 3, 64, 64), generator=draw, dtype=torch.uint8)
+    observed = {IMAGE: image, POSE: pose, PLACES: anywhere}
+    kinds = {"domain": NAME, "state_names": STATE_NAMES, "state_units": STATE_UNITS, "per_step": tuple(observed)}
+    return Demonstrations(
+        states=pose[..., [0, 1, 2, 7]], lengths=torch.full((count,), 6), concepts=(task,) * count, observed=observed, **kinds
+    )
+
+
+@pytest.fixture
+def data(monkeypatch: pytest.MonkeyPatch) -> PretrainingData:
+    """A small training set that needs no simulator."""
+    monkeypatch.setattr(source.Expert, "draw", made_up)
+    found = PretrainingData(domain=NAME, **SIZES)
+    found.setup("fit")
+    return found
+
+
 def trainer(**options: Any) -> Trainer:
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
     return Trainer(accelerator="cpu", default_root_dir="logs", **(quiet | options))
 
 
-def test_what_begins_elsewhere_and_corrections_join_the_training_set(tmp_path: Path) -> None:
-    data = PretrainingData(domain="tabletop", recoveries=1, **SIZES)
+@pytest.mark.usefixtures("data")
+def test_what_begins_elsewhere_and_corrections_join_the_training_set() -> None:
+    data = PretrainingData(domain=NAME, recoveries=1, **SIZES)
     data.setup("fit")
     assert [data.training.concepts.count(task) for task in (PUSH, AROUND_BOWL)] == [5, 2]
     assert len(data.training) == 9
     batch = data.batch(0)
     assert batch.observed[PLACES].shape == (8, 5, 4)
     assert "recoveries" in data.hparams
-    assert not {"recoveries", "more"} & set(PretrainingData(domain="tabletop", **SIZES).hparams)
-    data.training.rows([0, 1]).save(tmp_path / "more.safetensors")
-    longer = PretrainingData(domain="tabletop", more=str(tmp_path / "more.safetensors"), **SIZES)
+    assert not {"recoveries", "more"} & set(PretrainingData(domain=NAME, **SIZES).hparams)
+    data.training.rows([0, 1]).save("more.safetensors")
+    longer = PretrainingData(domain=NAME, more="more.safetensors", **SIZES)
     longer.setup("fit")
     assert len(longer.training) == 9
-    strange = DOMAIN.source(None).draw(PUSH_ON_BOOK, 1, 0)
-    strange.save(tmp_path / "strange.safetensors")
+    replace(data.training.rows([0]), concepts=(PUSH_ON_BOOK,)).save("strange.safetensors")
     with pytest.raises(UserError, match=r"strange.safetensors: expected demonstrations of training concepts, found 'push"):
-        PretrainingData(domain="tabletop", more=str(tmp_path / "strange.safetensors"), **SIZES).setup("fit")
+        PretrainingData(domain=NAME, more="strange.safetensors", **SIZES).setup("fit")
     with pytest.raises(UserError, match="recoveries: expected 0, as domain object_rearrangement has none, found 1"):
         PretrainingData(domain="object_rearrangement", recoveries=1).setup("fit")
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("pretrained")
 def test_eyes_are_taught_places(tmp_path: Path) -> None:
-    data = PretrainingData(domain="tabletop", **SIZES)
+    data = PretrainingData(domain=NAME, **SIZES)
     losses: list[float] = []
     module = PretrainingModule(privileged={PLACES: 1.0}, draws=2, output=str(tmp_path / "model"), learning_rate=5e-3, **SMALL)
     module.log = lambda name, value, **_: losses.append(float(value.detach())) if name == "train/places" else None  # type: ignore[method-assign]
@@ -89,9 +124,7 @@ def test_an_error_is_that_of_what_is_seen() -> None:
     assert misplaced(right.flatten(1), places).tolist() == pytest.approx([0, 0.5], abs=1e-6)
 
 
-def test_what_is_told_is_right_but_for_errors_of_eyes() -> None:
-    data = PretrainingData(domain="tabletop", **SIZES)
-    data.setup("fit")
+def test_what_is_told_is_right_but_for_errors_of_eyes(data: PretrainingData) -> None:
     places = data.batch(0).observed[PLACES].repeat(200, 1, 1)
     read = told(places, generator("cpu", 0))
     there = places[..., 0] > 0.5
@@ -101,7 +134,9 @@ def test_what_is_told_is_right_but_for_errors_of_eyes() -> None:
     assert torch.equal(read[:, 15:] > 0, there)
 
 
-def test_pictures_are_looked_at_in_part_of_the_windows_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_looked_at_in_part_of_the_windows_alone(
+    tmp_path: Path, data: PretrainingData, monkeypatch: pytest.MonkeyPatch
+) -> None:
     looked: list[int] = []
     plain = ImageEncoders.forward
 
@@ -110,7 +145,6 @@ def test_pictures_are_looked_at_in_part_of_the_windows_alone(tmp_path: Path, mon
         return plain(self, observed)
 
     monkeypatch.setattr(ImageEncoders, "forward", counted)
-    data = PretrainingData(domain="tabletop", **SIZES)
     module = PretrainingModule(privileged={PLACES: 1.0}, told=0.75, output=str(tmp_path / "model"), **SMALL)
     trainer(max_steps=3, limit_val_batches=0).fit(module, datamodule=data)
     assert looked == [2, 2, 2]
@@ -120,30 +154,18 @@ def test_pictures_are_looked_at_in_part_of_the_windows_alone(tmp_path: Path, mon
     assert "told" not in PretrainingModule(privileged={PLACES: 1.0}, **SMALL).hparams
 
 
-def test_places_move_with_the_picture() -> None:
-    data = PretrainingData(domain="tabletop", **SIZES)
-    data.setup("fit")
+def test_places_move_with_the_picture_and_what_has_none_is_also_seen_higher(data: PretrainingData) -> None:
     batch = data.batch(1)
-    perturb = VIEWS["points"].perturb
-    assert perturb is not None
     states, seen = perturb(batch.states, batch.observed, generator("cpu", 0))
     hand, before = seen[POSE][:, :2], batch.observed[POSE][:, :2]
     for number in range(5):
         there = (seen[PLACES][:, number, 0] > 0.5) & (batch.observed[PLACES][:, number, 0] > 0.5)
         away = (seen[PLACES][there, number, 1:3] - hand[there]).norm(dim=1)
-        torch.testing.assert_close(
-            away, (batch.observed[PLACES][there, number, 1:3] - before[there]).norm(dim=1), atol=1e-5, rtol=0
-        )
+        was = (batch.observed[PLACES][there, number, 1:3] - before[there]).norm(dim=1)
+        torch.testing.assert_close(away, was, atol=1e-5, rtol=0)
     assert seen[IMAGE].dtype == torch.uint8
+    assert torch.equal(seen[POSE][:, 2], batch.observed[POSE][:, 2])
     assert states.shape == batch.states.shape
-
-
-def test_what_has_no_picture_is_also_seen_higher() -> None:
-    data = PretrainingData(domain="tabletop", **SIZES)
-    data.setup("fit")
-    batch = data.batch(1)
-    perturb = VIEWS["points"].perturb
-    assert perturb is not None
     unseen = {name: values for name, values in batch.observed.items() if name != IMAGE}
     states, seen = perturb(batch.states, unseen, generator("cpu", 0))
     heights = (states[..., 2] - batch.states[..., 2])[:, 0]
@@ -156,46 +178,33 @@ def test_what_has_no_picture_is_also_seen_higher() -> None:
         (seen[PLACES][..., 3], batch.observed[PLACES][..., 3]),
     ):
         torch.testing.assert_close(moved - before, heights[:, None].expand_as(moved), atol=1e-6, rtol=0)
-    _, shown = perturb(batch.states, batch.observed, generator("cpu", 0))
-    assert torch.equal(shown[POSE][:, 2], batch.observed[POSE][:, 2])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_mistakes_are_told_in_one_line(data: PretrainingData) -> None:
+    plain = {"image_encoder": {"origin": "origin"}}
+    reads = "model.privileged.places: expected image_encoder of 5 points, found one that reads 96 numbers"
+    for options, message in (
         ({"privileged": {"depth": 1.0}}, r"model.privileged: expected places \(domain tabletop\), found 'depth'"),
-        (
-            {"privileged": {PLACES: 1.0}, "image_encoder": {"origin": "origin"}, "denoiser_args": {}},
-            "model.privileged.places: expected image_encoder of 5 points, found one that reads 96 numbers",
-        ),
-        ({"image_encoder": {"origin": "origin"}}, "initial_encoder: expected flat, found points"),
+        ({"privileged": {PLACES: 1.0}, "denoiser_args": {}, **plain}, reads),
+        (plain, "initial_encoder: expected flat, found points"),
         ({"privileged": {PLACES: -1.0}}, r"model.privileged.places: expected a number from 0"),
         ({"told": 0.5}, "model.told: expected less than 1, and one name in model.privileged, found 0.5"),
         ({"told": 1.0, "privileged": {PLACES: 1.0}}, "model.told: expected less than 1"),
         ({"told": 1.5, "privileged": {PLACES: 1.0}}, "model.told: expected a number from 0 to 1"),
         ({"draws": 0}, "model.draws: expected a number from 1|model.draws: expected 1"),
-    ],
-)
-def test_mistakes_are_told_in_one_line(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        trainer(max_steps=1).fit(PretrainingModule(**(SMALL | options)), datamodule=PretrainingData(domain="tabletop", **SIZES))
+    ):
+        with pytest.raises(UserError, match=message):
+            trainer(max_steps=1).fit(PretrainingModule(**(SMALL | options)), datamodule=data)
 
 
-def test_a_model_is_corrected_by_the_expert(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = ["fit", "--config", "conf/tabletop.yaml", "--trainer.max_steps", "1", "--model.output", str(tmp_path / "model")]
-    sizes = ["--data.samples_per_concept", "1", "--data.validation_per_concept", "1", "--data.recoveries", "0"]
-    monkeypatch.chdir(ROOT)
-    assert main([*arguments, *sizes, "--trainer.default_root_dir", str(tmp_path), "--trainer.logger", "false"]) == 0
-    out = tmp_path / "corrections.safetensors"
+@pytest.mark.slow
+def test_a_model_is_corrected_by_the_expert(pretrained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_dagger.py"))
-    monkeypatch.setattr(
-        "sys.argv",
-        ["x", f"--pretrained={tmp_path / 'model'}", f"--task={PUSH}", "--count=2", f"--out={out}"],
-    )
+    monkeypatch.setattr("sys.argv", ["x", f"--pretrained={pretrained}", f"--task={PUSH}", "--count=2", "--out=made.safetensors"])
     script["main"]()
-    made = Demonstrations.load(out)
+    made = Demonstrations.load("made.safetensors")
     assert made.concepts == (PUSH, PUSH)
     assert set(made.observed) == {IMAGE, POSE, PLACES}
-    longer = PretrainingData(domain="tabletop", more=str(out), **SIZES)
+    longer = PretrainingData(domain=NAME, more="made.safetensors", **SIZES)
     longer.setup("fit")
     assert len(longer.training) == 9

@@ -9,7 +9,7 @@ from ftl_lightning.domains.tasks import EvaluationTask, Suite, few_shot_suites
 from ftl_lightning.errors import UserError
 
 
-def test_a_suite_learns_every_concept_that_a_task_names_once_in_order() -> None:
+def test_a_suite_learns_every_concept_that_a_task_names_once_and_a_component_is_named_after_its_own() -> None:
     tasks = (
         EvaluationTask("two", "a and b", learned=("a", "b")),
         EvaluationTask("one", "b", learned=("b",)),
@@ -18,27 +18,22 @@ def test_a_suite_learns_every_concept_that_a_task_names_once_in_order() -> None:
     )
     assert Suite(tasks).learned == ("a", "b", "d")
     assert few_shot_suites(("known",), ("new",))["new"].tasks == (EvaluationTask("new concept", "new", learned=("new",)),)
-
-
-def test_a_task_of_a_component_is_named_after_the_concept_that_it_is_of() -> None:
     assert EvaluationTask("s", "a", learned=("a and b",), component=1).name == "a (learned from: a and b)"
     assert EvaluationTask("s", "a and b", learned=("a", "b")).name == "a and b"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_tasks_that_make_no_sense_are_refused() -> None:
+    options: dict[str, Any]
+    for options, message in (
         ({"learned": "up"}, "evaluation task 'g': learned: expected a tuple of names, found 'up'"),
         ({"texts": ["up"]}, r"texts: expected a tuple of names, found \['up'\]"),
         ({"without": "up"}, "without: expected a tuple of names"),
         ({"learned": ("a", "b"), "component": 1}, "component: expected one learned concept, found 2"),
         ({"component": 1}, "component: expected one learned concept, found 0"),
         ({"learned": ("a", "b"), "initial": "demonstrated"}, "initial: expected one learned concept, found 2"),
-    ],
-)
-def test_tasks_that_make_no_sense_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        EvaluationTask("s", "g", **options)
+    ):
+        with pytest.raises(UserError, match=message):
+            EvaluationTask("s", "g", **options)
 
 
 @pytest.mark.parametrize("name", ["agent", "driving", "object_rearrangement"])

@@ -21,6 +21,7 @@ def durations(content: bytes) -> list[int]:
 def test_an_animation_can_be_followed_whatever_its_number_of_frames(count: int) -> None:
     found = durations(gif(pictures(count)))
     assert len(found) == count
+    assert Image.open(io.BytesIO(gif(pictures(count)))).info["loop"] == 0
     assert len(set(found[:-1])) == 1
     assert 3000 <= sum(found) <= 6000
     assert found[-1] == found[0] + 1500  # it rests at the end
@@ -46,7 +47,7 @@ def test_a_caption_stands_below_every_picture_and_breaks_its_lines() -> None:
     assert captioned(plain, "")[0].shape == plain[0].shape
 
 
-def test_how_it_ended_stands_below_the_last_picture_alone() -> None:
+def test_how_it_ended_is_told_in_words_and_stands_below_the_last_picture_alone() -> None:
     plain = pictures(3)
     first, second, last = captioned(plain, "goal", "success: yes")
     assert first.shape == second.shape == last.shape
@@ -55,9 +56,6 @@ def test_how_it_ended_stands_below_the_last_picture_alone() -> None:
     assert (first[len(alone) - 6 :] == 255).all()
     assert np.array_equal(first[30:], second[30:])
     assert (last[len(alone) - 6 :] < 128).any()
-
-
-def test_an_outcome_is_told_in_words() -> None:
     outcomes = {"success": torch.tensor([True, False]), "return": torch.tensor([1.0, 2.345])}
     assert outcome_text(outcomes) == "success: yes, return: 1.00"
     assert outcome_text(outcomes, 1) == "success: no, return: 2.35"

@@ -20,7 +20,6 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation import closed_loop
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, reset, roll_out, sampled_plans
-from ftl_lightning.evaluation.tensorboard import gif
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.seeding import generator
@@ -30,7 +29,6 @@ class Line(gymnasium.Env[Any, Any]):
     """A point on a line; an action is its next step. It ends beyond 3."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        assert options is not None
         self.x = np.array(options["scene"], dtype=np.float32)
         return self.seen(), {}
 
@@ -81,7 +79,7 @@ def test_plans_are_followed_until_the_environment_ends_an_episode(replan: int) -
     assert [int(plan[0, 0]) for plan in policy.followed[0]] == [step - step % replan for step in range(4)]
 
 
-def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_episode_without_a_finite_plan_or_whose_simulator_raises_fails_alone(caplog: pytest.LogCaptureFixture) -> None:
     def plan(observed: Observed, rows: list[int]) -> Tensor:
         plans = ahead(observed, rows)
         if observed["place"][0, 0] == 2:
@@ -93,6 +91,15 @@ def test_an_episode_whose_plan_is_not_finite_fails_and_the_others_go_on(caplog: 
     assert found.observed["place"][0, :, 0].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2]
     assert found.observed["place"][1, -1, 0] == -1
     assert "episode 0, step 2: the plan is not finite" in caplog.text
+    nowhere = PlanFollower(lambda observed, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
+    none = roll_out(LOOP, begin(0.0, 0.0), nowhere)  # all may fail
+    assert none.failed.all()
+    assert (none.observed["place"] == 0).all()
+    found = roll_out(LOOP, begin(100.0, -9.0), PlanFollower(ahead, LOOP.act, 1))
+    assert found.failed.tolist() == [True, False]
+    assert "episode 0, step 0: RuntimeError('the simulator broke')" in caplog.text
+    assert [info.get("x") for info in found.infos] == [None, -1]
+    assert [len(part.infos) for part in found.split([1, 1])] == [1, 1]
 
 
 def test_the_bar_moves_with_every_step_of_every_episode_and_reaches_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,21 +113,6 @@ def test_the_bar_moves_with_every_step_of_every_episode_and_reaches_its_end(monk
     monkeypatch.setattr(closed_loop, "bar", counted)
     roll_out(LOOP, begin(0.0, -9.0, 100.0), PlanFollower(ahead, LOOP.act, 1))
     assert told.count(1) >= 4 + LOOP.steps + 1  # one arrives, one runs on, one breaks at once
-
-
-def test_all_episodes_may_fail() -> None:
-    nowhere = PlanFollower(lambda observed, rows: torch.full((2, 9, 1), float("inf")), LOOP.act, 1)
-    found = roll_out(LOOP, begin(0.0, 0.0), nowhere)
-    assert found.failed.all()
-    assert (found.observed["place"] == 0).all()
-
-
-def test_an_episode_whose_simulator_raises_fails_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
-    found = roll_out(LOOP, begin(100.0, -9.0), PlanFollower(ahead, LOOP.act, 1))
-    assert found.failed.tolist() == [True, False]
-    assert "episode 0, step 0: RuntimeError('the simulator broke')" in caplog.text
-    assert [info.get("x") for info in found.infos] == [None, -1]
-    assert [len(part.infos) for part in found.split([1, 1])] == [1, 1]
 
 
 def test_a_rollout_keeps_the_features_that_are_asked_for_and_parts_keep_their_own() -> None:
@@ -160,20 +152,10 @@ def test_fixed_plans_are_chosen_by_episode() -> None:
 
 def model() -> GenerativeModel:
     torch.manual_seed(0)
-    config = DiffusionConfig(
-        domain="agent",
-        horizon=16,
-        state_dim=1,
-        observed={"place": Feature((1,))},
-        concept_dim=6,
-        training_concepts=("a", "b"),
-        encoder="none",
-        denoiser="TemporalUNet",
-        denoiser_args={"width": 8, "multipliers": [1, 2]},
-        diffusion_steps=10,
-    )
-    limits = torch.tensor([-10.0]), torch.tensor([10.0])
-    limited = Normalization(*limits)
+    sizes: dict[str, Any] = {"horizon": 16, "state_dim": 1, "observed": {"place": Feature((1,))}, "diffusion_steps": 10}
+    sizes |= {"denoiser": "TemporalUNet", "denoiser_args": {"width": 8, "multipliers": [1, 2]}}
+    config = DiffusionConfig(domain="agent", concept_dim=6, training_concepts=("a", "b"), encoder="none", **sizes)
+    limited = Normalization(torch.tensor([-10.0]), torch.tensor([10.0]))
     return GenerativeModel(Prepared(config, load_domain("agent"), limited, torch.randn(3, 6), limited)).eval()
 
 
@@ -183,25 +165,10 @@ def test_episodes_do_not_depend_on_their_neighbours() -> None:
     concepts = [Composition(torch.randn(k, 1, 6, generator=generator("cpu", k)), torch.ones(k)) for k in (1, 2, 1, 2, 1)]
 
     def run(rows: list[int]) -> Tensor:
-        plan = sampled_plans(
-            net,
-            [concepts[row] for row in rows],
-            Sampling("ddpm", 5, 0.5),
-            [generator("cpu", 0, row) for row in rows],
-        )
+        draws = [generator("cpu", 0, row) for row in rows]
+        plan = sampled_plans(net, [concepts[row] for row in rows], Sampling("ddpm", 5, 0.5), draws)
         return roll_out(LOOP, starts.take(rows), PlanFollower(plan, LOOP.act, 2)).observed["place"]
 
     together = run([0, 1, 2, 3, 4])
     for rows in ([0], [3, 1], [4, 2, 0]):
         torch.testing.assert_close(run(rows), together[rows], rtol=1e-4, atol=1e-4)
-
-
-def test_an_animation_holds_every_picture() -> None:
-    from io import BytesIO
-
-    from PIL import Image
-
-    pictures = [np.full((8, 8, 3), shade, dtype=np.uint8) for shade in (0, 120, 250)]
-    with Image.open(BytesIO(gif(pictures))) as animation:
-        assert animation.n_frames == 3
-        assert animation.info["loop"] == 0

@@ -1,6 +1,5 @@
 """Novelty, coverage and their reference lines."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED, Real, coverage, lines, novelty
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.seeding import DEMONSTRATION_SEED
+from tests.evaluation.conftest import invert
 
 SCENES = load_domain("object_rearrangement")
 NEW = "square diagonal to triangle"
@@ -28,14 +28,11 @@ def five(domain: Domain = SCENES, goal: str = NEW) -> Demonstrations:
     return domain.source(None).draw(goal, 5, DEMONSTRATION_SEED)
 
 
-def test_novelty_and_coverage_of_three_plans_by_hand() -> None:
+def test_novelty_and_coverage_of_three_plans_and_the_distance_of_paths_by_hand() -> None:
     """Plans at 0, 1 and 5 on a line; demonstrations at 0 and 4; fresh samples at 0, 2 and 9."""
     plans, known, fresh = (torch.tensor(one)[:, None, None] for one in ([0.0, 1.0, 5.0], [0.0, 4.0], [0.0, 2.0, 9.0]))
     assert novelty(path_distance(plans, known)) == pytest.approx((0 + 1 + 1) / 3)
     assert coverage(path_distance(plans, fresh)) == pytest.approx((0 + 1 + 4) / 3)
-
-
-def test_the_distance_of_paths_is_the_root_mean_square_over_their_times() -> None:
     path = torch.zeros(1, 2, 2)
     others = torch.tensor([[[3.0, 4.0], [0.0, 0.0]], [[3.0, 4.0], [3.0, -4.0]]])
     assert torch.allclose(path_distance(path, others), torch.tensor([[(25 / 2) ** 0.5, 5.0]]))
@@ -53,7 +50,7 @@ def test_a_scaled_distance_does_not_depend_on_units_and_leaves_constant_columns_
     assert torch.allclose(scaled_distance(real)(plans, alone).diagonal(), torch.full((4,), 3.0), rtol=1e-4)
 
 
-def test_replayed_demonstrations_have_novelty_0_and_fresh_samples_do_not() -> None:
+def test_replayed_demonstrations_have_novelty_0_and_fresh_samples_are_none_nor_those_that_are_to_be_covered() -> None:
     real = Real.of(TASK, SCENES, 20, five())
     found = real.lines()
     assert found[REPLAYED].values["novelty"] == 0
@@ -62,11 +59,6 @@ def test_replayed_demonstrations_have_novelty_0_and_fresh_samples_do_not() -> No
     assert found[FRESH].values["coverage"] < found[REPLAYED].values["coverage"]
     assert len(found[REPLAYED].states) == len(found[FRESH].states) == 20
     assert torch.equal(found[REPLAYED].states[:5], found[REPLAYED].states[5:10])  # in turn
-
-
-def test_fresh_samples_are_no_demonstrations_nor_the_samples_that_are_to_be_covered() -> None:
-    real = Real.of(TASK, SCENES, 20, five())
-    assert real.fresh is not None
     covered, own = real.fresh
     assert SCENES.distances(own.states, covered.states, path_distance).min() > 0
     assert SCENES.distances(own.states, five().states, path_distance).min() > 0
@@ -83,10 +75,8 @@ def test_more_plans_never_increase_the_distance_of_coverage() -> None:
 
 def test_wider_plans_do_not_seem_nearer_for_it() -> None:
     """Scales are those of real behaviour, so that noise has its full distance."""
-    domain = replace(SCENES, distance=None)
-    real = Real.of(TASK, domain, 10, five())
-    plans = five().states
-    values = [real.values(plans * width)["novelty"] for width in (2, 20)]
+    real = Real.of(TASK, replace(SCENES, distance=None), 10, five())
+    values = [real.values(five().states * width)["novelty"] for width in (2, 20)]
     assert values[1] > 5 * values[0] > 0
 
 
@@ -106,6 +96,7 @@ def test_what_there_is_to_compare_with_depends_on_the_task(task: EvaluationTask,
     assert list(Real.of(task, SCENES, 5, known).values(five().states)) == names
 
 
+@pytest.mark.slow
 def test_a_task_that_cannot_be_drawn_has_no_coverage(caplog: pytest.LogCaptureFixture) -> None:
     impossible = "circle above square and square above circle"
     real = Real.of(EvaluationTask("s", impossible, texts=("circle above square",)), SCENES, 1, None)
@@ -149,7 +140,6 @@ def test_scenes_differ_by_their_shapes_centres_alone() -> None:
     turned[..., 2:7] += 0.1  # radius, angle and type of the circle
     moved[..., 7] += 3  # x of the triangle
     moved[..., 8] += 4
-    assert SCENES.distance is not None
     assert SCENES.distance(scene, torch.cat((turned, moved))).tolist() == [[0, pytest.approx(5)]]
 
 
@@ -160,7 +150,6 @@ def test_paths_of_navigation_are_seen_from_their_start() -> None:
     elsewhere[..., [0, 2]] += 1  # x and z
     faster[..., 3:] += 1
     longer[:, 1:, 0] += 1
-    assert agent.distance is not None
     found = agent.distance(path, torch.cat((elsewhere, faster, longer)))[0].tolist()
     assert found == pytest.approx([0, 0, (127 / 128) ** 0.5], abs=1e-5)
 
@@ -171,7 +160,6 @@ def test_paths_of_driving_are_seen_from_their_start_and_heading() -> None:
     ahead = 5 * torch.arange(8.0)
     north[..., 1], north[..., 5] = ahead + 3, 1.0  # along x with cosine 1
     east[..., 2], east[..., 6] = ahead - 7, 1.0  # along y with sine 1
-    assert driving.distance is not None
     assert driving.distance(north, torch.cat((east, north.roll(1, 0)))).tolist()[0] == pytest.approx([0, 0], abs=1e-5)
     slower = north.clone()
     slower[:, -1, 1] -= 8
@@ -194,24 +182,20 @@ def test_own_behaviour_is_compared_by_time_warping_and_has_no_fresh_samples() ->
     assert FRESH not in real.lines()
     scale, whole = states.flatten(0, 1).std(dim=0), torch.full((3,), 12)
     expected = warped_distances(states / scale, whole, states / scale, whole)
-    assert domain.distance is not None
     assert torch.allclose(domain.distance(states, states), expected)
     assert torch.allclose(domain.distance(states, states[:1]), expected[:, :1])
 
 
-def test_diversity_adds_rows_and_changes_none(invert: Callable[..., Path], tmp_path: Path) -> None:
-    both = []
-    for diversity in ("true", "false"):
-        path = tmp_path / f"{diversity}.csv"
-        invert(f"--evaluation.diversity={diversity}", f"--evaluation.results={path}", "--evaluation.suites=[paper]")
-        both.append(read_rows(path))
-    more, before = both
+@pytest.mark.slow
+def test_diversity_adds_rows_and_changes_none(log: Path, tiny: Path) -> None:
+    invert(tiny, "--evaluation.diversity=false")
+    more, before = read_rows(log), read_rows(Path("logs"))
     assert not {"novelty", "coverage"} & set(before["metric"])
     kept = more[~more["metric"].isin(["novelty", "coverage"]) & ~more["method"].isin([REPLAYED, FRESH])]
     assert kept.reset_index(drop=True).equals(before)  # configuration hashes too
     own = more[(more["metric"] == "novelty") & (more["role"] == "method")]
     assert set(own["setting"]) == {"training composition", "new concept"}
     assert (own["value"] > 0).all()
-    assert set(more.loc[more["metric"] == "coverage", "setting"]) == {*own["setting"], "new + training"}
+    assert set(more.loc[more["metric"] == "coverage", "setting"]) == {*own["setting"], "new + training", "training concept"}
     replayed = more[(more["method"] == REPLAYED) & (more["metric"] == "novelty")]
     assert replayed["value"].tolist() == [0] * 10

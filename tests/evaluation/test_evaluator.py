@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,12 +27,13 @@ from ftl_lightning.evaluation.drawing import picture
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
-from ftl_lightning.evaluation.judged import Judged, standard_error
+from ftl_lightning.evaluation.judged import Judged, share, standard_error
 from ftl_lightning.evaluation.results import COLUMNS, append_rows, labels, read_rows
 from ftl_lightning.evaluation.row import Row, label
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from tests.evaluation.rows import row as usual_row
 
 
 class Trained:
@@ -61,13 +63,15 @@ class Trained:
         return self.model.points()
 
 
-def test_accuracy_is_the_share_of_right_samples() -> None:
+def test_accuracy_is_the_share_of_right_samples_and_its_error_is_over_tasks() -> None:
     domain = load_domain("object_rearrangement")
     task = domain.concepts.suites["training"].tasks[0]
     source = domain.source(None)
     good = source.draw(task.goal, 3, 0).states
     bad = source.draw("square right of circle", 1, 0).states
     assert Judged.of(task, torch.cat((good, bad)), None, domain).values == {"accuracy": pytest.approx(0.75)}
+    assert standard_error([0.1, 0.5, 0.6, 1.0]) == pytest.approx(float(np.std([0.1, 0.5, 0.6, 1.0], ddof=1)) / 2)
+    assert standard_error([0.3]) == 0
 
 
 def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_may_be_better() -> None:
@@ -78,15 +82,9 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
         goals.append(goal)
         return states[:, 0, 0]
 
-    domain = replace(
-        base,
-        metrics={
-            "spread": Metric(lambda goal, states, starts: states.std(dim=0).mean(), identity="judge 1"),
-            "distance": Metric(distance, less_is_better=True),
-            "accuracy": base.metrics["accuracy"],
-        },
-        headline="distance",
-    )
+    spread = Metric(lambda goal, states, starts: states.std(dim=0).mean(), identity="judge 1")
+    metrics = {"spread": spread, "distance": Metric(distance, less_is_better=True), "accuracy": base.metrics["accuracy"]}
+    domain = replace(base, metrics=metrics, headline="distance")
     task = base.concepts.suites["training"].tasks[0]
     states = base.source(None).draw(task.goal, 4, 0).states
     one = Judged.of(task, states, None, domain)
@@ -97,7 +95,6 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
     assert one.values["distance"] == pytest.approx(states[:, 0, 0].mean().item())
     assert one.values["accuracy"] == 1
     assert goals == [task.goal]
-    assert one.right is not None
     assert one.right.tolist() == [True] * 4  # a number of the whole set, or of a sample, does not say what is right
     assert domain.main_metric == "spread"
     assert [domain.less_is_better(name) for name in domain.metrics] == [False, True, False]
@@ -111,10 +108,16 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
     assert driving.main_metric == "closed loop success"
 
 
-def test_standard_error_over_tasks() -> None:
-    values = [0.1, 0.5, 0.6, 1.0]
-    assert standard_error(values) == pytest.approx(float(np.std(values, ddof=1)) / 2)
-    assert standard_error([0.3]) == 0
+def test_plans_of_which_a_metric_says_nothing_do_not_count_and_without_any_it_is_not_reported() -> None:
+    assert share(torch.tensor([1.0, torch.nan, 0.0, torch.nan])) == pytest.approx(0.5)
+    assert share(torch.tensor([True, True, False, False])) == pytest.approx(0.5)
+    measured = {
+        "right": torch.tensor([True, False]),
+        "level": torch.tensor([math.nan, 1.0]),
+        "turned": torch.tensor([math.nan] * 2),
+    }
+    judged = Judged(EvaluationTask("s", "walk"), torch.zeros(2, 3, 1), measured)
+    assert judged.values == {"right": 0.5, "level": 1.0}
 
 
 def test_tasks_without_a_learned_concept_are_left_out_and_a_seed_repeats(tiny: Path) -> None:
@@ -155,15 +158,8 @@ def test_a_task_that_starts_in_demonstrations_needs_some(tiny: Path) -> None:
 def test_the_keys_of_generation_stand_beside_those_of_the_callback() -> None:
     evaluator = Evaluator(suites=["paper"], figures=0, samples=3, sampler="ddim", steps=4, environments=["step veto"], seed=7)
     assert evaluator.generation == Generation(3, "ddim", 4, environments=["step veto"], seed=7)
-    assert evaluator.settings(LightningDataModule()) == {
-        "suites": "paper",
-        "samples": 3,
-        "sampler": "ddim",
-        "steps": 4,
-        "temperature": 0.1,
-        "sample_seed": 7,
-        "environments": ["step veto"],
-    }
+    expected = {"suites": "paper", "samples": 3, "sampler": "ddim", "steps": 4, "environments": ["step veto"]}
+    assert evaluator.settings(LightningDataModule()) == expected | {"temperature": 0.1, "sample_seed": 7}
     with pytest.raises(TypeError, match="sample"):
         Evaluator(sample=3)
 
@@ -174,20 +170,17 @@ def test_what_a_task_is_learned_from_is_that_of_all_its_concepts() -> None:
     one, other = shown
     assert demonstrations_of(EvaluationTask("s", one, learned=(one,)), shown.get) is shown[one]
     both = demonstrations_of(EvaluationTask("s", "g", learned=(one, other)), shown.get)
-    assert both is not None
     assert both.concepts == (one,) * 3 + (other,) * 4
     assert demonstrations_of(EvaluationTask("s", one, texts=(one,)), shown.get) is None
     assert demonstrations_of(EvaluationTask("s", "g", learned=("unknown",)), shown.get) is None
 
 
-def row(**changes: object) -> Row:
-    values = {"domain": "d", "setting": "s", "task": "t", "method": "m", "K": 2, "omega": "1.2", "seed": 0, "n": 50}
-    values |= {"demonstrations": 5}
-    values |= {"metric": "accuracy", "value": 0.5, "model_hash": "00e1", "config_hash": "c"}
-    return Row(**(values | changes))  # type: ignore[arg-type]
+def row(**changes: Any) -> Row:
+    usual = {"domain": "d", "setting": "s", "method": "m", "variant": "", "model_hash": "00e1"}
+    return usual_row(**(usual | changes))
 
 
-def test_rows_are_added_replaced_and_keep_their_types(tmp_path: Path) -> None:
+def test_rows_are_added_replaced_and_keep_their_types_and_a_foreign_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.csv"
     append_rows(path, [row(), row(task="u")])
     append_rows(path, [row(value=0.75), row(omega="learned")])
@@ -196,6 +189,9 @@ def test_rows_are_added_replaced_and_keep_their_types(tmp_path: Path) -> None:
     assert table.loc[(table["task"] == "t") & (table["omega"] == "1.2"), "value"].tolist() == [0.75]
     assert set(table["omega"]) == {"1.2", "learned"}
     assert set(table["model_hash"]) == {"00e1"}  # not read as a number
+    pd.DataFrame({"a": [1]}).to_csv(path, index=False)
+    with pytest.raises(UserError, match=r"r\.csv: expected the columns domain, setting"):
+        read_rows(tmp_path)
 
 
 OLD = """domain,setting,task,method,K,omega,demonstrations,seed,n,metric,value,model_hash,config_hash,version
@@ -206,24 +202,24 @@ d,s,"a, b",in-context,0,none,5,0,50,accuracy,0.1,00e1,f,0.1.0
 """
 
 
-def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["", "with modes"])
+def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path, form: str) -> None:
     path = tmp_path / "r.csv"
-    path.write_text(OLD)
-    table = read_rows(path)
-    assert table[["method", "variant", "role"]].to_numpy().tolist() == [
-        ["FTL-IGM", "steps, set, near span 0.1", "method"],
-        ["expert (oracle)", "", "reference"],
-        ["language", "", "method"],
-        ["in-context", "", "method"],
+    path.write_text(OLD.replace("FTL-IGM (", f"{label('FTL-IGM', form)} ("))
+    table, old = read_rows(path), pd.read_csv(path, dtype=str, keep_default_na=False)
+    assert table[["method", "form", "variant", "role"]].to_numpy().tolist() == [
+        ["FTL-IGM", form, "steps, set, near span 0.1", "method"],
+        ["expert (oracle)", "", "", "reference"],
+        ["language", "", "", "method"],
+        ["in-context", "", "", "method"],
     ]
-    assert labels(table).tolist() == pd.read_csv(path)["method"].tolist()
-    old = pd.read_csv(path, dtype=str, keep_default_na=False)
+    assert labels(table).tolist() == old["method"].tolist()
     append_rows(path, [row()])
     new = pd.read_csv(path, dtype=str, keep_default_na=False)
     kept = [name for name in old.columns if name != "method"]
     assert new[kept].head(len(old)).equals(old[kept])  # text for text
-    assert (new["form"] == "").all()
-    append_rows(path, [row(task="a, b", method="FTL-IGM", variant="steps, set, near span 0.1", value=0.75)])
+    assert new["form"].tolist() == [form, "", "", "", ""]
+    append_rows(path, [row(task="a, b", method="FTL-IGM", form=form, variant="steps, set, near span 0.1", value=0.75)])
     assert read_rows(path)["value"].tolist() == [1.0, 0.25, 0.1, 0.5, 0.75]  # the same measurement, replaced
 
 
@@ -235,40 +231,20 @@ d,s,a,MINE with adapter,,method,1,1.0,5,0,50,accuracy,1.0,00e1,f,0.1.0
 d,s,a,without modes,,method,1,1.0,5,0,50,accuracy,1.0,00e1,g,0.1.0
 d,s,a,a walk with modes,,reference,0,,5,0,50,accuracy,0.1,,h,0.1.0
 """
-TOLD_APART = [
-    ("FTL-IGM", ""),
-    ("FTL-IGM", "with modes over time"),
-    ("FTL-IGM", "over time with adapter"),
-    ("MINE", "with adapter"),
-    ("without modes", ""),
-    ("a walk with modes", ""),
-]
-
-
-def test_in_a_file_from_before_forms_methods_and_their_forms_are_told_apart(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text(BEFORE_FORMS)
-    table = read_rows(path)
-    assert table.columns.tolist() == COLUMNS
-    assert list(zip(table["method"], table["form"], strict=True)) == TOLD_APART
-    assert [label(*told) for told in TOLD_APART] == pd.read_csv(path)["method"].tolist()
-
-
-def test_a_file_from_before_variants_may_tell_a_form_too(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text(OLD.replace("FTL-IGM (steps", "FTL-IGM with modes (steps"))
-    told = read_rows(path)[["method", "form", "variant", "role"]]
-    assert told.iloc[0].tolist() == ["FTL-IGM", "with modes", "steps, set, near span 0.1", "method"]
-    assert told.iloc[1].tolist() == ["expert (oracle)", "", "", "reference"]
+TOLD_APART = [("FTL-IGM", ""), ("FTL-IGM", "with modes over time"), ("FTL-IGM", "over time with adapter")]
+TOLD_APART += [("MINE", "with adapter"), ("without modes", ""), ("a walk with modes", "")]
 
 
 @pytest.mark.parametrize("added", [[], [{"task": "b"}]])
-def test_a_file_from_before_forms_is_written_with_them_and_keeps_the_rest_text_for_text(
+def test_in_a_file_from_before_forms_methods_and_forms_are_told_apart_and_it_keeps_the_rest_text_for_text(
     added: list[dict[str, object]], tmp_path: Path
 ) -> None:
     path = tmp_path / "r.csv"
     path.write_text(BEFORE_FORMS)
-    old = pd.read_csv(path, dtype=str, keep_default_na=False)
+    table, old = read_rows(path), pd.read_csv(path, dtype=str, keep_default_na=False)
+    assert table.columns.tolist() == COLUMNS
+    assert list(zip(table["method"], table["form"], strict=True)) == TOLD_APART
+    assert [label(*told) for told in TOLD_APART] == old["method"].tolist()
     append_rows(path, [row(**changes) for changes in added])
     new = pd.read_csv(path, dtype=str, keep_default_na=False)
     assert new.columns.tolist() == COLUMNS
@@ -305,14 +281,7 @@ def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_
     assert not [key for key in configuration(module, data, {}) if key.startswith("data/")]  # where data are is no setting
 
 
-def test_a_foreign_results_file_is_refused(tmp_path: Path) -> None:
-    pd.DataFrame({"a": [1]}).to_csv(tmp_path / "r.csv", index=False)
-    with pytest.raises(UserError, match=r"r\.csv: expected the columns domain, setting"):
-        read_rows(tmp_path)
-
-
-def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable[..., Path], tiny: Path) -> None:
-    log = invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[training, paper]")
+def test_tensorboard_gets_scalars_figures_hparams_and_projector(log: Path, tiny: Path) -> None:
     assert {path.parent for path in log.rglob("events.out.tfevents.*")} == {log}  # one run
     events = EventAccumulator(str(log), size_guidance={"images": 0, "scalars": 0}).Reload()
     fitted = EventAccumulator(str(tiny.parent), size_guidance={"images": 0, "scalars": 0}).Reload()
@@ -334,8 +303,7 @@ def test_tensorboard_gets_scalars_figures_hparams_and_projector(invert: Callable
     assert ["square diagonal to triangle", "new component", "2", "component 2"] in labels
 
 
-def test_hparams_are_what_a_person_chose_and_stand_with_the_curves(invert: Callable[..., Path], tiny: Path) -> None:
-    log = invert("--evaluation.suites=[paper]", "--seed_everything=3", "--model.omega=1.5", "--trainer.log_every_n_steps=1")
+def test_hparams_and_words_in_tables_are_what_a_person_chose_and_stand_with_the_curves(log: Path, tiny: Path) -> None:
     events = EventAccumulator(str(log)).Reload()
     content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     values = parse_session_start_info_plugin_data(content).hparams
@@ -348,10 +316,12 @@ def test_hparams_are_what_a_person_chose_and_stand_with_the_curves(invert: Calla
     assert values["with model/pretrained"].string_value == str(tiny)
     assert "loss/train" in events.Tags()["scalars"]
     known = read_rows(log / "results.csv")
+    assert set(known.loc[known["role"] == "method", "variant"]) == {"without a hat"} == {values["variant"].string_value}
     hashes = {*known["config_hash"], *known["model_hash"]}
     assert not (hashes - {""}) & {value.string_value for value in values.values()}
 
 
+@pytest.mark.slow
 def test_the_rate_of_each_step_is_a_curve(tiny: Path, invert: Callable[..., Path]) -> None:
     fitted = EventAccumulator(str(tiny.parent)).Reload()
     rates = [event.value for event in fitted.Scalars("optimizer/learning rate")]
@@ -386,11 +356,6 @@ def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(t
     seen.clear()
     picture(behaviour, watched, lambda concept: None, 2)
     assert seen == [(2, [True, True])]
-
-
-def test_a_run_may_have_words_of_its_own_in_tables(invert: Callable[..., Path]) -> None:
-    log = invert("--evaluation.suites=[paper]", "--evaluation.references=false", "--evaluation.variant=without a hat")
-    assert set(read_rows(log / "results.csv")["variant"]) == {"without a hat"}
 
 
 def test_figures_frame_right_green_and_wrong_red(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import base64
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -37,10 +36,8 @@ def test_packed_points_are_within_a_step_and_absent_ones_stay_absent() -> None:
     assert film.frames == 4
 
 
-def test_an_evaluation_writes_films_of_its_rows(invert: Callable[..., Path], tmp_path: Path) -> None:
-    path, results = tmp_path / "films" / "a.json", tmp_path / "rows.csv"
-    invert(f"--evaluation.films={path}", f"--evaluation.results={results}")
-    content, rows = json.loads(path.read_text()), read_rows(results)
+def test_an_evaluation_writes_films_of_its_rows(evaluated: Path, log: Path) -> None:
+    content, rows = json.loads((evaluated / "films.json").read_text()), read_rows(log)
     assert content["domain"] == "object_rearrangement"
     ours = [task for task in content["tasks"] if task["row"]["role"] == "method"]
     assert {task["row"]["task"] for task in ours} == set(rows.loc[rows["role"] == "method", "task"])
@@ -57,8 +54,6 @@ def test_an_evaluation_writes_films_of_its_rows(invert: Callable[..., Path], tmp
 
 def test_the_agent_of_a_film_goes_where_it_went() -> None:
     domain = load_domain("agent")
-    assert domain.closed_loop is not None
-    assert domain.closed_loop.vector_film is not None
     starts = domain.source(None).starts("go to red bowl", 1, 0)
     plans = domain.references["expert (oracle)"]("go to red bowl", 1, starts, 0)
     rollout = roll_out(domain.closed_loop, starts, PlanFollower(fixed_plans(plans), domain.closed_loop.act, 200))
@@ -70,13 +65,11 @@ def test_the_agent_of_a_film_goes_where_it_went() -> None:
     assert film.frames > 10
 
 
+@pytest.mark.slow
 def test_roads_stay_and_the_controlled_vehicle_drives() -> None:
     domain = load_domain("driving")
-    assert domain.closed_loop is not None
-    assert domain.closed_loop.vector_film is not None
     starts = domain.source(None).starts("roundabout", 1, 0)
     faster = domain.closed_loop.policies["FASTER"]("roundabout", starts, None, 0)
-    assert faster is not None
     rollout = roll_out(domain.closed_loop, starts, faster)
     film = domain.closed_loop.vector_film(rollout)
     roads = [shape for shape in film.shapes if shape.kind == "line"]
@@ -99,7 +92,6 @@ def test_own_behaviour_is_filmed_by_its_columns(columns: int) -> None:
 
     names = tuple(f"c{number}" for number in range(columns))
     show = line_drawings(Plans(12, names, ("m",) * columns))
-    assert show.vector_film is not None
     film = show.vector_film(torch.randn(12, columns, generator=torch.Generator().manual_seed(0)), None)
     left, lower, width, height = film.window
     for shape in film.shapes:
@@ -143,7 +135,6 @@ def test_a_plan_of_the_agent_is_a_way_in_its_scene(length: int) -> None:
     domain = load_domain("agent")
     starts = domain.source(None).starts("go to red bowl", 1, 0)
     states = domain.references["nearest object"]("go to red bowl", 1, starts, 0)[0, :length]
-    assert domain.show.vector_film is not None
     film = domain.show.vector_film(states, starts)
     assert film.frames == length
     assert np.allclose(middle(film), states[:, [0, 2]].numpy(), atol=1e-5)
@@ -153,7 +144,6 @@ def test_a_plan_of_the_agent_is_a_way_in_its_scene(length: int) -> None:
 
 def test_a_demonstration_of_driving_is_drawn_on_its_road_among_the_others_at_its_start() -> None:
     domain = load_domain("driving")
-    assert domain.show.vector_film is not None
     shipped = Demonstrations.load(SHIPPED / "merge.safetensors").rows([3])
     length = int(shipped.lengths[0])
     for states in (shipped.states[0, :length], shipped.states[0, :8] * 1.01):  # a plan's headings and presence are about 1
@@ -172,7 +162,6 @@ def test_a_demonstration_of_driving_is_drawn_on_its_road_among_the_others_at_its
 
 def test_a_demonstration_on_the_table_is_the_hands_way_among_objects_that_stay() -> None:
     domain = load_domain("tabletop")
-    assert domain.show.vector_film is not None
     shown = domain.source(None).draw("pick green circle to book", 1, 1)
     states = shown.states[0, : int(shown.lengths[0])]
     film = domain.show.vector_film(states, shown.initial_states)

@@ -1,34 +1,29 @@
 import io
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.summary import plain, show, summary_table
+from tests.evaluation.rows import REFERENCE
+from tests.evaluation.rows import row as usual_row
 
 
-def row(setting: str, task: str, metric: str, value: float, **changes: object) -> Row:
-    values: dict[str, object] = {
-        "domain": "agent",
-        "setting": setting,
-        "task": task,
-        "method": "FTL-IGM",
-        "variant": "free",
-        "K": 2,
-    }
-    values |= {"omega": "0.6", "demonstrations": 5, "seed": 0, "n": 50, "metric": metric, "value": value}
-    return Row(**(values | {"model_hash": "m", "config_hash": "c"} | changes))  # type: ignore[arg-type]
+def row(setting: str, task: str, metric: str, value: float, **changes: Any) -> Row:
+    usual = {"domain": "agent", "omega": "0.6", "setting": setting, "task": task, "metric": metric, "value": value}
+    return usual_row(**(usual | changes))
 
 
-REFERENCE = {"method": "random", "variant": "", "role": "reference", "K": 0, "omega": ""}
+RANDOM = REFERENCE | {"method": "random"}
 ROWS = [
     *(row("training", task, "accuracy", value) for task, value in (("a", 0.2), ("b", 0.4))),
     row("own demonstrations", "my way", "accuracy", 0.9),
     row("own demonstrations", "my way", "closed loop success", 0.7),
     row("own demonstrations", "my way", "won against random", 0.6),
     row("new", "their way", "accuracy", 0.5),
-    *(row("training", task, "accuracy", 0.1, **REFERENCE) for task in "ab"),
-    row("own demonstrations", "my way", "accuracy", 0.3, **REFERENCE),
+    *(row("training", task, "accuracy", 0.1, **RANDOM) for task in "ab"),
+    row("own demonstrations", "my way", "accuracy", 0.3, **RANDOM),
 ]
 
 

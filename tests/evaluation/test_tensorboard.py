@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +15,12 @@ from tensorboard.plugins.hparams.backend_context import Context
 from ftl_lightning.concepts.point import Part, Point
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.tensorboard import log_animation, log_projector, log_test, setting_means
+from tests.evaluation.rows import REFERENCE
+from tests.evaluation.rows import row as usual_row
 
 
-def row(domain: str, setting: str, task: str, metric: str, value: float, **changes: object) -> Row:
-    values: dict[str, object] = {"domain": domain, "setting": setting, "task": task, "method": "FTL-IGM", "variant": "free", "K": 2}
-    values |= {"omega": "0.6", "demonstrations": 5, "seed": 0, "n": 50, "metric": metric, "value": value}
-    return Row(**(values | {"model_hash": "m", "config_hash": "c"} | changes))  # type: ignore[arg-type]
+def row(domain: str, setting: str, task: str, metric: str, value: float, **changes: Any) -> Row:
+    return usual_row(domain=domain, setting=setting, task=task, metric=metric, value=value, **changes)
 
 
 def logger(folder: Path, domain: str) -> TensorBoardLogger:
@@ -59,7 +60,7 @@ def test_the_hparams_tab_shows_all_domains_with_their_metrics_and_tasks(tmp_path
 def test_a_test_adds_tables_and_its_means_behind_everything_else(tmp_path: Path) -> None:
     own = logger(tmp_path, "here")
     rows = [row("here", "new", task, "accuracy", value) for task, value in (("a", 0.25), ("b", 0.75))]
-    rows += [row("here", "new", "a", "accuracy", 0.1, method="random", variant="", role="reference", K=0, omega="")]
+    rows += [row("here", "new", "a", "accuracy", 0.1, method="random", **REFERENCE)]
     log_test(own, {}, rows, 5)
     log_animation(own, "rollouts/new/a", [np.zeros((20, 60, 3), dtype=np.uint8)] * 2, 5, "a: success")
     own.experiment.close()

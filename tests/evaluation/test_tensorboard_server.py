@@ -1,54 +1,58 @@
 """A TensorBoard server on the logs answers with what the evaluator wrote."""
 
 import json
-import socket
 import subprocess
 import sys
 import time
 import urllib.parse
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.conftest import environment
+
+PATIENCE = 120
+"""Seconds that the server may take to start, and to read a run."""
+
 
 @pytest.fixture
-def get(invert: Callable[..., Path]) -> Any:
+def get(log: Path) -> Iterator[Callable[..., bytes]]:
     """A function that asks a server on the logs of a short inversion."""
-    invert("--trainer.log_every_n_steps=1", "--evaluation.suites=[paper]")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    options = ["--logdir", "logs", "--port", str(port), "--host", "127.0.0.1", "--reload_interval", "1"]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "tensorboard.main", *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    logs = log.parent.parent
+    command = [sys.executable, "-m", "tensorboard.main", "--logdir", str(logs), "--port", "0", "--host", "127.0.0.1"]
+    with Path("told.txt").open("w") as told:
+        server = subprocess.Popen([*command, "--reload_interval", "1"], stdout=told, stderr=told, env=environment())
 
     def ask(path: str, body: dict[str, Any] | None = None) -> bytes:
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(f"http://127.0.0.1:{port}/data/{path}", data, {"Content-Type": "application/json"})
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        request = urllib.request.Request(f"{address()}data/{path}", data, {"Content-Type": "application/json"})
+        with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
             content: bytes = answer.read()
         return content
 
-    deadline = time.monotonic() + 60
+    def address() -> str:
+        return next(word for word in Path("told.txt").read_text().split() if word.startswith("http://127.0.0.1:"))
+
+    def until(there: Callable[[], Any]) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not there():
+            assert server.poll() is None, Path("told.txt").read_text()
+            assert time.monotonic() < deadline, Path("told.txt").read_text()
+            time.sleep(0.2)
+
     try:
-        while True:
-            try:
-                if json.loads(ask("plugin/scalars/tags")):
-                    break
-            except OSError:
-                if time.monotonic() > deadline:
-                    raise
-            time.sleep(0.5)
+        until(lambda: "http://127.0.0.1:" in Path("told.txt").read_text() and "(Press" in Path("told.txt").read_text())
+        until(lambda: json.loads(ask("plugin/scalars/tags")))
         yield ask
     finally:
         server.terminate()
         server.wait()
 
 
+@pytest.mark.slow
 def test_the_server_answers(get: Callable[..., bytes]) -> None:
     run = "object_rearrangement/invert"
     quoted = urllib.parse.quote(run, safe="")

@@ -7,31 +7,37 @@ import pytest
 import torch
 from torch import nn
 
-from ftl_lightning.cli import main
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.normalization import Normalization
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED
-from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
+from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning.additive import added
 from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.learning.transitions import StepConfig, unroll
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel, ParallelMLP
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
 from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
+from ftl_lightning.methods.in_context.pretraining import InContextPretraining
+from ftl_lightning.methods.in_context.prompting import prompt
 from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.seeding import generator
-from tests.conftest import CONF, ROOT
+from ftl_lightning.trainer import Trainer
+from tests import tiny as sizes
+from tests.conftest import CONF, ROOT, refused, succeed
 from tests.domains.mocap_samples import folder
 
 AGENT = {"domain": "agent", "state_dim": 13, "observed": {OBSERVED: FEATURE}, "encoder": "e"}
 DOMAIN = load_domain("agent")
+DRIVER = ROOT / "pretrained" / "baseline" / "in_context" / "driving"
 TEXTS = ("go to red object", "go to bowl")
 
 
@@ -81,7 +87,6 @@ def test_plans_are_unrolled_state_by_state_and_straight_between(stride: int, cal
     seen = []
 
     def predict(observed: torch.Tensor | None) -> torch.Tensor:
-        assert observed is not None
         seen.append(observed[:, :13].clone())
         return torch.stack((torch.zeros(2, 13), torch.full((2, 13), 0.1 * stride)), dim=1)
 
@@ -100,7 +105,7 @@ def test_a_plan_that_no_state_can_be_unrolled_from_is_refused() -> None:
         )  # type: ignore[arg-type]
 
 
-def test_the_view_in_steps_goes_there_and_back() -> None:
+def test_the_view_in_steps_goes_there_and_back_and_short_windows_start_anywhere_long_ones_early() -> None:
     drives = DOMAIN.source(None).draw("go to bowl", 2, 0)
     states, initial = drives.windows(torch.tensor([0, 1]), torch.tensor([0, 7]), 16)
     view = DOMAIN.views["steps"]
@@ -108,22 +113,21 @@ def test_the_view_in_steps_goes_there_and_back() -> None:
     assert torch.allclose(steps[:, 0], torch.zeros(2, 13), atol=1e-6)
     assert torch.allclose(steps[:, 3], states[:, 3] - states[:, 2])
     assert torch.allclose(view.decode(steps, initial), states, atol=1e-5)
+    plans = DOMAIN.plans
+    assert [plans.exponent(window) for window in (2, 9, plans.horizon)] == [1.0, 1.0, 3.0]
 
 
-def test_cloning_composes_by_adding_conditions() -> None:
+def test_cloning_and_the_vae_compose_by_adding_and_the_vaes_noise_is_the_temperatures() -> None:
     model = cloning()
     one, other = torch.randn(2, 5)
     initial = torch.randn(4, 52)
     both = sampled(model, [torch.stack((one, other))], initial, 4)
     assert torch.allclose(both, sampled(model, [(one + other)[None]], initial, 4), atol=1e-6)
     assert not torch.allclose(both, sampled(model, [one[None]], initial, 4), atol=1e-3)
-
-
-def test_the_vae_composes_by_adding_and_its_noise_is_the_temperatures() -> None:
     config = {"domain": "object_rearrangement", "state_dim": 21, "encoder": "e", "horizon": 1, "concept_dim": 4, "hidden_dim": 8}
     torch.manual_seed(0)
-    config = VAEConfig(**config, training_concepts=("a", "b"))  # type: ignore[arg-type]
-    model = VAEModel(Prepared(config, load_domain("object_rearrangement"), limits(21), torch.randn(3, 4))).eval()
+    own = VAEConfig(**config, training_concepts=("a", "b"))  # type: ignore[arg-type]
+    model = VAEModel(Prepared(own, load_domain("object_rearrangement"), limits(21), torch.randn(3, 4))).eval()
     both = sampled(model, [torch.stack((model.concept("a"), model.concept("b")))], None, 3)
     alone = model.plans((model.concept("a") + model.concept("b"))[None], {})
     assert torch.allclose(both[0], model.decode(alone, {}).expand(3, -1, -1), atol=1e-6)
@@ -142,13 +146,9 @@ def test_in_context_reads_only_the_demonstrations_that_are_given() -> None:
     assert not torch.allclose(together[1], sampled(model, [three[:1]], initial[2:], 2)[0], atol=1e-3)
 
 
-def test_bins_are_even_and_hold_what_goes_beyond() -> None:
+def test_bins_are_even_and_prompts_hold_what_was_seen_and_what_followed() -> None:
     model = transformer()
     assert model.bins(torch.tensor([-2.0, -1.0, -0.91, -0.89, 0.0, 0.99, 1.0, 3.0])).tolist() == [0, 0, 0, 1, 10, 19, 19, 19]
-
-
-def test_prompts_hold_what_was_seen_and_what_followed() -> None:
-    model = transformer()
     model.config = replace(model.config, stride=2)
     drive = DOMAIN.source(None).draw("go to bowl", 1, 0)
     prompt = model.prompts(drive).unflatten(-1, (3, 65))[0]
@@ -157,29 +157,18 @@ def test_prompts_hold_what_was_seen_and_what_followed() -> None:
         assert torch.allclose(prompt[token, 52:], drive.states[0, time + 2] - drive.states[0, time], atol=1e-5)
 
 
-TINY = {
-    "object_rearrangement": ["--data.samples_per_concept=20", "--data.validation_per_concept=2", "--data.batch_size=32"],
-    "agent": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
-    "driving": ["--data.samples_per_concept=2", "--data.validation_per_concept=1", "--data.batch_size=8"],
-    "mocap": ["--data.batch_size=8"],
-    "tabletop": ["--data.samples_per_concept=1", "--data.validation_per_concept=1", "--data.recoveries=1", "--data.batch_size=8"],
-}
-SMALL = {
-    "bc": ["--model.hidden_dim=16"],
-    "cvae": ["--model.hidden_dim=16", "--model.latent_dim=4"],
-    "in_context": ["--model.width=16", "--model.layers=1", "--model.heads=2"],
-}
-QUIET = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--evaluation.samples=2", "--evaluation.figures=0"]
-FITS = sorted(path for method in SMALL for path in (CONF / method).glob("*.yaml"))
+QUIET = [*sizes.QUIET, "--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.diversity=false"]
+BASELINES = sizes.CONFIGURATIONS[len(sizes.OURS) :]
+CHEAP = (Path("bc/object_rearrangement.yaml"), Path("cvae/object_rearrangement.yaml"))
 
 
-@pytest.mark.parametrize("path", FITS, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
-    method, domain = path.parent.name, path.stem
-    members = ["--model.members=2"] if (method, domain) == ("bc", "object_rearrangement") else []
-    recorded = [f"--data.root={folder(tmp_path / 'recordings', TRAINING_CONCEPTS)}"] if domain == "mocap" else []
-    options = [*TINY[domain], *recorded, *SMALL[method], *members, *QUIET, "--data.steps_per_epoch=2", "--trainer.max_steps=2"]
-    assert main(["fit", "--config", str(path), *options, "--model.output=made"]) == 0
+@pytest.mark.usefixtures("drawn")
+@pytest.mark.parametrize("path", [pytest.param(one, marks=[] if one in CHEAP else pytest.mark.slow) for one in BASELINES], ids=str)
+def test_every_baseline_from_fit_to_results(path: Path) -> None:
+    domain = path.stem
+    members = ["--model.members=2"] if path == CHEAP[0] else []
+    steps = ["--data.batch_size=8", "--data.steps_per_epoch=2", "--trainer.max_steps=2"]
+    succeed(*sizes.fit(path, *members, *QUIET, *steps, "--model.output=made"))
     model = load_model("made")
     assert load_model("made").hash == model.hash
     assert "root" not in model.config.training["data"]  # no model says where its maker's recordings lay
@@ -187,75 +176,50 @@ def test_every_baseline_from_fit_to_results(path: Path, tmp_path: Path) -> None:
     assert concept.isfinite().all()
     assert concept.any()  # a VAE's and a transformer's are made after the fit, not left at zero
     goal = load_domain(domain).concepts.suites["validation"].learned[0]
-    demonstrations = [] if domain == "driving" else ["--data.suite=validation", "--data.demonstrations_per_concept=2"]
+    demonstrations = ["--data.suite=validation", "--data.demonstrations_per_concept=2"]
     if domain == "driving":  # its expert takes long; any drives will do
         drives = load_domain(domain).source(None).split("train", 2, 0).select("merge")
         replace(drives, concepts=(goal,) * len(drives)).save("drives.safetensors")
         demonstrations = ["--data.demonstrations=drives.safetensors"]
-    adapt = [*demonstrations, *recorded, "--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", *QUIET]
+    recorded = ["--data.root=recordings"] if domain == "mocap" else []
     executed = [] if domain == "object_rearrangement" else ["--evaluation.closed_loop=false"]
-    assert main(["invert", "--config", str(path), *adapt, *executed, "--model.output=concepts", "--evaluation.results=r.csv"]) == 0
+    adapt = ["--model.pretrained=made", "--data.steps=2", "--evaluation.suites=[validation]", "--evaluation.results=r.csv"]
+    succeed("invert", f"--config={CONF / path}", *demonstrations, *recorded, *adapt, *executed, *QUIET, "--model.output=concepts")
     learned = Concept.load(next(Path("concepts").iterdir()))
     assert learned.origin.pretrained == model.hash
     if domain not in ("driving", "tabletop"):  # which judge episodes alone
-        rows = read_rows("r.csv")
-        own = rows[rows["role"] == "method"]
+        own = read_rows("r.csv").query("role == 'method'")
         assert set(own["method"]) == {model.method.name}
         assert set(own["demonstrations"]) == {2}
 
 
 def test_a_baselines_window_must_hold_a_transition(capsys: pytest.CaptureFixture[str]) -> None:
-    config = str(CONF / "bc" / "driving.yaml")
-    assert main(["fit", "--config", config, *TINY["driving"], *QUIET, "--data.horizon=5"]) == 2
-    assert "data.horizon: expected 2 (states that a transition spans), found 5" in capsys.readouterr().err
-
-
-def test_each_adaptation_asks_for_its_own_kind_of_model(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = str(CONF / "in_context" / "agent.yaml")
-    assert main(["invert", "--config", config, f"--model.pretrained={tiny}"]) == 2
-    assert "expected a model of kind in-context, found diffusion" in capsys.readouterr().err
+    expected = "data.horizon: expected 2 (states that a transition spans), found 5"
+    refused(capsys, sizes.fit(Path("bc/driving.yaml"), "--data.horizon=5", "--trainer.max_steps=1"), expected)
 
 
 @pytest.mark.parametrize("method", ["cvae", "in_context"])
-def test_a_method_whose_concepts_are_demonstrations_asks_for_one_of_each(
-    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = str(CONF / method / "mocap.yaml")
-    options = [f"--data.root={folder(tmp_path / 'few')}", "--trainer.max_steps=1", *QUIET]
-    assert main(["fit", "--config", config, *options]) == 2
-    assert "expected a demonstration of each of 82 training concepts, found none of 78, such as" in capsys.readouterr().err
+def test_a_method_whose_concepts_are_demonstrations_asks_for_one_of_each(method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    fit = ["fit", f"--config={CONF / method / 'mocap.yaml'}", f"--data.root={folder(Path('few'))}", "--trainer.max_steps=1", *QUIET]
+    refused(capsys, fit, "expected a demonstration of each of 82 training concepts, found none of 78, such as")
 
 
-def test_the_wrong_verb_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    config = str(CONF / "in_context" / "driving.yaml")
-    method = "ftl_lightning.learning.baselines"
-    Path("fit.yaml").write_text(f"model: {{class_path: {method}.in_context.InContextPretraining}}")
-    assert main(["invert", "--config", config, "--config=fit.yaml", *QUIET]) == 2
-    assert "expected a module that adapts a pretrained model, found InContextPretraining" in capsys.readouterr().err
-    made = [
-        f"--model.pretrained={ROOT / 'pretrained' / 'baseline' / 'in_context' / 'driving'}",
-        "--data.demonstrations=drives.safetensors",
-    ]
+def test_the_wrong_verb_is_told() -> None:
+    trainer = Trainer(accelerator="cpu", logger=False, max_steps=1)
     drives = load_domain("driving").source(None).split("train", 2, 0).select("merge")
     drives.save("drives.safetensors")
-    Path("adapt.yaml").write_text(
-        "model: {class_path: ftl_lightning.learning.learner_adaptation.LearnerAdaptation}\n"
-        "data: {class_path: ftl_lightning.domains.data.InversionData, init_args: {domain: driving}}"
-    )
-    assert main(["fit", "--config", config, "--config=adapt.yaml", *made, *QUIET]) == 2
-    assert "expected invert (model.class_path: LearnerAdaptation learns nothing), found fit" in capsys.readouterr().err
-    replace(drives, observed=drives.initial_states.observed, per_step=()).save("drives.safetensors")
-    assert main(["invert", "--config", config, *made, *QUIET]) == 2
-    assert "key 'per_step': expected every feature to be observed at each time" in capsys.readouterr().err
-
-
-def test_short_windows_start_anywhere_and_long_ones_early() -> None:
-    plans = DOMAIN.plans
-    assert [plans.exponent(window) for window in (2, 9, plans.horizon)] == [1.0, 1.0, 3.0]
+    data = InversionData("driving", demonstrations="drives.safetensors")
+    with pytest.raises(UserError, match="expected a module that adapts a pretrained model, found InContextPretraining"):
+        trainer.invert(InContextPretraining(), data)  # type: ignore[arg-type]
+    adaptation = LearnerAdaptation(str(DRIVER))
+    with pytest.raises(UserError, match=r"expected invert \(model.class_path: LearnerAdaptation learns nothing\), found fit"):
+        trainer.fit(adaptation, datamodule=data)
+    with pytest.raises(UserError, match="key 'per_step': expected every feature to be observed at each time"):
+        prompt(adaptation.model, replace(drives, observed=drives.initial_states.observed, per_step=()), InversionSettings(), 0)
 
 
 def test_prompts_can_hide_the_road() -> None:
-    model = load_model(ROOT / "pretrained" / "baseline" / "in_context" / "driving")
+    model = load_model(DRIVER)
     assert isinstance(model, InContextModel)
     drives = load_domain("driving").source(None).split("train", 1, 0)
     shown, hidden = (model.prompts(drives, perturbed=hide).unflatten(-1, (model.config.tokens, -1)) for hide in (False, True))
@@ -265,48 +229,31 @@ def test_prompts_can_hide_the_road() -> None:
     assert torch.allclose(shown[..., 4], hidden[..., 4], atol=1e-5)  # the speed stays
 
 
-LANGUAGE = [f"--config={CONF / 'agent.yaml'}", f"--config={CONF / 'method' / 'language.yaml'}"]
-
-
-def test_language_generates_from_the_description(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.slow
+def test_language_generates_from_the_description() -> None:
     # In this domain descriptions are the tasks' names, which the table holds: no language model is needed.
-    options = [
-        f"--model.pretrained={ROOT / 'pretrained' / 'agent'}",
-        "--model.encoder=table",
-        "--evaluation.suites=[paper]",
-        *QUIET,
-    ]
-    options += [
-        "--data.demonstrations_per_concept=1",
-        "--evaluation.closed_loop=false",
-        "--model.output=c",
-        "--evaluation.results=r.csv",
-    ]
-    assert main(["invert", *LANGUAGE, *options]) == 0
-    model = load_model(ROOT / "pretrained" / "agent")
+    language = [f"--config={CONF / name}" for name in ("agent.yaml", "method/language.yaml")]
+    language += [f"--model.pretrained={ROOT / 'pretrained' / 'agent'}", "--model.encoder=table", "--model.output=c"]
+    judged = ["--evaluation.suites=[paper]", "--evaluation.closed_loop=false", "--evaluation.results=r.csv"]
+    succeed("invert", *language, *judged, *QUIET, "--data.demonstrations_per_concept=1")
     assert set(read_rows("r.csv").query("role == 'method'")["method"]) == {"language"}
     for path in Path("c").iterdir():
         concept = Concept.load(path)
-        assert concept.embeddings.shape == (1, 1, model.config.concept_dim)
+        assert concept.embeddings.shape == (1, 1, 384)
         assert concept.weights.tolist() == [pytest.approx(1.2)]
 
 
-def test_a_table_knows_no_new_sentences(tiny: Path) -> None:
+def test_tasks_are_told_in_the_papers_words_of_which_a_table_knows_no_new_ones(tiny: Path) -> None:
+    sentence = load_domain("object_rearrangement").concepts.sentence
+    assert sentence("circle diagonal to triangle") == "circle right and above diagonally to triangle"
+    ring = "circle triangle and square in a circle of radius 1.67"
+    assert sentence(ring.replace("circle triangle", "circle, triangle")) == ring
+    assert sentence("square diagonal to triangle and circle above square").endswith("to triangle and circle above square")
+    assert DOMAIN.concepts.sentence("go to red bowl") == "go to red bowl"
     module = LanguageAdaptation(str(tiny), encoder="table")
     module.domain = load_domain("object_rearrangement")
     with pytest.raises(UserError, match="'square right and above diagonally to triangle': not in the table"):
         module._embedding("square diagonal to triangle")
-
-
-def test_tasks_are_told_in_the_papers_words() -> None:
-    sentence = load_domain("object_rearrangement").concepts.sentence
-    assert sentence("circle diagonal to triangle") == "circle right and above diagonally to triangle"
-    assert (
-        sentence("circle, triangle and square in a circle of radius 1.67")
-        == "circle triangle and square in a circle of radius 1.67"
-    )
-    assert sentence("square diagonal to triangle and circle above square").endswith("to triangle and circle above square")
-    assert DOMAIN.concepts.sentence("go to red bowl") == "go to red bowl"
 
 
 def test_models_that_add_concepts_refuse_weights_on_some_columns() -> None:

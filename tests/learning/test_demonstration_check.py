@@ -10,18 +10,20 @@ import pytest
 import torch
 
 from ftl_lightning.check_figure import picture
-from ftl_lightning.cli import main
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.demonstration_check import Known, warnings_of
 from ftl_lightning.learning.explained_by import relative_losses
 from ftl_lightning.learning.left_out import LeftOut, left_out, odd_one, subsets
 from ftl_lightning.learning.scale_check import scale_findings
-from ftl_lightning.testing.strokes import TRAINING, strokes
-from tests.conftest import CONF, refused
+from ftl_lightning.testing.strokes import strokes
+from tests.conftest import CONF, ROOT, refused, succeed
 
 KNOWN, NEW = "circle right of square", "square diagonal to triangle"
+STROKES = ROOT / "pretrained" / "strokes"
+"""A model that ships: of what else people draw than squares and hearts."""
 
 
 @pytest.fixture(scope="module")
@@ -34,29 +36,15 @@ def five(scenes: FewShot) -> Demonstrations:
     return scenes.domain.source(None).draw(KNOWN, 5, 3)
 
 
-@pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a model of strokes."""
-    folder = tmp_path_factory.mktemp("own")
-    states = np.concatenate([strokes(kind, 40, 0) for kind in TRAINING])
-    np.savez(folder / "strokes.npz", states=states, concepts=np.repeat(TRAINING, 40))
-    arguments = ["fit", "--config", str(CONF / "own.yaml"), f"--data.demonstrations={folder / 'strokes.npz'}"]
-    arguments += ["--data.encoder=hashing", "--trainer.max_steps=300", "--trainer.enable_progress_bar=false"]
-    arguments += ["--evaluation.samples=2", f"--trainer.logger.init_args.save_dir={folder}", "--trainer.accelerator=cpu"]
-    assert main(arguments) == 0
-    return folder / "own" / "fit" / "pretrained"
-
-
-def test_a_known_concept_is_recognised_and_a_new_one_is_not(scenes: FewShot, five: Demonstrations) -> None:
+def test_a_known_concept_is_recognised_and_a_new_one_is_not_and_a_picture_is_drawn(scenes: FewShot, five: Demonstrations) -> None:
     found = scenes.check(five)
     assert found.warnings == ()
-    assert found.known is not None
     assert (found.known.text, found.known.clear) == (KNOWN, True)
     assert "no learning is needed" in str(found)
     other = scenes.check(scenes.domain.source(None).draw(NEW, 5, 0), name=NEW).known
-    assert other is not None
     assert not other.clear
     assert str(other).startswith("known: no training concept explains them all")
+    assert len(picture([found]).axes) == 2
 
 
 def test_the_empty_concept_explains_as_much_as_itself(scenes: FewShot, five: Demonstrations) -> None:
@@ -65,6 +53,7 @@ def test_the_empty_concept_explains_as_much_as_itself(scenes: FewShot, five: Dem
     assert torch.allclose(relative_losses(scenes.model, five, together, scenes.tuned.inversion), torch.ones(1, 5))
 
 
+@pytest.mark.slow
 def test_other_units_are_outside_of_what_pretraining_saw(scenes: FewShot, five: Demonstrations) -> None:
     (good,) = scale_findings(scenes.model, five)
     assert (good.severity, good.text[:29]) == ("note", "scale: 0 % of the states are ")
@@ -75,6 +64,7 @@ def test_other_units_are_outside_of_what_pretraining_saw(scenes: FewShot, five: 
         scenes.learn(larger, steps=1)
 
 
+@pytest.mark.slow
 def test_learning_warns_of_faults_and_of_nothing_else(scenes: FewShot, five: Demonstrations) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -85,16 +75,13 @@ def test_learning_warns_of_faults_and_of_nothing_else(scenes: FewShot, five: Dem
         scenes.learn(twice, steps=1)
 
 
-def test_states_with_missing_numbers_are_told_in_python(scenes: FewShot, five: Demonstrations) -> None:
+def test_missing_numbers_and_several_concepts_in_one_check_are_told_in_python(scenes: FewShot, five: Demonstrations) -> None:
     states = five.states.numpy().copy()
     states[1, 0, 4] = np.nan
     (error,) = [one for one in scenes.check(states).findings if one.severity == "error"]
     assert error.rows == (1,)
     with pytest.raises(UserError, match="expected finite numbers"):
         scenes.learn(states)
-
-
-def test_concepts_in_one_check_are_refused(scenes: FewShot, five: Demonstrations) -> None:
     with pytest.raises(UserError, match="expected demonstrations of one concept"):
         scenes.check(concatenate([five, replace(five, concepts=(NEW,) * 5)]))
 
@@ -134,8 +121,9 @@ def test_words_follow_the_numbers() -> None:
     assert not Known("a", (0.9, 0.9, 1.2, 0.9)).clear
 
 
-def test_a_stroke_of_another_kind_is_odd(own: Path) -> None:
-    model = FewShot.from_pretrained(own)
+@pytest.mark.slow
+def test_a_stroke_of_another_kind_is_odd() -> None:
+    model = FewShot.from_pretrained(STROKES)
     good = model.demonstrations(strokes("square", 5, 77))
     assert warnings_of(model.model, good) == ()
     mixed = model.demonstrations(np.concatenate([strokes("square", 4, 77), strokes("heart", 1, 77)]))
@@ -148,32 +136,29 @@ def test_a_stroke_of_another_kind_is_odd(own: Path) -> None:
     assert not fine.far
 
 
-def test_the_verb_checks_learns_and_draws(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    states = strokes("square", 3, 1)
+@pytest.mark.slow
+def test_the_verb_checks_learns_and_draws(capsys: pytest.CaptureFixture[str]) -> None:
     frozen = strokes("heart", 3, 1)
     frozen[1] = frozen[1, :1]
-    np.savez("six.npz", states=np.concatenate([states, frozen]), concepts=np.repeat(["square", "heart"], 3))
-    capsys.readouterr()
-    assert main(["check", "six.npz"]) == 0
+    np.savez("six.npz", states=np.concatenate([strokes("square", 3, 1), frozen]), concepts=np.repeat(["square", "heart"], 3))
+    Path("few.yaml").write_text("defaults: [conf/own.yaml]\ndata: {init_args: {steps: 5}}\n")
+    succeed("check", "six.npz")
     told = capsys.readouterr().out
     assert "square: 3 demonstrations of 40 steps, 2 columns\n  no faults" in told
     assert "  warning: demonstration 2: nothing moves" in told
-    assert main(["check", "six.npz", f"--pretrained={own}", "--learn=true", "--figure=six.png"]) == 0
+    succeed("check", "six.npz", f"--pretrained={STROKES}", "--learn=true", "--settings=few.yaml", "--figure=six.png")
     told = capsys.readouterr().out
     assert max(len(part.splitlines()) for part in told.split("heart: ")) <= 12
     assert told.count("left out: ") == 2
     assert Path("six.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_picture_is_drawn_of_every_form_of_state(scenes: FewShot, five: Demonstrations) -> None:
-    assert len(picture([scenes.check(five)]).axes) == 2
-
-
+@pytest.mark.slow
 def test_invert_notes_faults_of_a_file_of_ones_own(tiny: Path, five: Demonstrations, capsys: pytest.CaptureFixture[str]) -> None:
     five.rows([0, 1, 2, 2]).save("four.safetensors")
-    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
-    arguments += ["--data.demonstrations=four.safetensors", "--data.steps=10", "--evaluation.samples=2"]
-    assert main([*arguments, "--trainer.accelerator=cpu"]) == 0
+    invert = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}", "--model.form=paper"]
+    invert += ["--data.demonstrations=four.safetensors", "--data.steps=2", "--evaluation.samples=1", "--evaluation.steps=2"]
+    succeed(*invert, "--evaluation.figures=0", "--trainer.accelerator=cpu")
     assert f"note: {KNOWN}: demonstrations 3 and 4: are the same" in capsys.readouterr().err
 
 
@@ -183,7 +168,6 @@ def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     refused(capsys, ["check", "five.npz", "--learn=true"], "learn: expected --pretrained MODEL")
     refused(capsys, ["check", "five.npz", "--pretrained=object_rearrangement"], "five.npz: ", "21 columns")
     refused(capsys, ["check", "five.npz", "--figure=five.txt"], "figure: expected a name that ends in .png")
-    bad = ["check", "scenes.safetensors", "--pretrained=baseline/bc/object_rearrangement"]
-    assert main(["generate", "object_rearrangement", f"--task={KNOWN}", "--count=3", "--out=scenes.safetensors"]) == 0
-    if not FewShot.from_pretrained("baseline/bc/object_rearrangement").model.invertible:
-        refused(capsys, bad, "model.pretrained: expected a model that concepts are learned through")
+    load_domain("agent").source(None).draw("go to bowl", 1, 0).save("drives.safetensors")
+    reads = ["check", "drives.safetensors", "--pretrained=baseline/in_context/agent"]
+    refused(capsys, reads, "model.pretrained: expected a model that concepts are learned through")

@@ -2,30 +2,30 @@
 
 import os
 import shutil
-import signal
-import socket
 import subprocess
 import sys
-import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.distributed import TCPStore
 
-from ftl_lightning.cli import main
+from ftl_lightning.errors import UserError
 from ftl_lightning.processes import Dropout, drawn, rows_of
-from tests.conftest import CONF, ROOT, TINY, refused
-from tests.learning.test_resume import DATA, NETWORK
+from ftl_lightning.trainer import Trainer
+from tests import tiny as sizes
+from tests.conftest import CONF, TINY, environment, inversion_module, refused, started, succeed
 
-STEPS = 50
-FIT = ["--data.steps_per_epoch=25", f"--trainer.max_steps={STEPS}", "--trainer.log_every_n_steps=1", "--trainer.accelerator=cpu"]
-FIT += ["--evaluation.samples=2", "--evaluation.steps=2", "--evaluation.figures=0", "--trainer.enable_progress_bar=false"]
+STEPS = 20
+FIT = [f"--data.steps_per_epoch={STEPS // 2}", f"--trainer.max_steps={STEPS}", "--trainer.log_every_n_steps=1"]
+FIT += ["--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.diversity=false"]
 TWO = ["--trainer.devices=2", "--trainer.strategy=ddp"]
-OURS = ["--model.codes={share: 0.5, knots: 1}", "--model.draws=2"]
+OURS = "object_rearrangement.yaml"
 CASES = {
-    "object_rearrangement.yaml": [*OURS, "--evaluation.samples=1"],
+    OURS: ["--model.codes={share: 0.5, knots: 1}", "--model.draws=2"],
     "bc/object_rearrangement.yaml": ["--model.members=2"],
     "cvae/object_rearrangement.yaml": [],
     "driving.yaml": ["--model.view=steps", "--model.perturb=true", "--model.feature_dropout={traffic: 0.4}"],
@@ -36,49 +36,47 @@ CASES = {
 
 def fit(path: str, name: str, batch_size: int) -> list[str]:
     """Arguments of a tiny fit that logs and writes to folders of a name."""
-    domain, method = Path(path).stem, Path(path).parent.name or Path(path).stem
-    options = [*FIT, *DATA[domain], *NETWORK[method], *CASES[path], f"--data.batch_size={batch_size}"]
-    options += [f"--trainer.logger.init_args.save_dir={name}", f"--model.output={name}/model"]
-    return ["fit", "--config", str(CONF / path), *options]
+    options = [*FIT, *CASES[path], f"--data.batch_size={batch_size}", f"--trainer.logger.init_args.save_dir={name}"]
+    return sizes.fit(Path(path), *options, f"--model.output={name}/model")
 
 
 def logged(folder: str) -> dict[str, list[float]]:
-    """Every curve of a run by its tag."""
+    """Every curve of a run by its tag; of a step that was done again the later value."""
     (events,) = sorted({path.parent for path in Path(folder).rglob("events.*")})
     board = EventAccumulator(str(events))
     board.Reload()
-    return {tag: [event.value for event in board.Scalars(tag)] for tag in board.Tags()["scalars"]}
+    return {tag: [*{event.step: event.value for event in board.Scalars(tag)}.values()] for tag in board.Tags()["scalars"]}
 
 
-def environment(**more: str) -> dict[str, str]:
-    """Of processes that tests start."""
-    return os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)} | more
+def same(one: str, other: str) -> bool:
+    """Whether two runs logged the same curves, to the rounding of sums in another order."""
+    first, second = logged(one), logged(other)
+    assert list(first) == list(second)
+    for tag, values in first.items():
+        assert second[tag] == pytest.approx(values, rel=1e-5, abs=1e-5), tag
+    return True
 
 
-def started(arguments: list[str]) -> "subprocess.Popen[str]":
-    """The program, as people start it."""
-    command = [sys.executable, "-m", "ftl_lightning", *arguments]
-    return subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def ports(count: int) -> list[str]:
-    """So many that nobody uses."""
-    with ExitStack() as held:
-        free = [held.enter_context(socket.socket()) for _ in range(count)]
-        for one in free:
-            one.bind(("127.0.0.1", 0))
-        return [str(one.getsockname()[1]) for one in free]
+@contextmanager
+def ended(*runs: "subprocess.Popen[str]") -> Iterator[list[tuple[str, str]]]:
+    """What processes wrote, after their ends; none of them outlives the block."""
+    try:
+        yield [run.communicate() for run in runs]
+    finally:
+        for run in runs:
+            run.kill()
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the logs of each case in two processes, which fit one case after another: starting takes longer than that."""
     folder = tmp_path_factory.mktemp("two")
-    # Each with a port of its own: a process that is ahead must not join the group that the other one is about to leave.
-    every = [([*fit(path, f"two/{path}", 4), *TWO], port) for path, port in zip(CASES, ports(len(CASES)), strict=True)]
+    # Each case has a store, at a port that the system chose: a process that is ahead joins no group that the other one leaves.
+    stores = [TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False) for _ in CASES]
+    every = [([*fit(path, f"two/{path}", 4), *TWO], str(store.port)) for path, store in zip(CASES, stores, strict=True)]
     script = "import os, sys\nfrom ftl_lightning.cli import main\n"
     script += f"for arguments, os.environ['MASTER_PORT'] in {every!r}:\n    if main(arguments):\n        sys.exit(1)"
-    names = {"MASTER_ADDR": "127.0.0.1", "NODE_RANK": "0", "WORLD_SIZE": "2"}
+    names = {"MASTER_ADDR": "127.0.0.1", "NODE_RANK": "0", "WORLD_SIZE": "2", "TORCHELASTIC_USE_AGENT_STORE": "True"}
     both = [
         subprocess.Popen(
             [sys.executable, "-c", script],
@@ -90,28 +88,22 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         for rank in range(2)
     ]
-    try:
-        (first, trouble), (second, more) = (one.communicate(timeout=100) for one in both)
-    finally:
-        for one in both:
-            one.kill()
-    assert [one.returncode for one in both] == [0, 0], trouble + more
+    with ended(*both) as ((first, trouble), (second, more)):
+        assert [one.returncode for one in both] == [0, 0], trouble + more
     assert first.count("pretrained model: ") == len(CASES)
     assert second == ""  # one of them speaks
     assert "error" not in trouble + more
     return folder
 
 
+@pytest.mark.cluster
 @pytest.mark.parametrize("path", CASES)
 def test_two_processes_learn_as_one_with_the_doubled_batch(path: str, runs: Path) -> None:
-    assert main(fit(path, "one", 8)) == 0
-    one, two = logged("one"), logged(str(runs / "two" / path))
-    assert list(one) == list(two)
-    assert len(one["loss/train"]) == STEPS
-    for tag, values in one.items():
-        assert two[tag] == pytest.approx(values, rel=1e-5, abs=1e-5), tag
+    succeed(*fit(path, "one", 8))
+    assert same("one", str(runs / "two" / path))
+    assert len(logged("one")["loss/train"]) == STEPS
     if path != "in_context/agent.yaml":
-        assert len(one["loss/val"]) == 2  # once an epoch
+        assert len(logged("one")["loss/val"]) == 2  # once an epoch
 
 
 def test_rows_of_a_batch_get_the_numbers_that_one_process_draws_for_them() -> None:
@@ -131,70 +123,79 @@ def test_rows_of_a_batch_get_the_numbers_that_one_process_draws_for_them() -> No
     assert numbers(6).equal(whole)  # outside there is one process
 
 
-LONG = [f"--trainer.max_steps={6 * STEPS}", "--trainer.callbacks.init_args.every_n_train_steps=100", "--data.steps_per_epoch=90"]
-"""A run that is long enough to be killed after its first checkpoint and before its end."""
+OFTEN = ["--trainer.callbacks.init_args.every_n_train_steps=8"]
+CALLBACKS = """
+import os, signal
+import lightning.pytorch as pl
+from ftl_lightning.errors import UserError
+
+class Second(pl.Callback):
+    def on_train_batch_start(self, trainer, *_):
+        if trainer.global_rank == 1 and trainer.global_step == 12:
+            self.end()
+
+class Killed(Second):
+    def end(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+class Mistaken(Second):
+    def end(self):
+        raise UserError('number: expected 1, found 2')
+"""
+"""What ends the second process after its twelfth step, for which it exchanged gradients with the first one after its checkpoint."""
+
+
+def broken(name: str) -> tuple[int, str, str]:
+    """The exit code of a run whose second process ends so, and what the run writes."""
+    Path("ends.py").write_text(CALLBACKS)
+    run = started(*fit(OURS, name, 4), *TWO, *OFTEN, f"--trainer.callbacks+=ends.{name}", "--trust=ends")
+    with ended(run) as ((told, error),):
+        return run.returncode, told, error
 
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the logs of a run in two processes, the second of which was killed."""
+    """Folder with the logs of a run in two processes, the second of which was killed, and of an unbroken one."""
     folder = tmp_path_factory.mktemp("killed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        run = started([*fit("object_rearrangement.yaml", "killed", 4), *TWO, *LONG])
-        end = time.monotonic() + 60
-        while not list(Path("killed").rglob("last.ckpt")) and time.monotonic() < end and run.poll() is None:
-            time.sleep(0.01)
-        (second,) = map(int, Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split())
-        os.kill(second, signal.SIGKILL)
-        told, error = run.communicate(timeout=30)
-    assert (run.returncode, told) == (2, "")
-    (error,) = error.splitlines()
+        code, told, error = broken("Killed")
+        succeed(*fit(OURS, "unbroken", 8), *OFTEN)
+    assert (code, told, error.count("\n")) == (2, "", 1)
     assert error.startswith("error: trainer.devices: expected 2 processes to the end, process 1 ended by signal 9 (SIGKILL)")
     assert "--ckpt_path last" in error
-    assert not (folder / "killed" / "model").exists()
+    assert not (folder / "Killed" / "model").exists()
     return folder
 
 
+@pytest.mark.cluster
 @pytest.mark.parametrize(("processes", "batch_size"), [(2, 4), (1, 8)])
 def test_a_run_whose_process_was_killed_goes_on_in_two_or_one(
     processes: int, batch_size: int, killed: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
-    again = [*fit("object_rearrangement.yaml", "killed", batch_size), *LONG, "--ckpt_path=last"]
+    again = [*fit(OURS, "Killed", batch_size), *OFTEN, "--ckpt_path=last"]
     if processes == 1:
-        assert main(again) == 0
+        succeed(*again)
     else:
-        run = started([*again, *TWO])
-        told, error = run.communicate(timeout=60)
-        assert (run.returncode, len(told.splitlines()), "error" in error) == (0, 1, False)
-    assert main([*fit("object_rearrangement.yaml", "unbroken", 8), *LONG]) == 0
-    for tag, values in logged("unbroken").items():
-        assert logged("killed")[tag] == pytest.approx(values, rel=1e-5, abs=1e-5), tag
+        with ended(run := started(*again, *TWO)) as ((told, error),):
+            assert (run.returncode, told.count("pretrained model: "), "error" in error) == (0, 1, False), told
+    assert same("unbroken", "Killed")
 
 
-def test_a_mistake_in_one_process_ends_both_with_its_line(tmp_path: Path) -> None:
-    Path("mistaken.py").write_text(
-        "import lightning.pytorch as pl\nfrom ftl_lightning.errors import UserError\n"
-        "class Mistaken(pl.Callback):\n"
-        "    def on_train_batch_start(self, trainer, *_):\n"
-        "        if trainer.global_rank == 1 and trainer.global_step == 3:\n"
-        "            raise UserError('number: expected 1, found 2')\n"
-    )
-    run = started(
-        [*fit("object_rearrangement.yaml", "mistaken", 4), *TWO, "--trainer.callbacks+=mistaken.Mistaken", "--trust=mistaken"]
-    )
-    told, error = run.communicate(timeout=60)
-    assert (run.returncode, told, error) == (2, "", "error: number: expected 1, found 2\n")
+@pytest.mark.cluster
+def test_a_mistake_in_one_process_ends_both_with_its_line() -> None:
+    assert broken("Mistaken") == (2, "", "error: number: expected 1, found 2\n")
 
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="one processor runs one process")
 def test_what_cannot_run_in_several_processes_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    base = ["--config", str(CONF / "object_rearrangement.yaml"), *TINY, "--trainer.devices=2"]
-    refused(capsys, ["fit", *base, "--trainer.strategy=ddp_spawn"], "trainer.strategy: expected ddp", "found spawn")
-    checkpoint = next(tiny.parent.rglob("*.ckpt"))
-    refused(capsys, ["test", *base, f"--ckpt_path={checkpoint}"], "trainer.devices: expected 1 for test, found 2")
-    invert = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
-    refused(
-        capsys, [*invert, "--trainer.accelerator=cpu", "--trainer.devices=2"], "trainer.devices: expected 1 for invert, found 2"
-    )
+    module, options = inversion_module(tiny), {"accelerator": "cpu", "devices": 2, "logger": False}
+    with pytest.raises(UserError, match=r"trainer\.strategy: expected ddp for several processes, found spawn"):
+        Trainer(**options, strategy="ddp_spawn").fit(module)
+    two = Trainer(**options, strategy="ddp")
+    for verb in (two.validate, two.test, two.invert):
+        with pytest.raises(UserError, match=rf"trainer\.devices: expected 1 for {verb.__name__}, found 2"):
+            verb(module, datamodule=None)
+    test = ["test", f"--config={CONF / OURS}", *TINY, "--trainer.devices=2", f"--ckpt_path={next(tiny.parent.rglob('*.ckpt'))}"]
+    refused(capsys, test, "trainer.devices: expected 1 for test, found 2")

@@ -7,7 +7,6 @@ import pytest
 import torch
 from matplotlib.colors import to_hex
 
-from ftl_lightning.cli import main
 from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.concepts.modes import Modes, even_stretch
@@ -20,7 +19,7 @@ from ftl_lightning.learning.forms import ALL, OWN, RANK, TOLERANCE, _Shares, fir
 from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, FORMS, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.learning.quality import Quality
 from ftl_lightning.testing.strokes import strokes
-from tests.conftest import CONF, ROOT
+from tests.conftest import CONF, ROOT, succeed
 
 TASK = "circle right of square"
 
@@ -34,10 +33,10 @@ def model() -> FewShot:
     return FewShot.from_pretrained(ROOT / "pretrained" / "object_rearrangement")
 
 
+@pytest.mark.slow
 def test_where_demonstrations_share_a_relation_one_set_suffices_and_the_numbers_are_told(model: FewShot) -> None:
     learned = model.learn(scenes(model))
     choice = learned.concept.choice
-    assert choice is not None
     assert choice.form in (ADAPTED, MIXED)
     own, *left_out = (choice.numbers[f"loss, {name}"] for name in ("own", "left out", "left out, in span"))
     assert own + sum(left_out) <= ALL or own <= OWN
@@ -47,6 +46,7 @@ def test_where_demonstrations_share_a_relation_one_set_suffices_and_the_numbers_
     assert model.evaluate(samples, TASK)["accuracy"] > 0.95
 
 
+@pytest.mark.slow
 def test_where_they_do_not_samples_come_from_one_mode_each(model: FewShot) -> None:
     proposed = random_scenes(100_000, 0)
     x, y, _ = columns(proposed)
@@ -54,18 +54,16 @@ def test_where_they_do_not_samples_come_from_one_mode_each(model: FewShot) -> No
     apart = torch.cdist(points, points)[:, [0, 0, 1], [1, 2, 2]].amin(dim=1) > 3.2  # in ways that are right, but not alike
     states = proposed[apart][:5, None].numpy()
     learned = model.learn(states, name="far apart")
-    assert learned.concept.choice is not None
     assert learned.concept.choice.form == MODES
-    assert learned.concept.modes is not None
     assert not learned.concept.modes.mixed
     assert learned.concept.adapter is None
 
 
-def test_each_form_can_be_asked_for(model: FewShot) -> None:
+@pytest.mark.slow
+def test_each_form_can_be_asked_for_and_options_that_name_one_are_followed_without_a_choice(model: FewShot) -> None:
     five = scenes(model)
     found = {form: model.learn(five, form=form, steps=4).concept for form in FORMS[1:] if form != AUTO}
-    for concept in found.values():
-        assert concept.choice is None
+    assert all(concept.choice is None for concept in found.values())
     for form in (PAPER, ONE):
         assert found[form].modes is None
         assert found[form].adapter is None
@@ -75,21 +73,17 @@ def test_each_form_can_be_asked_for(model: FewShot) -> None:
     assert found[ADAPTED].adapter is not None
     assert found[ADAPTED].modes is None
     modes = found[MIXED].modes
-    assert modes is not None
     assert modes.mixed
     assert modes.stretch == even_stretch(5)
     with pytest.raises(UserError, match=r"model\.form: expected one of paper, auto, one set, .*, found 'best'"):
         model.learn(five, form="best")
-
-
-def test_options_that_name_a_form_are_followed_without_a_choice(model: FewShot) -> None:
-    five = scenes(model)
     for options in ({"modes": "each"}, {"adapter": 1, "tolerance": None}, {"form": "paper"}):
         assert model.learn(five, steps=2, **options).concept.choice is None
     assert InversionSettings().for_own(choose=True).form == AUTO
     assert InversionSettings().for_own(choose=False).form == ""
 
 
+@pytest.mark.slow
 def test_a_chosen_form_comes_back_from_its_file_and_composes_as_before(model: FewShot, tmp_path: Path) -> None:
     concept = model.learn(scenes(model), steps=20).concept
     other = replace(concept, composing=(concept.embeddings + 1, concept.weights * 0.5))
@@ -129,13 +123,12 @@ def test_evenly_stretched_mixtures_vary_as_much_as_what_the_modes_are_a_sample_o
 
 def test_a_single_demonstration_has_one_set_and_two_have_no_left_out_ones(model: FewShot) -> None:
     one = model.learn(scenes(model, count=1), steps=10).concept
-    assert one.choice is not None
     assert one.choice.form == ONE
     two = model.learn(scenes(model, count=2), steps=10).concept
-    assert two.choice is not None
     assert "loss, left out" not in two.choice.numbers
 
 
+@pytest.mark.slow
 def test_several_concepts_are_chosen_for_each_by_itself(model: FewShot) -> None:
     both = [scenes(model, task) for task in (TASK, "triangle above square")]
     together = learn(model.model, concatenate(both), model.tuned.inversion.changed(form=AUTO), 20)
@@ -175,27 +168,23 @@ def test_quality_tells_copies_collapse_and_jagged_samples() -> None:
         Quality.of(fresh, five[:1])
 
 
+@pytest.mark.slow
 def test_invert_on_a_file_of_ones_own_chooses_and_tells_the_quality(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scenes(FewShot.from_pretrained(tiny)).save("five.safetensors")
-    arguments = ["invert", "--config", str(CONF / "object_rearrangement.yaml"), f"--model.pretrained={tiny}"]
-    arguments += ["--data.steps=10", "--evaluation.samples=3", "--evaluation.steps=3", "--data.demonstrations=five.safetensors"]
-    arguments += ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--model.output=concepts"]
-    assert main(arguments) == 0
+    five, configuration = "five.safetensors", str(CONF / "object_rearrangement.yaml")
+    model = FewShot.from_pretrained(tiny, configuration)
+    scenes(model).save(five)
+    invert = ["invert", "--config", configuration, f"--model.pretrained={tiny}", "--data.steps=10", f"--data.demonstrations={five}"]
+    invert += ["--evaluation.samples=3", "--evaluation.steps=3", "--evaluation.figures=0", "--model.output=concepts"]
+    succeed(*invert, "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu")
     told = capsys.readouterr().out
     assert "form: " in told
     assert "quality: accuracy " in told
     learned = Concept.load("concepts/circle_right_of_square.safetensors")
     assert learned.choice is not None
-    same = FewShot.from_pretrained(tiny, str(CONF / "object_rearrangement.yaml")).learn(
-        scenes(FewShot.from_pretrained(tiny)), steps=10
-    )
-    assert torch.equal(same.concept.embeddings, learned.embeddings)  # as FewShot.learn
-    assert main([*arguments, "--model.form=paper"]) == 0
-    assert Concept.load("concepts/circle_right_of_square.safetensors").choice is None
-    assert main([*arguments, "--model.form=best"]) == 2
-    assert "model.form: expected one of paper, auto" in capsys.readouterr().err
+    assert torch.equal(model.learn(scenes(model), steps=10).concept.embeddings, learned.embeddings)  # as FewShot.learn
 
 
+@pytest.mark.slow
 def test_the_quality_of_what_was_learned_is_told_and_drawn(model: FewShot) -> None:
     learned = model.learn(scenes(model), steps=10)
     assert "spread" in str(learned.quality)
@@ -221,7 +210,6 @@ def test_an_adapter_that_is_named_beside_the_choice_is_of_the_named_rank(model: 
     assert model.tuned.inversion.budget.tolerance is not None  # with which an adapter alone is refused
     for options, rank in (({}, RANK), ({"adapter": 3}, 3)):
         adapter = model.learn(scenes(model), steps=3, form=ADAPTED, **options).concept.adapter
-        assert adapter is not None
         assert {up.shape[-1] for up, _ in adapter.factors.values()} == {rank}
 
 
@@ -231,11 +219,10 @@ def test_forms_are_learned_where_a_trainer_has_turned_gradients_off(model: FewSh
     expected = formed(model.model, five, settings, 3, first)[TASK].modes
     with torch.inference_mode():
         found = formed(model.model, five, settings, 3, first)[TASK].modes
-    assert found is not None
-    assert expected is not None
     assert torch.equal(found.embeddings, expected.embeddings)
 
 
+@pytest.mark.slow
 def test_a_warning_that_another_loss_was_pretrained_with_comes_once(
     model: FewShot, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,6 @@
 """``invert`` in several processes learns the concepts of one process."""
 
+from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -7,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept, file_name
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.domains.data import InversionData
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.results import read_rows
@@ -18,9 +19,47 @@ from ftl_lightning.learning.forms import learn
 from ftl_lightning.learning.in_processes import learned_in_processes
 from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.lightning_cli import build
-from tests.conftest import CONF, ROOT, refused
+from ftl_lightning.trainer import Trainer
+from tests.conftest import CONF, ROOT, inversion_module, refused, succeed
 
-STEPS = 10
+STEPS = 5
+
+
+class Here:
+    """In the place of processes: what they are to do is done in this one at once."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __enter__(self) -> "Here":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def submit(self, work: Callable[..., str], *arguments: object) -> "Future[str]":
+        future: Future[str] = Future()
+        with torch.inference_mode(False), torch.enable_grad():  # as in a new process
+            future.set_result(work(*arguments))
+        return future
+
+
+class Stopped(Here):
+    """In the place of processes of which one was killed from outside."""
+
+    def submit(self, work: Callable[..., str], *arguments: object) -> "Future[str]":
+        future: Future[str] = Future()
+        future.set_exception(BrokenProcessPool())
+        return future
+
+
+@pytest.fixture(params=["here", pytest.param("elsewhere", marks=pytest.mark.slow)])
+def _work(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What processes do, done by them or in this one."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    if request.param == "here":
+        monkeypatch.setattr(in_processes, "ProcessPoolExecutor", Here)
+        monkeypatch.setattr(in_processes, "silence", lambda: None)
 
 
 def inversion(pretrained: Path, name: str, *options: str) -> list[str]:
@@ -30,12 +69,13 @@ def inversion(pretrained: Path, name: str, *options: str) -> list[str]:
     return [*arguments, f"--model.output={name}/concepts", f"--trainer.logger.init_args.save_dir={name}", *options]
 
 
-def test_two_processes_learn_the_concepts_of_one(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+@pytest.mark.slow
+@pytest.mark.usefixtures("_work")
+def test_two_processes_learn_the_concepts_of_one(tiny: Path) -> None:
     line = build("invert", inversion(tiny, "one")[1:])
     alone = learn(line.model.model, line.datamodule.demonstrations, line.model.settings, STEPS)
     assert len(alone) == 10
-    assert main(inversion(tiny, "two", "--trainer.processes=2")) == 0
+    succeed(*inversion(tiny, "two", "--trainer.processes=2"))
     assert len(list(Path("two/concepts").iterdir())) == len(alone)
     for name, one in alone.items():
         two = Concept.load(Path("two/concepts") / f"{file_name(name)}.safetensors")
@@ -52,28 +92,10 @@ def demonstrations() -> Demonstrations:
     return Demonstrations(states, torch.ones(4, dtype=torch.int64), "", ("x", "y"), ("", ""), ("a", "a", "b", "b"))
 
 
-def test_a_mistake_in_one_process_is_told_by_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+@pytest.mark.usefixtures("_work")
+def test_a_mistake_in_one_process_is_told_by_the_first(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nowhere"):
         learned_in_processes(str(tmp_path / "nowhere"), demonstrations(), InversionSettings(), 1, 1)
-
-
-class Stopped:
-    """In the place of processes of which one was killed from outside."""
-
-    def __init__(self, *_: object) -> None:
-        pass
-
-    def __enter__(self) -> "Stopped":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def submit(self, *_: object) -> "Future[str]":
-        future: Future[str] = Future()
-        future.set_exception(BrokenProcessPool())
-        return future
 
 
 def test_a_process_that_is_stopped_from_outside_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,15 +104,13 @@ def test_a_process_that_is_stopped_from_outside_is_told(monkeypatch: pytest.Monk
         learned_in_processes("anything", demonstrations(), InversionSettings(), 1, 3)
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--trainer.processes=0"], "trainer.processes: expected 1 or more"),
-        (["--trainer.processes=1000"], "trainer.processes: expected a number from 1 to 256"),
-        (["--trainer.processes=2", "--trainer.gradient_clip_val=0.5"], "expected 1 with trainer.gradient_clip_val, found 2"),
-    ],
-)
-def test_what_several_processes_do_not_look_at_is_refused(
-    options: list[str], told: str, tiny: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    refused(capsys, inversion(tiny, "run", *options), told)
+def test_what_several_processes_do_not_look_at_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = InversionData("object_rearrangement", suite="validation", steps=STEPS)
+    for options, told in (
+        ({"processes": 0}, "trainer.processes: expected 1 or more"),
+        ({"processes": 1000}, "trainer.processes: expected a number from 1 to 256"),
+        ({"processes": 2, "gradient_clip_val": 0.5}, "expected 1 with trainer.gradient_clip_val, found 2"),
+    ):
+        with pytest.raises(UserError, match=told):
+            Trainer(accelerator="cpu", logger=False, **options).invert(inversion_module(tiny), data)
+    refused(capsys, inversion(tiny, "run", "--trainer.processes=0"), "trainer.processes: expected 1 or more")

@@ -24,6 +24,7 @@ def test_a_resumed_run_is_one_curve(tmp_path: Path) -> None:
         curve(str(tmp_path / "none"), "val/loss")
 
 
+@pytest.mark.slow
 def test_a_model_that_uses_the_concept_loses_without_it() -> None:
     losses = runpy.run_path(str(ROOT / "benchmarks" / "concept_in_loss.py"))["losses"]
     few = FewShot.from_pretrained("object_rearrangement")

@@ -2,87 +2,97 @@
 
 import json
 import os
-import shutil
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from tests.conftest import ROOT
+from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.few_shot import FewShot
+from ftl_lightning.learning.methods import load_method, method_names, method_of
+from tests.conftest import ROOT, Once, python, succeed
+from tests.domains.test_plug_in import VERBS, installed
 
-FLOW = ROOT / "examples" / "ftl-flow"
-SMALL = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--evaluation.samples=4", "--evaluation.steps=3"]
-FIT = ["--trainer.max_steps=60", "--data.steps_per_epoch=60", "--data.samples_per_concept=20", "--data.batch_size=32"]
-PYTHON = """
+FLOW, STROKES = (ROOT / "examples" / name for name in ("ftl-flow", "ftl-strokes"))
+SMALL = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--evaluation.samples=1", "--evaluation.steps=2"]
+SMALL += ["--evaluation.figures=0"]
+FIT = ["fit", f"--config={FLOW / 'flow.yaml'}", *SMALL, "--model.network={hidden_dim: 16, condition_dim: 8}"]
+FIT += ["--trainer.max_steps=2", "--data.steps_per_epoch=2", "--data.samples_per_concept=2", "--data.batch_size=8"]
+SETTINGS = FLOW / "flow_invert.yaml"
+INVERT = ["invert", f"--config={SETTINGS}", *SMALL, "--data.steps=2", "--model.budget.samples=2"]
+INVERT += ["--evaluation.results=strokes.csv"]
+PYTHON = f"""
 from ftl_lightning import FewShot
 from ftl_lightning.domains.registry import load_domain
 
 five = load_domain("strokes").source(None).draw("wave upwards", 5, 1)
-model = FewShot.from_pretrained("logs/flow/fit/pretrained", settings="flow_invert.yaml")
+model = FewShot.from_pretrained("logs/flow/fit/pretrained", settings={str(SETTINGS)!r})
 concept = model.learn(five, steps=3, samples=8)
 plans = model.sample(concept + 0.5 * model["arc upwards"], 3, steps=4)
 print(repr(model), tuple(plans.states.shape), sorted(model.evaluate(plans, "wave upwards")))
 """
+OFFERED = """[ftl_lightning.methods]
+flow = ftl_flow:METHOD
+[ftl_lightning.domains]
+strokes = ftl_strokes:DOMAIN
+"""
 
 
-def run(packages: Path, *command: str) -> str:
-    """What a program says, with another folder of packages."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (packages, ROOT))), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout + done.stderr
+@pytest.fixture
+def offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Both examples as if they were installed: on Python's path, with a card that holds their entry points."""
+    card = tmp_path / "packages" / "examples-0.1.0.dist-info"
+    card.mkdir(parents=True)
+    (card / "METADATA").write_text("Metadata-Version: 2.1\nName: examples\nVersion: 0.1.0\n")
+    (card / "entry_points.txt").write_text(OFFERED)
+    for folder in (FLOW, STROKES, card.parent):
+        monkeypatch.syspath_prepend(folder)
+    load_domain.cache_clear()
+    yield
+    load_domain.cache_clear()
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder into which the method and the domain that it is shown on were installed as packages."""
-    folder = tmp_path_factory.mktemp("installed")
-    options = ["--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--target", str(folder / "packages")]
-    for example in (FLOW, ROOT / "examples" / "ftl-strokes"):
-        source = folder / example.name
-        shutil.copytree(example, source, ignore=shutil.ignore_patterns("logs", "build", "*.egg-info", "__pycache__"))
-        subprocess.run([sys.executable, "-m", "pip", "install", *options, str(source)], check=True)
-    return folder / "packages"
-
-
-def test_an_installed_method_pretrains_adapts_appears_in_tables_and_is_used_from_python(installed: Path) -> None:
-    for name in ("flow.yaml", "flow_invert.yaml"):
-        shutil.copy(FLOW / name, name)
-    program = ("-m", "ftl_lightning")
-    run(installed, *program, "fit", "--config=flow.yaml", *SMALL, *FIT)
+def expect_pretrained_and_adapted() -> None:
+    """What the current folder holds after a fit and an inversion."""
     assert json.loads(Path("logs/flow/fit/pretrained/config.json").read_text())["kind"] == "flow"
-    run(installed, *program, "invert", "--config=flow_invert.yaml", *SMALL, "--data.steps=5")
-    rows = pd.read_csv("logs/flow/invert/results.csv")
+    rows = pd.read_csv("strokes.csv")
     assert set(rows.loc[rows["role"] == "method", "method"]) == {"flow matching"}
-    Path("results").mkdir()
-    shutil.copy("logs/flow/invert/results.csv", "results/strokes.csv")
-    run(installed, *program, "report", "--results", "results", "--out", "report")
-    tables = "".join(path.read_text() for path in Path("report").rglob("*.md"))
-    assert "flow matching" in tables
-    told = run(installed, "-c", PYTHON)
+
+
+@pytest.mark.release
+def test_an_installed_method_pretrains_adapts_appears_in_tables_and_is_used_from_python(once: Once) -> None:
+    packages = once("plug_ins", installed) / "packages"
+    verbs = (FIT, INVERT, ["report", "--results=strokes.csv", "--out=report"])
+    path = os.pathsep.join(map(str, (packages, ROOT)))
+    done = python("-c", VERBS + PYTHON, *map(json.dumps, verbs), PYTHONPATH=path)
+    assert done.returncode == 0, done.stderr
+    expect_pretrained_and_adapted()
+    assert "flow matching" in "".join(file.read_text() for file in Path("report").rglob("*.md"))
+    told = done.stdout.splitlines()[-1]
     assert "flow matching" in told
     assert "(3, 32, 2) ['accuracy']" in told
 
 
-def test_the_same_seed_gives_the_same_model(installed: Path) -> None:
-    shutil.copy(FLOW / "flow.yaml", "flow.yaml")
-    hashes = []
+def test_a_method_that_an_entry_point_offers_pretrains_adapts_and_is_used_from_python(offered: None) -> None:
+    assert method_names()[-1] == "flow"
+    assert method_of("flow") is load_method("flow")
+    succeed(*FIT)
+    succeed(*INVERT)
+    expect_pretrained_and_adapted()
+    model = FewShot.from_pretrained("logs/flow/fit/pretrained", settings=str(SETTINGS))
+    concept = model.learn(model.domain.source(None).draw("wave upwards", 5, 1), steps=3, samples=8)
+    plans = model.sample(concept + 0.5 * model["arc upwards"], 3, steps=4)
+    assert "flow matching" in repr(model)
+    assert (tuple(plans.states.shape), list(model.evaluate(plans, "wave upwards"))) == ((3, 32, 2), ["accuracy"])
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_model(offered: None) -> None:
     for name in ("first", "second"):
-        run(
-            installed,
-            "-m",
-            "ftl_lightning",
-            "fit",
-            "--config=flow.yaml",
-            *SMALL,
-            *FIT,
-            "--trainer.max_steps=20",
-            f"--model.output={name}",
-        )
-        hashes.append(json.loads(Path(name, "config.json").read_text())["hash"])
-    assert hashes[0] == hashes[1]
+        succeed(*FIT, f"--model.output={name}")
+    first, second = (json.loads(Path(name, "config.json").read_text())["hash"] for name in ("first", "second"))
+    assert first == second
 
 
 def test_the_example_is_small() -> None:

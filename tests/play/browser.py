@@ -1,5 +1,6 @@
 """A real browser that does on the page what a person does: draws, drags, steers, types."""
 
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,52 +14,67 @@ from selenium.webdriver.common.actions.interaction import POINTER_MOUSE, POINTER
 from selenium.webdriver.common.actions.pointer_input import PointerInput
 from selenium.webdriver.common.keys import Keys
 
-OPTIONS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-)
-CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
+OPTIONS = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"]
+OPTIONS += ["--disable-background-networking", "--disable-component-update", "--hide-scrollbars"]
+PATIENCE = 120.0
+"""Seconds that anything may take before a test fails."""
+TOLD = "(document.getElementById('error-text') || document.body).textContent"
+"""What is said on a page if it is one of the program's."""
 Point = tuple[float, float]
+
+
+def installed() -> bool:
+    """Whether there is a browser, and the program that drives it."""
+    return bool(_program() and shutil.which("chromedriver"))
+
+
+def _program() -> str | None:
+    return next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
 
 
 @contextmanager
 def browser(folder: Path, width: int = 1280, height: int = 900, dark: bool = False) -> Iterator["Browser"]:
-    """A browser with a profile of its own in a folder."""
+    """A browser whose profile and downloads are in a folder."""
     options = webdriver.ChromeOptions()
-    options.binary_location = str(CHROMIUM)
+    options.binary_location = str(_program())
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    downloads = folder / "downloads"
+    options.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
     for option in (*OPTIONS, f"--user-data-dir={folder / 'profile'}", f"--window-size={width},{height}"):
         options.add_argument(option)
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(str(DRIVER)))
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(shutil.which("chromedriver")))
     try:
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
-        yield Browser(driver)
+        driver.set_script_timeout(PATIENCE)
+        found = Browser(driver, downloads)
+        found.window(width, height, dark)
+        yield found
     finally:
         driver.quit()
 
 
 class Browser:
-    """What a person does, and sees."""
+    """What a person does, and sees.
 
-    def __init__(self, driver: webdriver.Chrome) -> None:
-        self.driver = driver
+    Attributes:
+        downloads: folder of what a page gives to be saved.
+        pause: seconds between two looks at what is waited for.
+    """
 
-    def open(self, address: str) -> float:
-        """Open a page; returns the seconds until it has drawn its first state."""
-        begin = time.monotonic()
+    def __init__(self, driver: webdriver.Chrome, downloads: Path) -> None:
+        self.driver, self.downloads, self.pause = driver, downloads, 0.02
+
+    def window(self, width: int = 1280, height: int = 900, dark: bool = False) -> None:
+        """Be a screen of another size, or a phone."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+
+    def open(self, address: str) -> None:
+        """Open a page of the program, and wait until it has drawn its first state."""
+        self.errors()  # of the page before
         self.driver.get(address)
         self.until(lambda: self.data("ready"))
-        return time.monotonic() - begin
 
     def js(self, script: str, *arguments: Any) -> Any:
         """What a script returns."""
@@ -68,18 +84,21 @@ class Browser:
         """A word that the page says of itself, for those who wait."""
         return self.js(f"document.body.dataset.{name} || ''")
 
-    def until(self, what: Callable[[], Any], seconds: float = 60.0) -> float:
-        """Wait until something is so; returns how long it took.
+    def until(self, what: Callable[[], Any], seconds: float = PATIENCE) -> None:
+        """Wait until something is so.
 
         Raises:
             AssertionError: if it takes too long, with what the page says.
         """
         begin = time.monotonic()
         while not what():
-            told = self.text("error-text") if self.js("Boolean(document.getElementById('error-text'))") else ""
-            assert time.monotonic() - begin < seconds, f"waited {seconds} s; the page says {told!r}"
-            time.sleep(0.02)
-        return time.monotonic() - begin
+            if time.monotonic() - begin > seconds:
+                raise AssertionError(f"waited {seconds} s; the page says {self.js(TOLD)!r}")
+            time.sleep(self.pause)
+
+    def sampled(self, before: int = 0) -> None:
+        """Wait until there are samples, after so many sets of them."""
+        self.until(lambda: int(self.data("samples") or 0) > before)
 
     def text(self, name: str) -> str:
         """Of an element by its id."""
@@ -101,17 +120,16 @@ class Browser:
             "((one) => { one.scrollIntoView({block: 'center'}); const box = one.getBoundingClientRect();"
             " return [box.left, box.top, box.width, box.height]; })(document.querySelector(arguments[0]))"
         )
-        left, top, width, height = self.js(script, selector)
-        return left, top, width, height
+        return tuple(self.js(script, selector))
 
     def drag(self, points: Sequence[Point], touch: bool = False, milliseconds: int = 8) -> None:
         """Press at the first of some places in the window, go through all, and let go."""
         pointer = PointerInput(POINTER_TOUCH if touch else POINTER_MOUSE, "finger" if touch else "mouse")
         actions = ActionBuilder(self.driver, mouse=pointer, duration=milliseconds)
-        first, *rest = points
-        actions.pointer_action.move_to_location(round(first[0]), round(first[1])).pointer_down()
-        for x, y in rest:
+        for number, (x, y) in enumerate(points):
             actions.pointer_action.move_to_location(round(x), round(y))
+            if number == 0:
+                actions.pointer_action.pointer_down()
         actions.pointer_action.pointer_up()
         actions.perform()
 

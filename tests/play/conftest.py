@@ -1,18 +1,43 @@
-"""One server for the tests of a module."""
+"""What the tests of the page share: one browser for a process, and one server for a module."""
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.play.served import Served, served
+from ftl_lightning.learning.inversion_settings import PAPER
+from ftl_lightning.play.workspace import Workspace
+from tests.play.served import Served, here
+
+if TYPE_CHECKING:
+    from tests.play.browser import Browser
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Browser]":
+    """A browser, which opens a page after the other."""
+    pytest.importorskip("selenium", reason="selenium is not installed")
+    from tests.play.browser import browser, installed
+
+    if not installed():
+        pytest.skip("needs Chromium and its driver")
+    with browser(tmp_path_factory.mktemp("chromium")) as found:
+        found.pause = 0.1
+        yield found
 
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """The page of object rearrangement, whose model ships."""
-    with served(tmp_path_factory.mktemp("played"), ["object_rearrangement"]) as found:
+    with here(tmp_path_factory.mktemp("played"), "play", "object_rearrangement") as found:
         yield found
+
+
+@pytest.fixture
+def learns_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A concept is learned in a few steps, where a test looks at the page and not at the concept."""
+    monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({"form": PAPER}, 20))
 
 
 def files_of(folder: Path) -> set[Path]:

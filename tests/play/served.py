@@ -1,41 +1,49 @@
-"""The program as a person starts it, and questions to it as anybody may send them."""
+"""The program that serves a page, and questions to it as anybody may send them."""
 
 import http.client
 import json
-import os
+import queue
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any
 from urllib.parse import urlsplit
 
-from tests.conftest import ROOT
+import pytest
+
+import ftl_lightning.play.application  # noqa: F401 - before the work of a test is measured
+from ftl_lightning.cli import main
+from ftl_lightning.play import server
+from tests.conftest import environment
+
+PATIENCE = 120.0
+"""Seconds that anything may take before a test fails."""
 
 
 @dataclass
 class Served:
-    """A server that runs.
-
-    Attributes:
-        address: that it printed.
-        folder: where it runs.
-        process: of it.
-        told: lines that it printed.
-        seconds: from the command to the address.
-    """
+    """A server that runs."""
 
     address: str
-    folder: Path
-    process: "subprocess.Popen[str]"
+    """That it printed."""
+    told: list[str]
+    """Lines that it printed."""
+    alive: Callable[[], bool]
+    wait: Callable[[], int]
+    """Waits for its end, and returns its exit code."""
+    stop: Callable[[], object]
+    """Ends it from outside."""
     seconds: float
-    told: list[str] = field(default_factory=list)
+    """From the command to the address."""
 
     @property
     def token(self) -> str:
@@ -46,11 +54,10 @@ class Served:
         return urlsplit(self.address).netloc
 
     def ask(
-        self, method: str, path: str, body: bytes | str | None = None, headers: Mapping[str, str] | None = None, timeout: float = 60
+        self, method: str, path: str, body: bytes | str | None = None, headers: Mapping[str, str] | None = None
     ) -> tuple[int, bytes, Mapping[str, str]]:
         """Status, bytes and headers of an answer; headers that are given take the place of the usual ones."""
-        name, _, port = self.host.partition(":")
-        connection = http.client.HTTPConnection(name, int(port), timeout=timeout)
+        connection = http.client.HTTPConnection(*self._at, timeout=PATIENCE)
         try:
             connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
             usual = {"Host": self.host, "X-Token": self.token, "Content-Type": "application/json"}
@@ -66,53 +73,105 @@ class Served:
         finally:
             connection.close()
 
+    @property
+    def _at(self) -> tuple[str, int]:
+        name, _, port = self.host.partition(":")
+        return name, int(port)
+
+    def send(self, sent: bytes, first: bool = False) -> None:
+        """Send bytes that need not be a question, and read what comes until the server hangs up, or its first bytes."""
+        with socket.create_connection(self._at, timeout=PATIENCE) as connection:
+            connection.sendall(sent)
+            if first:
+                assert connection.recv(1000)
+                return
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(65536):
+                pass
+
     def get(self, path: str) -> Any:
-        status, content, _ = self.ask("GET", path)
-        assert status == 200, content
-        return json.loads(content)
+        return json.loads(self._content("GET", path))
 
     def post(self, path: str, asked: Any) -> Any:
-        status, content, _ = self.ask("POST", path, json.dumps(asked))
-        assert status == 200, content
-        return json.loads(content)
+        return json.loads(self._content("POST", path, json.dumps(asked)))
 
     def learn(self, name: str) -> list[Any]:
         """The lines that learning tells."""
-        status, content, _ = self.ask("POST", "/api/learn", json.dumps({"name": name}), timeout=300)
-        assert status == 200
-        return [json.loads(line) for line in content.decode().splitlines()]
+        return [json.loads(line) for line in self._content("POST", "/api/learn", json.dumps({"name": name})).splitlines()]
 
-    def alive(self) -> bool:
-        return self.process.poll() is None
+    def _content(self, method: str, path: str, body: str | None = None) -> bytes:
+        status, content, _ = self.ask(method, path, body)
+        assert status == 200, content
+        return content
+
+
+@contextmanager
+def here(folder: Path, *arguments: str) -> Iterator[Served]:
+    """Run a verb in a thread of this process, in a folder, until the block ends: all of the program but its start."""
+    begin, told, ended = monotonic(), list[str](), list[int]()
+    lines = queue.SimpleQueue[str]()
+
+    def say(*parts: object, error: bool = False) -> None:
+        for one in " ".join(map(str, parts)).splitlines():
+            told.append(one)
+            lines.put(one)
+
+    def run() -> None:
+        ended.append(main([*arguments, "--browser", "false", "--port", "0"]))
+        lines.put(f"ended with {ended}")
+
+    def wait() -> int:
+        thread.join(PATIENCE)
+        return ended[0]
+
+    thread = threading.Thread(target=run, daemon=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, "say", say)
+        patch.setenv("XDG_DATA_HOME", str(folder / "data"))  # no concepts of the person who runs the tests
+        patch.chdir(folder)
+        thread.start()
+        address = lines.get(timeout=PATIENCE).removeprefix("open ")
+        assert address.startswith("http"), address
+        found = Served(address, told, thread.is_alive, wait, lambda: found.post("/api/end", {}), monotonic() - begin)
+        try:
+            yield found
+        finally:
+            if thread.is_alive():
+                found.stop()
+            assert wait() == 0
 
 
 @contextmanager
 def served(folder: Path, arguments: Sequence[str], verb: str = "play") -> Iterator[Served]:
-    """Run the program in a folder until the block ends."""
+    """Run the program as a person starts it, in a folder, until the block ends."""
     begin = monotonic()
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "XDG_DATA_HOME": str(folder / "share"), "PYTHONPATH": str(ROOT)}
+    variables = environment(XDG_DATA_HOME=str(folder / "share"))
     command = [sys.executable, "-m", "ftl_lightning", verb, *arguments, "--browser", "false", "--port", "0"]
-    process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(command, cwd=folder, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
-    told: list[str] = []
-    address = ""
+    told, address = list[str](), ""
     for line in process.stdout:
-        told.append(line)
-        if found := re.match(r"open (http://\S+)", line):
-            address = found[1]
+        told.append(line.rstrip("\n"))
+        if match := re.match(r"open (http://\S+)", line):
+            address = match[1]
             break
-    assert address, "".join(told)
-    one = Served(address, folder, process, monotonic() - begin, told)
-    reader = threading.Thread(target=lambda: told.extend(process.stdout or ()), daemon=True)
+    assert address, told
+    reader = threading.Thread(target=lambda: told.extend(line.rstrip("\n") for line in process.stdout or ()), daemon=True)
     reader.start()
+
+    def wait() -> int:
+        code = process.wait(PATIENCE)
+        reader.join(PATIENCE)
+        return code
+
+    stop = partial(process.send_signal, signal.SIGINT)
     try:
-        yield one
+        yield Served(address, told, lambda: process.poll() is None, wait, stop, monotonic() - begin)
     finally:
         if process.poll() is None:
-            process.send_signal(signal.SIGINT)
+            stop()
             try:
-                process.wait(20)
+                wait()
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        reader.join(5)

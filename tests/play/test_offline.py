@@ -1,18 +1,21 @@
 """Pages that need no program."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from ftl_lightning.cli import main
 from ftl_lightning.errors import UserError
 from ftl_lightning.play.offline import COUNT, WEIGHTS, answers_of, pairs_of
 from ftl_lightning.play.workspace import Workspace
-from tests.conftest import refused
-from tests.play.browser import DRIVER, browser
+from tests.conftest import Once, refused, succeed
+
+if TYPE_CHECKING:
+    from tests.play.browser import Browser
 
 CONCEPTS = [{"id": f"t{number}", "kind": "training", "name": f"text {number}"} for number in range(6)]
 LEARNED = [{"id": "l1", "kind": "learned", "name": "mine"}, {"id": "s1", "kind": "shipped", "name": "theirs"}]
+TASK = "square diagonal to triangle"
 
 
 def test_learned_concepts_are_mixed_with_known_ones_and_one_another() -> None:
@@ -23,6 +26,7 @@ def test_learned_concepts_are_mixed_with_known_ones_and_one_another() -> None:
         pairs_of(CONCEPTS, [("text 5", "nobody")])
 
 
+@pytest.mark.slow
 def test_every_choice_has_an_answer() -> None:
     answers = answers_of(Workspace("object_rearrangement"), [("circle above square", "circle right of square")])
     samples = [answer for name, answer in answers.items() if name.startswith("/api/sample ")]
@@ -32,27 +36,42 @@ def test_every_choice_has_an_answer() -> None:
     assert [one["name"] for one in state["concepts"]] == ["circle right of square", "circle above square"]
 
 
-def test_the_page_moves_its_sliders_without_a_program(tmp_path: Path) -> None:
-    assert (
-        main(["generate", "object_rearrangement", "--task", "square diagonal to triangle", "--count", "3", "--out", "a.npz"]) == 0
-    )
-    assert main(["play", "object_rearrangement", "--demonstrations", "a.npz", "--static", "site"]) == 0
-    first = (tmp_path / "site" / "object_rearrangement.html").read_bytes()
-    if not DRIVER.exists():
-        pytest.skip("needs Chromium and its driver")
-    with browser(tmp_path) as page:
-        page.open((tmp_path / "site" / "object_rearrangement.html").as_uri())
-        page.until(lambda: int(page.data("samples") or 0) > 0)
-        assert page.count("#slots canvas") == 3
-        assert page.count("#show") == 0
-        before = int(page.data("samples"))
-        find = "document.querySelector('#mix input[type=range]')"
-        page.js(f"({find}.value = 0.5, {find}.dispatchEvent(new Event('input', {{bubbles: true}})))")
-        page.until(lambda: int(page.data("samples")) > before)
-        assert not page.text("error-text")
-        assert not page.errors()
-    assert main(["play", "object_rearrangement", "--demonstrations", "a.npz", "--static", "site"]) == 0
-    assert (tmp_path / "site" / "object_rearrangement.html").read_bytes() == first
+@pytest.fixture
+def written(once: Once) -> Path:
+    """A folder with a page of demonstrations and a pair of concepts: what is learned from them, and a training concept."""
+
+    def write(folder: Path) -> None:
+        succeed("generate", "object_rearrangement", "--task", TASK, "--count", "3", "--out", "a.npz")
+        succeed(*STATIC, "--static", "site")
+
+    return once("page_without_program", write)
+
+
+STATIC = ("play", "object_rearrangement", "--demonstrations", "a.npz")
+STATIC += ("--pairs", f'["{TASK} + circle above square"]')
+
+
+@pytest.mark.slow
+def test_the_same_page_is_written_again(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(written)
+    succeed(*STATIC, "--static", "again")
+    first, again = ((written / name / "object_rearrangement.html").read_bytes() for name in ("site", "again"))
+    assert first == again
+
+
+@pytest.mark.browser
+def test_the_page_moves_its_sliders_without_a_program(written: Path, chromium: "Browser") -> None:
+    page = chromium
+    page.open((written / "site" / "object_rearrangement.html").as_uri())
+    page.sampled()
+    assert page.count("#slots canvas") == 3
+    assert page.count("#show") == 0
+    before = int(page.data("samples"))
+    find = "document.querySelector('#mix input[type=range]')"
+    page.js(f"({find}.value = 0.5, {find}.dispatchEvent(new Event('input', {{bubbles: true}})))")
+    page.sampled(before)
+    assert not page.text("error-text")
+    assert not page.errors()
 
 
 def test_mistakes_are_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

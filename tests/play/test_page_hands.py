@@ -1,6 +1,5 @@
 """The page in the hands of a person: pointer and keys together, demonstrations that look wrong, learned concepts."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,10 +9,10 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 
 from selenium.webdriver.common.keys import Keys
 
-from tests.play.browser import DRIVER, Browser, browser
-from tests.play.served import served
+from tests.play.browser import Browser
+from tests.play.served import here
 
-pytestmark = pytest.mark.skipif(not DRIVER.exists() or not shutil.which("chromium"), reason="needs Chromium and its driver")
+pytestmark = [pytest.mark.browser, pytest.mark.usefixtures("learns_fast")]
 
 TAP = """((key) => {
   for (const kind of ["keydown", "keyup"])
@@ -23,21 +22,12 @@ TAP = """((key) => {
 
 
 @pytest.fixture(scope="module")
-def strokes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    folder = tmp_path_factory.mktemp("strokes")
-    with served(folder, ["--pretrained", "strokes"]) as server, browser(folder) as found:
-        found.open(server.address)
-        found.until(lambda: int(found.data("samples") or 0) > 0)
-        yield found
-
-
-@pytest.fixture(scope="module")
-def agent(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    folder = tmp_path_factory.mktemp("agent")
-    with served(folder, ["--pretrained", "agent"]) as server, browser(folder) as found:
-        found.open(server.address)
-        found.until(lambda: int(found.data("samples") or 0) > 0)
-        yield found
+def strokes(tmp_path_factory: pytest.TempPathFactory, chromium: Browser) -> Iterator[Browser]:
+    with here(tmp_path_factory.mktemp("strokes"), "play", "--pretrained", "strokes") as server:
+        chromium.window()
+        chromium.open(server.address)
+        chromium.sampled()
+        yield chromium
 
 
 def stroke(page: Browser, bend: float = 0.0, touch: bool = False) -> None:
@@ -58,7 +48,7 @@ def cleared(page: Browser) -> None:
 
 def learned(page: Browser) -> None:
     """Wait until something is learned from what is there."""
-    page.until(lambda: page.js("Boolean(justLearned())"))
+    page.until(lambda: page.js("justLearned()"))
 
 
 def test_the_first_stroke_moves_nothing(strokes: Browser) -> None:
@@ -100,27 +90,6 @@ def test_a_short_tap_moves_the_pen(strokes: Browser) -> None:
     strokes.click("pen-keys")
 
 
-def test_a_short_tap_steers(agent: Browser) -> None:
-    agent.until(lambda: agent.js("recorder.scene !== null"))
-    agent.js("document.activeElement.blur()")
-    before = agent.js("recorder.at[0]")
-    agent.js(TAP, "ArrowLeft")
-    assert agent.js("recorder.at[0][0]") < before[0]
-    assert agent.js("recorder.path.length") == 2
-    for _ in range(15):
-        agent.js(TAP, "ArrowLeft")
-    agent.click("keep")
-    assert agent.js("document.activeElement.id") == "show"
-    agent.until(lambda: agent.count("#slots canvas") == 1 and agent.js("!recorder.busy && recorder.scene !== null"))
-    agent.js(TAP, "d")
-    assert agent.js("recorder.path.length") == 2
-    agent.click("scene")
-    agent.until(lambda: agent.js("recorder.path.length") == 0)
-    agent.js(TAP, "ArrowUp")
-    assert agent.js("recorder.path.length") == 2
-    assert not agent.errors()
-
-
 def test_learning_waits_where_a_demonstration_looks_wrong(strokes: Browser) -> None:
     cleared(strokes)
     for bend in (0.3, 0.28, 0.31, 0.29):
@@ -135,47 +104,77 @@ def test_learning_waits_where_a_demonstration_looks_wrong(strokes: Browser) -> N
     assert strokes.text("waiting").startswith("Learning starts by itself")
 
 
+@pytest.fixture
+def page(request: pytest.FixtureRequest, tmp_path: Path, chromium: Browser) -> Iterator[Browser]:
+    """The page of a model, as nobody has used it."""
+    with here(tmp_path, "play", request.param) as server:
+        chromium.window()
+        chromium.open(server.address)
+        chromium.sampled()
+        yield chromium
+
+
+@pytest.mark.parametrize("page", ["agent"], indirect=True)
+def test_a_short_tap_steers(page: Browser) -> None:
+    page.until(lambda: page.js("recorder.scene !== null"))
+    page.js("document.activeElement.blur()")
+    before = page.js("recorder.at[0]")
+    page.js(TAP, "ArrowLeft")
+    assert page.js("recorder.at[0][0]") < before[0]
+    assert page.js("recorder.path.length") == 2
+    for _ in range(15):
+        page.js(TAP, "ArrowLeft")
+    page.click("keep")
+    assert page.js("document.activeElement.id") == "show"
+    page.until(lambda: page.count("#slots canvas") == 1 and page.js("!recorder.busy && recorder.scene !== null"))
+    page.js(TAP, "d")
+    assert page.js("recorder.path.length") == 2
+    page.click("scene")
+    page.until(lambda: page.js("recorder.path.length") == 0)
+    page.js(TAP, "ArrowUp")
+    assert page.js("recorder.path.length") == 2
+    assert not page.errors()
+
+
 YOURS = "state.concepts.filter((one) => one.kind === 'learned').map((one) => one.name)"
 WEIGHTS = """[...document.querySelectorAll('#mix li')].map(
   (one) => [one.querySelector('.name').textContent, one.querySelector('input').value])"""
 
 
-def test_what_is_learned_is_mixed_forgotten_and_renamed(tmp_path: Path) -> None:
-    with served(tmp_path, ["strokes"]) as server, browser(tmp_path) as page:
-        page.open(server.address)
-        page.until(lambda: int(page.data("samples") or 0) > 0)
-        for bend in (0.3, 0.28, 0.31, 0.29, 0.305):
-            stroke(page, bend)
-        learned(page)
-        # Alone in the mix; a second one beside it, half and half.
-        assert page.js(WEIGHTS) == [["my stroke 1", "1"]]
-        assert page.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
-        page.click("learn")  # again, from the same
-        page.until(lambda: page.js("justLearned() && learning.concept.name === 'my stroke 2'"))
-        assert page.js(WEIGHTS) == [["my stroke 1", "0.5"], ["my stroke 2", "0.5"]]
-        assert page.js("find('name').value") == "my stroke 2"
-        # Forgotten.
-        assert page.js(YOURS) == ["my stroke 1", "my stroke 2"]
-        button = page.driver.find_element("css selector", "button[aria-label='Forget my stroke 2']")
-        page.js("arguments[0].scrollIntoView({ block: 'center' })", button)
-        page.until(lambda: page.js("!mix.fetching && !mix.asking"))  # nothing is on its way of what is forgotten
-        button.click()
-        page.until(lambda: page.js(YOURS) == ["my stroke 1"])
-        assert page.count("#mix li") == 1
-        assert page.count("#learned") == page.count("#samples canvas") == 0
-        assert page.text("error-text") == ""
-        assert page.js("find('name').value") == "my stroke 2"  # the next one's
-        # Called otherwise.
-        page.click("learn")
-        learned(page)
-        assert page.count("#rename") == 0
-        page.js("(find('name').value = '', find('name').focus())")
-        page.press("bow")
-        assert page.count("#rename") == 1
-        page.press(Keys.ENTER)
-        page.until(lambda: "bow" in page.js("state.concepts.map((one) => one.name)"))
-        page.until(lambda: "bow" in page.text("mix-name"))
-        assert page.text("waiting").startswith("Learned “bow” in")
-        assert page.count("button[aria-label='Forget bow']") == 1
-        assert page.count("#rename") == 0
-        assert page.errors() == []
+@pytest.mark.parametrize("page", ["strokes"], indirect=True)
+def test_what_is_learned_is_mixed_forgotten_and_renamed(page: Browser) -> None:
+    for bend in (0.3, 0.28, 0.31, 0.29, 0.305):
+        stroke(page, bend)
+    learned(page)
+    # Alone in the mix; a second one beside it, half and half.
+    assert page.js(WEIGHTS) == [["my stroke 1", "1"]]
+    assert page.js("document.querySelector('#concepts .pick .about').textContent").startswith("5 demonstrations · ")
+    page.click("learn")  # again, from the same
+    page.until(lambda: page.js("justLearned() && learning.concept.name === 'my stroke 2'"))
+    assert page.js(WEIGHTS) == [["my stroke 1", "0.5"], ["my stroke 2", "0.5"]]
+    assert page.js("find('name').value") == "my stroke 2"
+    # Forgotten.
+    assert page.js(YOURS) == ["my stroke 1", "my stroke 2"]
+    button = page.driver.find_element("css selector", "button[aria-label='Forget my stroke 2']")
+    page.js("arguments[0].scrollIntoView({ block: 'center' })", button)
+    page.until(lambda: page.js("!mix.fetching && !mix.asking"))  # nothing is on its way of what is forgotten
+    button.click()
+    page.until(lambda: page.js(YOURS) == ["my stroke 1"])
+    assert page.count("#mix li") == 1
+    assert page.count("#learned") == page.count("#samples canvas") == 0
+    assert page.text("error-text") == ""
+    assert page.js("find('name').value") == "my stroke 2"  # the next one's
+    # Called otherwise.
+    page.click("learn")
+    learned(page)
+    assert page.count("#rename") == 0
+    page.js("(find('name').value = '', find('name').focus())")
+    page.press("bow")
+    assert page.count("#rename") == 1
+    page.press(Keys.ENTER)
+    page.until(lambda: "bow" in page.js("state.concepts.map((one) => one.name)"))
+    page.until(lambda: "bow" in page.text("mix-name"))
+    assert page.text("waiting").startswith("Learned “bow” in")
+    assert page.count("button[aria-label='Forget bow']") == 1
+    assert page.count("#rename") == 0
+    assert page.errors() == []

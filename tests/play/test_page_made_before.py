@@ -4,10 +4,8 @@ import base64
 import gzip
 import json
 import re
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -17,6 +15,9 @@ from ftl_lightning.domains.line_plots import path_film
 from ftl_lightning.evaluation.films import packed
 from ftl_lightning.play.page import page, request_key
 from ftl_lightning.testing.strokes import strokes
+
+if TYPE_CHECKING:
+    from tests.play.browser import Browser
 
 NONCE = "abc123"
 WEIGHTS = [0, 0.5, 1, 1.5]
@@ -42,9 +43,8 @@ def body(height: float) -> Json:
 
 def state(**other: Any) -> Json:
     about = {"kind": "training", "count": None, "form": "", "accuracy": None, "hash": "0" * 16}
-    shown = [
-        {"id": number, "film": line(stroke), "flags": ["It is short."]} for number, stroke in enumerate(strokes("heart", 5, 0))
-    ]
+    flags = ["It is short."]
+    shown = [{"id": number, "film": line(stroke), "flags": flags} for number, stroke in enumerate(strokes("heart", 5, 0))]
     same = {"python": "", "command": ""}
     return {
         "title": "strokes",
@@ -72,16 +72,9 @@ def made_before() -> Json:
         for b in WEIGHTS:
             parts = [{"id": name, "weight": float(weight), "groups": []} for name, weight in (("c0", a), ("c1", b))]
             asked = {"parts": parts, "count": 8, "seed": 0, "temperature": TEMPERATURE, "execute": False, "task": ""}
-            films = [
-                line(a * first + b * second + 0.01, right=number % 2 == 0)
-                for number, (first, second) in enumerate(zip(one, other, strict=True))
-            ]
-            told = {
-                "samples": films,
-                "told": f"{a} and {b}",
-                "seconds": 0.0,
-                "same": {"python": f"{a} * line", "command": "sample"},
-            }
+            films = [line(path, right=number % 2 == 0) for number, path in enumerate(a * one + b * other + 0.01)]
+            same = {"python": f"{a} * line", "command": "sample"}
+            told = {"samples": films, "told": f"{a} and {b}", "seconds": 0.0, "same": same}
             answers[request_key("/api/sample", asked)] = told
     return answers
 
@@ -90,54 +83,30 @@ def packed_page(answers: Json) -> str:
     return page(NONCE, gzip.compress(json.dumps(answers).encode(), mtime=0))
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    program, driver = (shutil.which("chromium") or shutil.which("google-chrome")), shutil.which("chromedriver")
-    if program is None or driver is None:
-        pytest.skip("no chromium with chromedriver is installed, so that the page is not tested in a browser")
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = program
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"):
-        options.add_argument(argument)
-    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('profile')}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    found = webdriver.Chrome(options=options, service=Service(driver))
-    yield found
-    found.quit()
-
-
 HELP = """
 const done = arguments[0], told = {};
 const pause = (time) => new Promise((then) => setTimeout(then, time));
-const until = async (what) => { for (let waited = 0; waited < 200 && !what(); waited++) await pause(25); };
+const until = async (what) => { for (let waited = 0; waited < 4800 && !what(); waited++) await pause(25); };
 const texts = (where) => [...document.querySelectorAll(where)].map((one) => one.textContent);
 const pictures = (where) => [...document.querySelectorAll(where)].map((one) => one.toDataURL()).join();
 const put = (where, value) => { where.value = value; where.dispatchEvent(new Event("input")); };
 """
 
 
-def asked(browser: Any, text: str, folder: Path, script: str, width: int = 1280) -> Json:
+def asked(page: "Browser", text: str, folder: Path, script: str, width: int = 1280) -> Json:
     """What a script tells of a page, which is as wide as its window, loads nothing and has no mistakes."""
     path = folder / "page.html"
     path.write_text(text, encoding="utf-8")
-    metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    browser.get(path.as_uri())
+    page.window(width)
+    page.driver.get_log("browser")  # of the page before
+    page.driver.get(path.as_uri())
     whole = f"(async () => {{ await until(() => document.body.dataset.ready); {script} }})()"
-    run = f"{HELP} {whole}.then(() => done(told), (error) => done(String(error)));"
-    told = browser.execute_async_script(run)
+    told = page.driver.execute_async_script(f"{HELP} {whole}.then(() => done(told), (error) => done(String(error)));")
     assert isinstance(told, dict), told
-    assert browser.execute_script("return document.documentElement.scrollWidth - innerWidth") <= 0
-    assert (
-        browser.execute_script("return performance.getEntriesByType('resource').filter((one) => !one.name.startsWith('data:'))")
-        == []
-    )
-    assert browser.get_log("browser") == []
-    told["error"] = browser.execute_script("return find('error-text').textContent")
-    return told
+    assert page.js("document.documentElement.scrollWidth - innerWidth") <= 0
+    assert page.js("performance.getEntriesByType('resource').filter((one) => !one.name.startsWith('data:'))") == []
+    assert page.driver.get_log("browser") == []
+    return told | {"error": page.text("error-text")}
 
 
 def test_the_page_is_whole_and_names_no_address() -> None:
@@ -148,10 +117,7 @@ def test_the_page_is_whole_and_names_no_address() -> None:
         assert " style=" not in text  # which the policy forbids
     assert "Content-Security-Policy" not in page(NONCE)
     assert "default-src 'none'; script-src 'nonce-abc123'" in packed_page({})
-
-
-def test_what_is_put_into_the_page_is_not_looked_at_again() -> None:
-    assert '<style nonce="%SCRIPT%">' in page("%SCRIPT%")
+    assert '<style nonce="%SCRIPT%">' in page("%SCRIPT%")  # what is put into the page is not looked at again
 
 
 def test_the_name_of_a_request_is_that_of_the_page() -> None:
@@ -162,8 +128,9 @@ def test_the_name_of_a_request_is_that_of_the_page() -> None:
     )
 
 
+@pytest.mark.browser
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_page_made_before_shows_samples_of_pairs(browser: Any, tmp_path: Path, width: int) -> None:
+def test_a_page_made_before_shows_samples_of_pairs(chromium: "Browser", tmp_path: Path, width: int) -> None:
     script = """
       await until(() => document.body.dataset.samples);
       told.samples = Number(document.body.dataset.samples);
@@ -197,47 +164,36 @@ def test_a_page_made_before_shows_samples_of_pairs(browser: Any, tmp_path: Path,
       told.large = find("large").open;
       find("large-close").click();
     """
-    told = asked(browser, packed_page(made_before()), tmp_path, script, width)
-    assert told["error"] == ""
-    assert told["samples"] == 1
+    told = asked(chromium, packed_page(made_before()), tmp_path, script, width)
     assert told["ready"] > 0
-    assert told["hidden"] == ["canvas", "learning", "ways", "sampling"]
-    assert told["slots"] == 5
-    assert told["check"][0] == "⚠ Demonstration 1: It is short."
-    assert told["check"][-1] == "They are much alike."
-    assert told["mix"] == ["line", "arc"]
-    assert told["marks"] == ["✓ right", "✗ wrong"] * 4
-    assert told["weights"] == ["1.50", "1.00"]  # the nearest of those that there are
-    assert told["said"] == "1.5 and 1"
-    assert told["python"] == "1.5 * line"
-    assert told["other"]
-    assert told["same"]  # exchanged in place, so that nothing flickers
-    assert told["later"] == 2
-    assert told["moved"]
-    assert not told["playing"]
-    assert told["alone"] == [False, False, True]
+    assert (told["check"][0], told["check"][-1]) == ("⚠ Demonstration 1: It is short.", "They are much alike.")
+    shown = {"error": "", "samples": 1, "hidden": ["canvas", "learning", "ways", "sampling"], "slots": 5, "mix": ["line", "arc"]}
+    shown |= {"marks": ["✓ right", "✗ wrong"] * 4, "said": "1.5 and 1", "python": "1.5 * line", "later": 2, "large": True}
+    shown |= {"weights": ["1.50", "1.00"]}  # the nearest of those that there are
+    shown |= {"other": True, "same": True}  # exchanged in place, so that nothing flickers
+    shown |= {"moved": True, "playing": False, "alone": [False, False, True]}
+    assert {name: told[name] for name in shown} == shown
     assert width < 1000 or told["thumbnails"] == 3
-    assert told["large"]
 
 
-def test_a_request_that_has_no_answer_is_told_and_breaks_nothing(browser: Any, tmp_path: Path) -> None:
-    answers = made_before()
+@pytest.mark.browser
+def test_a_request_that_has_no_answer_is_told_and_breaks_nothing(chromium: "Browser", tmp_path: Path) -> None:
+    answers = {name: one for name, one in made_before().items() if '"weight":0.5' not in name}
     script = """
       await until(() => document.body.dataset.samples);
       put(document.querySelector("#mix input"), 0.5);
       await until(() => !find("error").hidden);
       told.films = texts("#mixed figure").length;
     """
-    told = asked(browser, packed_page({name: one for name, one in answers.items() if '"weight":0.5' not in name}), tmp_path, script)
+    told = asked(chromium, packed_page(answers), tmp_path, script)
     assert "no samples of this choice" in told["error"]
     assert told["films"] == 8
 
 
-def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(browser: Any, tmp_path: Path) -> None:
-    hearts = [
-        {"film": line(stroke), "label": str(number), "flags": ["It is short."]}
-        for number, stroke in enumerate(strokes("heart", 3, 0))
-    ]
+@pytest.mark.browser
+def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(chromium: "Browser", tmp_path: Path) -> None:
+    flags = ["It is short."]
+    hearts = [{"film": line(stroke), "label": str(number), "flags": flags} for number, stroke in enumerate(strokes("heart", 3, 0))]
     poles = [{"film": body(1 + 0.2 * number), "label": str(number), "flags": []} for number in range(2)]
     groups = [{"concept": "heart", "films": hearts}, {"concept": "pole", "films": poles}]
     viewer = {"title": "five.npz", "told": ["Two concepts."], "groups": groups}
@@ -262,13 +218,8 @@ def test_a_viewer_filters_films_lays_them_over_each_other_and_turns_bodies(brows
       told.one = concepts();
       told.left = films.size;
     """
-    told = asked(browser, packed_page({"/api/state": state(viewer=viewer, offline=None)}), tmp_path, script)
-    assert told["error"] == ""
-    assert not told["play"]
-    assert told["concepts"] == ["heart, 3 films", "pole, 2 films"]
-    assert told["flags"] == [f"⚠ {number}: It is short." for number in range(3)]
-    assert (told["canvases"], told["over"]) == (5, 2)
-    assert told["turned"]
-    assert told["fewer"] == ["pole, 2 films"]
-    assert told["one"] == ["pole, 1 film"]
-    assert told["left"] == 1  # films that are not shown are not kept
+    told = asked(chromium, packed_page({"/api/state": state(viewer=viewer, offline=None)}), tmp_path, script)
+    shown = {"error": "", "play": False, "concepts": ["heart, 3 films", "pole, 2 films"], "canvases": 5, "over": 2, "turned": True}
+    shown |= {"flags": [f"⚠ {number}: It is short." for number in range(3)], "fewer": ["pole, 2 films"], "one": ["pole, 1 film"]}
+    shown |= {"left": 1}  # films that are not shown are not kept
+    assert told == shown

@@ -1,6 +1,5 @@
 """The page with several models: nothing of one is left with another, and nothing is lost without a question."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,10 +8,11 @@ import pytest
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 
-from tests.play.browser import DRIVER, Browser, browser
-from tests.play.served import Served, served
+from ftl_lightning.play.workspace import Workspace
+from tests.play.browser import Browser
+from tests.play.served import Served, here
 
-pytestmark = pytest.mark.skipif(not DRIVER.exists() or not shutil.which("chromium"), reason="needs Chromium and its driver")
+pytestmark = [pytest.mark.browser, pytest.mark.usefixtures("learns_fast")]
 
 OPENING = """(() => {
   const seen = window.seen = [];
@@ -27,17 +27,22 @@ FILMS = "[...document.querySelectorAll('#concepts .filmed canvas')].map((one) =>
 
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with served(tmp_path_factory.mktemp("several"), []) as found:
+    with here(tmp_path_factory.mktemp("several"), "play") as found:
         yield found
 
 
 @pytest.fixture
-def page(several: Served, tmp_path: Path) -> Iterator[Browser]:
-    with browser(tmp_path) as found:
-        found.open(several.address)
-        found.until(lambda: int(found.data("samples") or 0) > 0)
-        choose(found, "strokes")
-        yield found
+def page(several: Served, chromium: Browser) -> Browser:
+    """All models, of which strokes is open."""
+    several.post("/api/open", {"model": "strokes"})
+    return opened(chromium, several)
+
+
+def opened(page: Browser, server: Served) -> Browser:
+    page.window()
+    page.open(server.address)
+    page.sampled()
+    return page
 
 
 def choose(page: Browser, model: str, wait: bool = True) -> None:
@@ -114,8 +119,10 @@ def test_nothing_of_a_model_is_seen_while_another_one_is_opened(page: Browser) -
     assert not page.errors()
 
 
-def test_learning_is_not_stopped_by_another_model_without_a_question(page: Browser) -> None:
-    page.click("careful")
+def test_learning_is_not_stopped_by_another_model_without_a_question(page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        Workspace, "_settings", lambda self, quick: ({"tolerance": None}, 10**6)
+    )  # steps, which end if they are stopped
     take(page)
     page.until(lambda: page.data("learning") == "yes")
     choose(page, "agent", wait=False)
@@ -126,16 +133,15 @@ def test_learning_is_not_stopped_by_another_model_without_a_question(page: Brows
     assert page.data("learning") == "yes"
     choose(page, "agent", wait=False)
     page.click("sure-yes")
-    page.until(lambda: page.js("state.model.name") == "agent" and page.data("learning") == "no", 120)
+    page.until(lambda: page.js("state.model.name") == "agent" and page.data("learning") == "no")
     page.until(lambda: page.count("#mixed canvas") == 8)
     assert page.count("#samples canvas") == 0
     assert page.text("error-text") == ""
 
 
-def test_the_end_is_asked_for_and_calm(tmp_path: Path) -> None:
-    with served(tmp_path, ["--pretrained", "strokes"]) as server, browser(tmp_path) as page:
-        page.open(server.address)
-        page.until(lambda: int(page.data("samples") or 0) > 0)
+def test_the_end_is_asked_for_and_calm(chromium: Browser, tmp_path: Path) -> None:
+    with here(tmp_path, "play", "--pretrained", "strokes") as server:
+        page = opened(chromium, server)
         take(page)
         page.until(lambda: page.count("#learned") == 1)
         name = page.js("learning.concept.name")
@@ -147,7 +153,7 @@ def test_the_end_is_asked_for_and_calm(tmp_path: Path) -> None:
         page.click("end")
         page.click("sure-yes")
         page.until(lambda: page.count("#ended") == 1)
-        server.process.wait(20)
+        assert server.wait() == 0
         page.js("(performance.clearResourceTimings(), resample(), mix.waiting.push(...mix.cards.values()), thumbnails(), true)")
         page.driver.execute_async_script("setTimeout(arguments[0], 600)")
         assert page.js("performance.getEntriesByType('resource').length") == 0
@@ -156,14 +162,13 @@ def test_the_end_is_asked_for_and_calm(tmp_path: Path) -> None:
         assert page.text("ended") == "The program has ended. You can close this page."
 
 
-def test_what_is_saved_is_not_asked_for(tmp_path: Path) -> None:
-    with served(tmp_path, ["--pretrained", "strokes"]) as server, browser(tmp_path) as page:
-        page.open(server.address)
-        page.until(lambda: int(page.data("samples") or 0) > 0)
+def test_what_is_saved_is_not_asked_for(chromium: Browser, tmp_path: Path) -> None:
+    with here(tmp_path, "play", "--pretrained", "strokes") as server:
+        page = opened(chromium, server)
         take(page)
         page.until(lambda: page.count("#learned") == 1)
         page.click("save")
         page.until(lambda: page.js("learning.unsaved.size") == 0)
         page.click("end")
         page.until(lambda: page.count("#ended") == 1)
-        assert server.process.wait(20) is not None
+        assert server.wait() == 0

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.play.viewer import MOST_SHOWN, holds_results, results_page, viewed
 from ftl_lightning.testing.strokes import strokes
 from tests.conftest import ROOT, refused
-from tests.play.browser import DRIVER, browser
-from tests.play.served import served
+from tests.play.served import here
+
+if TYPE_CHECKING:
+    from tests.play.browser import Browser
 
 
 @pytest.fixture
@@ -46,6 +49,7 @@ def test_samples_are_drawn_as_their_domain_draws(name: str, tmp_path: Path) -> N
     assert ("space" in group["films"][0]["film"]) == (name == "mocap")
 
 
+@pytest.mark.slow
 def test_a_concept_is_shown_by_its_samples_in_words() -> None:
     shown = viewed(str(ROOT / "pretrained" / "mocap" / "jumping_jacks.safetensors"))["viewer"]
     assert "jumping jacks" in shown["told"][0]
@@ -89,12 +93,19 @@ def test_what_is_none_is_refused_before_a_page_is_served(tmp_path: Path, capsys:
     refused(capsys, ["view", "nothing.safetensors", "--browser", "false"], "nothing.safetensors")
 
 
-def test_the_page_shows_them(five: Path, tmp_path: Path) -> None:
-    if not DRIVER.exists():
-        pytest.skip("needs Chromium and its driver")
-    with served(tmp_path, [str(five)], "view") as server, browser(tmp_path) as page:
+@pytest.mark.browser
+def test_the_page_shows_them(five: Path, tmp_path: Path, chromium: "Browser") -> None:
+    with here(tmp_path, "view", str(five)) as server:
+        page = chromium
         page.open(server.address)
         page.until(lambda: page.count("#view-films canvas") == 8)
         page.click("view-over")
         page.until(lambda: page.count("#view-films canvas") == 2)
         assert not page.errors()
+
+
+def test_files_and_results_are_served(five: Path, tmp_path: Path) -> None:
+    with here(tmp_path, "view", str(five)) as server:
+        assert [group["concept"] for group in server.get("/api/state")["viewer"]["groups"]] == ["heart", "circle"]
+    with here(tmp_path, "view", str(ROOT / "results" / "object_rearrangement.csv")) as server:
+        assert b"ftl-lightning: results to watch" in server.ask("GET", f"/?token={server.token}")[1]

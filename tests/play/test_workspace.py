@@ -1,19 +1,23 @@
 """What was done on the page is what Python and the command line do."""
 
 import base64
+import copy
 import json
-import subprocess
-import sys
+import runpy
+import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from ftl_lightning.cli import main
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.errors import UserError
-from ftl_lightning.play import requests
+from ftl_lightning.learning.inversion_settings import PAPER
+from ftl_lightning.play import requests, workspace
 from ftl_lightning.play.films import Json
 from ftl_lightning.play.same import VARIABLES, Learned
 from ftl_lightning.play.workspace import Stopped, Workspace
@@ -21,26 +25,63 @@ from ftl_lightning.testing.more_strokes import drawn
 from tests.conftest import ROOT
 
 TASK = "square diagonal to triangle"
+Taught = tuple[Workspace, list[Json]]
 
 
-@pytest.fixture
-def workspace() -> Workspace:
+STEPS = 150
+"""Of learning in a second or two: enough for most samples to be right."""
+
+
+@pytest.fixture(scope="module")
+def first() -> Workspace:
+    """Object rearrangement, as it is opened."""
     return Workspace("object_rearrangement")
 
 
-def learned(workspace: Workspace, name: str = TASK, count: int = 5) -> tuple[Json, list[Json]]:
-    """The last line that learning tells, and all of them."""
-    workspace.draw(requests.Drawn(TASK, count))
+@pytest.fixture
+def opened(first: Workspace) -> Workspace:
+    return copy.deepcopy(first)
+
+
+@pytest.fixture(scope="module")
+def taught(first: Workspace) -> Taught:
+    """The same after a concept was learned, and what was told; samples are shown once on the way."""
+    changed = copy.deepcopy(first)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, seconds in {"FIRST": 0.0, "EVERY": 1e9, "TOLD": 0.0}.items():
+            patch.setattr(workspace, name, seconds)
+        patch.setattr(Workspace, "_settings", quickly)
+        return changed, learn(changed)
+
+
+def quickly(of: Workspace, quick: bool) -> tuple[dict[str, Any], int]:
+    """Settings of the page, with fewer steps."""
+    return {"form": PAPER}, STEPS
+
+
+@pytest.fixture
+def after(taught: Taught) -> Workspace:
+    return copy.deepcopy(taught[0])
+
+
+@pytest.fixture
+def key(taught: Taught) -> str:
+    """Of the concept that was learned."""
+    return str(taught[1][-1]["concept"]["id"])
+
+
+def learn(of: Workspace, name: str = TASK, count: int = 5) -> list[Json]:
+    """All lines that learning tells."""
+    of.draw(requests.Drawn(TASK, count))
     told: list[Json] = []
-    workspace.learn(requests.Learn(name), told.append, lambda: False)
-    return told[-1], told
+    of.learn(requests.Learn(name), told.append, lambda: False)
+    return told
 
 
-def test_learning_tells_loss_and_samples_as_it_goes(workspace: Workspace) -> None:
-    last, told = learned(workspace)
+def test_learning_tells_loss_and_samples_as_it_goes(taught: Taught) -> None:
+    *_, last = told = taught[1]
     steps = [line["step"] for line in told if "loss" in line]
-    assert steps == sorted(set(steps))
-    assert steps[0] == 1
+    assert steps == [*range(1, len(steps) + 1)]
     assert any("samples" in line and "done" not in line for line in told)
     assert last["done"]
     assert len(last["samples"]) == 8
@@ -51,40 +92,50 @@ def test_learning_tells_loss_and_samples_as_it_goes(workspace: Workspace) -> Non
     assert [one["kind"] for one in last["concepts"]].count("learned") == 1
 
 
-def test_it_is_the_concept_that_python_learns(workspace: Workspace, tmp_path: Path) -> None:
-    last, _ = learned(workspace)
-    key = last["concept"]["id"]
+@pytest.mark.slow
+def test_it_is_the_concept_that_python_learns(after: Workspace, key: str, tmp_path: Path) -> None:
     asked = requests.Sample((requests.Mixed(key, 0.8), requests.Mixed("t0", 1.2)), count=3, seed=2, temperature=0.5)
-    mixed = workspace.sample(asked)
-    name, content = workspace.demonstrations_file(key)
-    (tmp_path / name).write_bytes(content)
+    mixed = after.sample(asked)
+    download(after, key)
     script = mixed["same"]["python"] + "samples.save('samples.safetensors')\nsquare_diagonal_to_triangle.save('own.safetensors')\n"
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"})
-    file, concept = workspace.concept_file(key)
-    (tmp_path / file).write_bytes(concept)
-    own, other = Concept.load(tmp_path / "own.safetensors"), Concept.load(tmp_path / file)
-    assert torch.equal(own.embeddings, other.embeddings)
-    samples = Demonstrations.load(tmp_path / "samples.safetensors")
+    Path("script.py").write_text(script)
+    runpy.run_path("script.py")
+    assert same_numbers(after, key, Path("own.safetensors"))
+    samples = Demonstrations.load("samples.safetensors")
     drawn = [_circle(film) for film in mixed["samples"]]
     assert np.allclose(drawn, samples.states[:, 0, :2].numpy(), atol=2e-3)
 
 
-def test_it_is_the_concept_that_the_commands_learn(workspace: Workspace, tmp_path: Path) -> None:
-    last, _ = learned(workspace)
-    key = last["concept"]["id"]
-    told = workspace.sample(requests.Sample((requests.Mixed(key), requests.Mixed("t0", 0.5)), count=2))["same"]["command"]
-    name, content = workspace.demonstrations_file(key)
-    (tmp_path / name).write_bytes(content)
+@pytest.mark.slow
+def test_it_is_the_concept_that_the_commands_learn(opened: Workspace) -> None:
+    key = learn(opened)[-1]["concept"]["id"]
+    told = opened.sample(requests.Sample((requests.Mixed(key), requests.Mixed("t0", 0.5)), count=2))["same"]["command"]
+    download(opened, key)
     for command in told.splitlines():
-        command = command.replace("python ", f"{sys.executable} ", 1) + (
-            " --evaluation.samples 2 --trainer.enable_progress_bar false" if " invert " in command else ""
-        )
-        subprocess.run(command, check=True, cwd=tmp_path, shell=True, env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"})
-    file, concept = workspace.concept_file(key)
-    (tmp_path / "page.safetensors").write_bytes(concept)
-    own, other = Concept.load(tmp_path / "concepts" / file), Concept.load(tmp_path / "page.safetensors")
-    assert torch.equal(own.embeddings, other.embeddings)
-    assert len(Demonstrations.load(tmp_path / "states.safetensors")) == 2
+        python, option, program, *arguments = shlex.split(command)
+        assert (python, option, program) == ("python", "-m", "ftl_lightning")
+        if arguments[0] == "invert":
+            arguments += ["--evaluation.samples", "2", "--trainer.enable_progress_bar", "false"]
+        assert main(arguments) == 0
+    assert same_numbers(opened, key, Path("concepts") / opened.concept_file(key)[0])
+    assert len(Demonstrations.load("states.safetensors")) == 2
+
+
+def download(of: Workspace, key: str) -> None:
+    """Save the demonstrations that a concept was learned from."""
+    name, content = of.demonstrations_file(key)
+    Path(name).write_bytes(content)
+
+
+def same_numbers(of: Workspace, key: str, path: Path) -> bool:
+    """Whether a file holds the concept that the page has."""
+    return torch.equal(Concept.load(path).embeddings, saved(of, key, Path("page.safetensors")).embeddings)
+
+
+def saved(of: Workspace, key: str, path: Path) -> Concept:
+    """The concept's file."""
+    path.write_bytes(of.concept_file(key)[1])
+    return Concept.load(path)
 
 
 def _circle(film: Json) -> tuple[float, float]:
@@ -94,86 +145,79 @@ def _circle(film: Json) -> tuple[float, float]:
     return left + x * width / 10_000, lower + y * width / 10_000
 
 
-def test_two_learned_concepts_are_mixed(workspace: Workspace) -> None:
-    first, _ = learned(workspace)
-    workspace.clear(requests.Nothing())
-    second, _ = learned(workspace, "another", 3)
-    parts = tuple(requests.Mixed(one["concept"]["id"], 0.5) for one in (first, second))
-    mixed = workspace.sample(requests.Sample(parts, count=2))
+@pytest.mark.slow
+def test_two_learned_concepts_are_mixed(after: Workspace, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Workspace, "_settings", lambda self, quick: ({}, 5))
+    after.clear(requests.Nothing())
+    second = learn(after, "another", 3)[-1]["concept"]["id"]
+    parts = tuple(requests.Mixed(one, 0.5) for one in (key, second))
+    mixed = after.sample(requests.Sample(parts, count=2))
     assert len(mixed["samples"]) == 2
     assert "0.5 * square_diagonal_to_triangle + 0.5 * another" in mixed["same"]["python"]
 
 
-def test_changes_of_demonstrations_can_be_undone(workspace: Workspace) -> None:
-    first = workspace.draw(requests.Drawn(TASK, 3))
+def test_changes_of_demonstrations_can_be_undone(opened: Workspace) -> None:
+    first = opened.draw(requests.Drawn(TASK, 3))
     ids = [one["id"] for one in first["demonstrations"]]
     assert not first["demonstrations"][0]["flags"]
-    fewer = workspace.remove(requests.One(ids[1]))
+    fewer = opened.remove(requests.One(ids[1]))
     assert [one["id"] for one in fewer["demonstrations"]] == [ids[0], ids[2]]
-    assert not workspace.clear(requests.Nothing())["demonstrations"]
-    assert [one["id"] for one in workspace.undo(requests.Nothing())["demonstrations"]] == [ids[0], ids[2]]
-    assert [one["id"] for one in workspace.undo(requests.Nothing())["demonstrations"]] == ids
-    assert not workspace.undo(requests.Nothing())["undo"]
+    assert not opened.clear(requests.Nothing())["demonstrations"]
+    assert [one["id"] for one in opened.undo(requests.Nothing())["demonstrations"]] == [ids[0], ids[2]]
+    assert [one["id"] for one in opened.undo(requests.Nothing())["demonstrations"]] == ids
+    assert not opened.undo(requests.Nothing())["undo"]
 
 
-def test_what_a_check_finds_stands_beside_the_demonstration(workspace: Workspace) -> None:
-    drawn = workspace.draw(requests.Drawn(TASK, 3))
-    _, content = workspace.demonstrations_file("")
+def test_what_a_check_finds_stands_beside_the_demonstration(opened: Workspace) -> None:
+    drawn = opened.draw(requests.Drawn(TASK, 3))
+    _, content = opened.demonstrations_file("")
     assert not any(one["flags"] for one in drawn["demonstrations"])
-    workspace.upload("again.npz", content)
-    assert all(one["flags"] for one in workspace.work()["demonstrations"])
+    opened.upload("again.npz", content)
+    assert all(one["flags"] for one in opened.work()["demonstrations"])
 
 
-def test_another_name_changes_neither_the_numbers_nor_the_code(workspace: Workspace, tmp_path: Path) -> None:
-    last, _ = learned(workspace)
-    key = last["concept"]["id"]
-    before = Concept.load(saved(workspace, key, tmp_path / "before.safetensors"))
-    workspace.rename(requests.Renamed(key, "my  diagonal"))
-    after = Concept.load(saved(workspace, key, tmp_path / "after.safetensors"))
-    assert torch.equal(before.embeddings, after.embeddings)
-    assert (before.origin.name, after.origin.name) == (TASK, "my diagonal")
-    told = workspace.sample(requests.Sample((requests.Mixed(key),), count=1))["same"]
+def test_another_name_changes_neither_the_numbers_nor_the_code(after: Workspace, key: str) -> None:
+    before = saved(after, key, Path("before.safetensors"))
+    after.rename(requests.Renamed(key, "my  diagonal"))
+    renamed = saved(after, key, Path("after.safetensors"))
+    assert torch.equal(before.embeddings, renamed.embeddings)
+    assert (before.origin.name, renamed.origin.name) == (TASK, "my diagonal")
+    told = after.sample(requests.Sample((requests.Mixed(key),), count=1))["same"]
     assert f"my_diagonal = model.learn(Demonstrations.load('my_diagonal.npz'), name={TASK!r}" in told["python"]
     assert "concepts/square_diagonal_to_triangle.safetensors" in told["command"]
     with pytest.raises(UserError, match="found one of the model's"):
-        workspace.rename(requests.Renamed("t0", "mine"))
+        after.rename(requests.Renamed("t0", "mine"))
 
 
-def saved(workspace: Workspace, key: str, path: Path) -> Path:
-    """The concept's file."""
-    path.write_bytes(workspace.concept_file(key)[1])
-    return path
-
-
-def test_files_come_back_as_they_were(workspace: Workspace, tmp_path: Path) -> None:
-    last, _ = learned(workspace)
-    file, content = workspace.concept_file(last["concept"]["id"])
-    workspace.upload(file, content)
-    opened = workspace.state()["concepts"][-1]
+def test_files_come_back_as_they_were(after: Workspace, key: str) -> None:
+    file, content = after.concept_file(key)
+    after.upload(file, content)
+    opened = after.state()["concepts"][-1]
     assert (opened["kind"], opened["name"]) == ("opened", TASK)
-    assert workspace.concept_file(opened["id"])[1] == content
-    workspace.forget(requests.Named(opened["id"]))
-    assert opened["id"] not in [one["id"] for one in workspace.state()["concepts"]]
+    assert after.concept_file(opened["id"])[1] == content
+    after.forget(requests.Named(opened["id"]))
+    assert opened["id"] not in [one["id"] for one in after.state()["concepts"]]
 
 
-def test_files_of_others_are_refused_by_the_name_that_the_person_knows(workspace: Workspace) -> None:
+def test_files_of_others_are_refused_by_the_name_that_the_person_knows(opened: Workspace) -> None:
     own = Concept.load(ROOT / "pretrained" / "mocap" / "jumping_jacks.safetensors")
     assert own.origin.domain == "mocap"
     content = (ROOT / "pretrained" / "mocap" / "jumping_jacks.safetensors").read_bytes()
     with pytest.raises(UserError, match=r"^jumping_jacks\.safetensors: "):
-        workspace.upload("jumping_jacks.safetensors", content)
+        opened.upload("jumping_jacks.safetensors", content)
     with pytest.raises(UserError, match=r"^five\.npz: "):
-        workspace.upload("five.npz", b"nothing")
+        opened.upload("five.npz", b"nothing")
 
 
-def test_learning_stops_when_nobody_waits(workspace: Workspace) -> None:
-    workspace.draw(requests.Drawn(TASK, 3))
+def test_learning_stops_when_nobody_waits(opened: Workspace) -> None:
+    opened.draw(requests.Drawn(TASK, 3))
     told: list[Json] = []
     with pytest.raises(Stopped):
-        workspace.learn(requests.Learn("left"), told.append, lambda: len(told) > 3)
-    assert "left" not in [one["name"] for one in workspace.state()["concepts"]]
+        opened.learn(requests.Learn("left"), told.append, lambda: len(told) > 3)
+    assert "left" not in [one["name"] for one in opened.state()["concepts"]]
 
 
+@pytest.mark.slow
 def test_an_older_concept_of_the_same_kind_is_no_rival() -> None:
     strokes = Workspace("strokes")
     for name in ("first heart", "second heart"):
@@ -187,9 +231,9 @@ def test_an_older_concept_of_the_same_kind_is_no_rival() -> None:
         assert told[-1]["concept"]["accuracy"] > 0.8
 
 
-def test_all_that_is_told_is_json(workspace: Workspace) -> None:
-    last, told = learned(workspace)
-    for one in (*told, workspace.state(), workspace.thumbnail("t0"), workspace.thumbnail(last["concept"]["id"])):
+def test_all_that_is_told_is_json(taught: Taught, key: str) -> None:
+    of, told = taught
+    for one in (*told, of.state(), of.thumbnail("t0"), of.thumbnail(key)):
         json.dumps(one, allow_nan=False)
 
 

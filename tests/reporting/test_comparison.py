@@ -1,6 +1,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import pandas as pd
@@ -26,46 +27,45 @@ from ftl_lightning.reporting.comparison import (
 )
 from ftl_lightning.reporting.curves import curves_table
 from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth, overview_dots
-from ftl_lightning.reporting.table import MOST_COLUMNS
+from ftl_lightning.reporting.report import BEGIN, END
+from ftl_lightning.reporting.table import MOST_COLUMNS, Table, select
 from ftl_lightning.reporting.tables import tables
 from tests.conftest import ROOT
+from tests.evaluation.rows import REFERENCE
+from tests.evaluation.rows import row as usual_row
 
 DOMAIN = load_domain("object_rearrangement")
 METHODS = {"FTL-IGM": (0.9, 0.7), "BC": (0.8, 0.2), "CVAE": (0.1, 0.1), "language": (0.3, 0.1)}
 
 
-def row(method: str, task: str, value: float, **changes: object) -> Row:
-    values: dict[str, object] = {
-        "domain": DOMAIN.name,
-        "setting": "new concept",
-        "task": task,
-        "method": method,
-        "variant": "" if method == "language" else "free",
-        "K": 1,
-        "omega": "1.0",
-    }
-    values |= {
-        "demonstrations": 5,
-        "seed": 0,
-        "n": 50,
-        "metric": "accuracy",
-        "value": value,
-        "model_hash": "m",
-        "config_hash": method,
-    }
-    return Row(**(values | changes))  # type: ignore[arg-type]
+def row(method: str, task: str, value: float, **changes: Any) -> Row:
+    variant = "" if method == "language" else "free"
+    usual = {"method": method, "task": task, "value": value, "variant": variant, "K": 1, "omega": "1.0", "config_hash": method}
+    return usual_row(**(usual | changes))
 
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
     rows = [row(method, task, value) for method, values in METHODS.items() for task, value in zip("ab", values, strict=True)]
-    rows += [row("random scenes", task, 0.15, variant="", role="reference", K=0, omega="") for task in "ab"]
+    rows += [row("random scenes", task, 0.15, **REFERENCE) for task in "ab"]
     append_rows(tmp_path / "r" / "comparison.csv", rows)
     grown = [row("FTL-IGM", "a", 0.1 * count, K=2, omega="1.2", demonstrations=count) for count in (1, 2, 5)]
     wider = [row("FTL-IGM", "a", value, K=K, omega="learned") for K, value in ((2, 0.5), (4, 0.7))]
     few = row("FTL-IGM", "b", 0.0, K=2, omega="1.2", n=5)  # starts where the demonstrations did
     append_rows(tmp_path / "r" / "curves.csv", [*grown, *wider, few])
     return tmp_path / "r"
+
+
+@pytest.fixture(scope="module")
+def committed() -> pd.DataFrame:
+    """What the repository's results say of all methods."""
+    return all_methods(read_study(ROOT / "results", "comparison"), read_study(ROOT / "results"))
+
+
+@pytest.fixture(scope="module")
+def whole(committed: pd.DataFrame) -> Table:
+    """The overview of them, in which hundreds of cells are compared."""
+    return overview(committed)
 
 
 def test_every_number_stands_beside_the_papers_with_their_difference(results: Path) -> None:
@@ -86,43 +86,42 @@ def test_the_overview_fits_on_one_screen_and_names_the_best_baseline(results: Pa
     assert line["FTL-IGM"] == "0.80 ± 0.10 [0.82]"
     assert "in-context" not in cells
     assert line["lead"] == "+0.30 against BC, undecided (2 pairs)"
+    assert short_overview(read_study(results, "comparison")).cells.to_numpy().tolist() == cells.to_numpy().tolist()
     *_, references = overview_tables(read_study(results, "comparison"))
     assert references.cells["reference lines"].tolist() == ["random scenes 0.15"]
 
 
-def test_the_short_overview_has_at_most_ten_lines_and_all_domains() -> None:
-    committed = all_methods(*(read_study(ROOT / "results", name) for name in ("comparison", "")))
+@pytest.mark.slow
+def test_the_short_overview_has_at_most_ten_lines_and_all_domains(committed: pd.DataFrame, whole: Table) -> None:
     cells = short_overview(committed).cells
     assert len(cells) == 10
     subject = cells.columns[0]
     names = [told.partition(":")[0] for told in cells[subject]]
     assert list(dict.fromkeys(names)) == ["agent", "driving", "mocap", "object_rearrangement", "tabletop"]
-    whole = overview(committed).cells
-    assert len(whole) > 10
+    assert len(whole.cells) > 10
     same = [name for name in cells.columns if name != "other forms"]
-    assert set(map(tuple, cells[same].to_numpy())) < set(map(tuple, whole[same].to_numpy()))  # the same lines
+    assert set(map(tuple, cells[same].to_numpy())) < set(map(tuple, whole.cells[same].to_numpy()))  # the same lines
     assert "[" in "".join(cells["FTL-IGM"])
     one = short_overview(committed[committed["domain"] == "driving"]).cells
-    assert one[subject].tolist() == [
-        f"driving: new initial state, closed loop {name}" for name in ("success (step veto)", "crash (step veto)", "strict success")
-    ]
+    outcomes = ("success (step veto)", "crash (step veto)", "strict success")
+    assert one[subject].tolist() == [f"driving: new initial state, closed loop {name}" for name in outcomes]
 
 
-def test_the_overview_takes_in_domains_whose_methods_were_all_measured_in_their_ablation() -> None:
-    ablations = read_study(ROOT / "results")
-    beside = all_methods(read_study(ROOT / "results", "comparison"), ablations)
-    assert "tabletop_wide" not in set(beside["domain"])  # no baseline was measured there
-    learned = beside[(beside["domain"] == "tabletop") & (beside["role"] == "method") & (beside["setting"] == "new concept")]
+def test_domains_whose_methods_were_all_measured_in_their_ablation_are_compared_too(committed: pd.DataFrame) -> None:
+    assert "tabletop_wide" not in set(committed["domain"])  # no baseline was measured there
+    learned = select(committed, domain="tabletop", role="method", setting="new concept")
     assert set(learned["demonstrations"]) == {10}  # and not from fewer
     assert set(learned.loc[learned["method"] == "FTL-IGM", "K"]) == {1, 2}  # with an adapter, and in the paper's form
     assert set(learned.loc[(learned["method"] == "FTL-IGM") & (learned["form"] == ""), "K"]) == {2}
-    whole = overview(beside)
+
+
+@pytest.mark.slow
+def test_the_overview_takes_in_domains_whose_methods_were_all_measured_in_their_ablation(whole: Table) -> None:
     assert "in mocap and tabletop network, view and loss are ours" in whole.caption
     lines = whole.cells.set_index(whole.cells.columns[0])
     pushed = lines.loc["tabletop: new concept, closed loop success"]
-    kept = ablations[(ablations["domain"] == "tabletop") & (ablations["setting"] == "new concept")]
-    kept = kept[kept["metric"] == "closed loop success"]
-    tuned = kept[kept["method"] == "LoRA fine-tuning"]["value"].mean()
+    kept = select(read_study(ROOT / "results"), domain="tabletop", setting="new concept", metric="closed loop success")
+    tuned = select(kept, method="LoRA fine-tuning")["value"].mean()
     assert pushed["LoRA fine-tuning"] == f"{tuned:.2f}"
     assert "[" not in pushed["FTL-IGM"]  # the paper's number is a robot's
     moved = lines.loc["mocap: new concept, rule"]
@@ -130,18 +129,28 @@ def test_the_overview_takes_in_domains_whose_methods_were_all_measured_in_their_
     assert re.search(r"with modes over time \d.*over time form chosen \d", moved["other forms"])
 
 
-def test_tables_of_the_overview_are_narrow_and_together_say_what_it_says() -> None:
-    beside = all_methods(*(read_study(ROOT / "results", name) for name in ("comparison", "")))
-    whole = overview(beside).cells
-    first, *methods, references = overview_tables(beside)
-    for table in (first, *methods, references):
+def expect_narrow(rows: pd.DataFrame, whole: Table) -> list[Table]:
+    """The overview's tables, which are narrow and together say what it says."""
+    first, *methods, _ = found = overview_tables(rows)
+    for table in found:
         assert len(table.cells.columns) <= MOST_COLUMNS
-        assert table.cells.iloc[:, 0].tolist() == whole.iloc[:, 0].tolist()
+        assert table.cells.iloc[:, 0].tolist() == whole.cells.iloc[:, 0].tolist()
     beside_each_other = pd.concat([first.cells, *(table.cells.iloc[:, 1:] for table in methods)], axis=1)
-    assert set(whole.columns) == set(beside_each_other.columns)
-    many = pd.concat([beside, *(beside[beside["method"] == "BC"].assign(method=f"mine {count}") for count in range(9))])
-    assert max(len(table.cells.columns) for table in overview_tables(many)) == MOST_COLUMNS
-    assert {table.name for table in overview_tables(many)} >= {"overview_methods", "overview_methods_2"}
+    assert set(whole.cells.columns) == set(beside_each_other.columns)
+    return found
+
+
+@pytest.mark.slow
+def test_tables_of_the_overview_are_narrow_and_together_say_what_it_says(committed: pd.DataFrame, whole: Table) -> None:
+    expect_narrow(committed, whole)
+
+
+def test_many_methods_take_several_tables(results: Path) -> None:
+    few = read_study(results, "comparison")
+    many = pd.concat([few, *(select(few, method="BC").assign(method=f"mine {count}") for count in range(9))])
+    found = expect_narrow(many, overview(many))
+    assert max(len(table.cells.columns) for table in found) == MOST_COLUMNS
+    assert {table.name for table in found} >= {"overview_methods", "overview_methods_2"}
 
 
 def test_a_method_of_ones_own_stands_beside_the_others(results: Path) -> None:
@@ -194,7 +203,7 @@ def test_where_a_policy_of_no_learning_ends_as_ours_does_the_overview_says_in_ho
     strict = {**driving, "metric": "closed loop strict success"}
     rows = [row("FTL-IGM", seed=seed, value=0.5, **strict) for seed in (0, 1)]
     for policy, lost in (("FASTER", 0.02), ("IDLE", 0.5)):
-        rows += [row(policy, seed=seed, value=0.4, variant="", role="reference", K=0, omega="", **strict) for seed in (0, 1)]
+        rows += [row(policy, seed=seed, value=0.4, **REFERENCE, **strict) for seed in (0, 1)]
         for seed in (0, 1):
             rows += [row("FTL-IGM", seed=seed, value=0.0, **(driving | {"metric": f"won against {policy}"}))]
             rows += [row("FTL-IGM", seed=seed, value=lost * seed, **(driving | {"metric": f"lost against {policy}"}))]
@@ -225,7 +234,7 @@ def test_curves_keep_the_other_axis_as_usual(results: Path) -> None:
 def test_curves_are_of_the_headline_where_it_was_measured(tmp_path: Path) -> None:
     driven = {"domain": "driving", "setting": "new initial state", "task": "roundabout", "K": 2, "omega": "learned"}
     rows = [
-        row("FTL-IGM", value=value, metric=metric, demonstrations=count, config_hash=f"{count}", **driven)  # type: ignore[arg-type]
+        row("FTL-IGM", value=value, metric=metric, demonstrations=count, config_hash=f"{count}", **driven)
         for count in (1, 5)
         for metric, value in (("closed loop success", 0.9), ("closed loop strict success", count / 10))
     ]
@@ -237,12 +246,9 @@ def test_curves_are_of_the_headline_where_it_was_measured(tmp_path: Path) -> Non
 
 def test_what_does_not_grow_is_what_most_points_were_measured_with(tmp_path: Path) -> None:
     pushed = {"domain": "tabletop", "setting": "new concept", "task": "push", "metric": "closed loop success", "omega": "1.0"}
-    grown = [(1, 1, 0.1), (1, 10, 0.5), (2, 10, 0.6), (3, 10, 0.7)]
-    rows = [
-        row("FTL-IGM", value=value, K=count, demonstrations=shown, config_hash=f"{count} {shown}", **pushed)  # type: ignore[arg-type]
-        for count, shown, value in grown
-    ]
-    append_rows(tmp_path / "curves.csv", rows)
+    for count, shown, value in ((1, 1, 0.1), (1, 10, 0.5), (2, 10, 0.6), (3, 10, 0.7)):
+        grown = row("FTL-IGM", value=value, K=count, demonstrations=shown, config_hash=f"{count} {shown}", **pushed)
+        append_rows(tmp_path / "curves.csv", [grown])
     found = curves_table(load_domain("tabletop"), read_study(tmp_path, "curves")).cells.set_index("of")
     assert found.loc["demonstrations", ["1", "10"]].tolist() == ["0.10", "0.50"]
     assert found.loc["K", ["1", "2", "3"]].tolist() == ["0.50", "0.60", "0.70"]
@@ -251,7 +257,7 @@ def test_what_does_not_grow_is_what_most_points_were_measured_with(tmp_path: Pat
 def test_changes_stand_in_their_order_with_the_headline_if_it_was_measured(tmp_path: Path) -> None:
     told = [("ours", 0.9), ("noise is predicted", 0.4), ("flat", 0.5)]
     rows = [row("FTL-IGM", task, value + shift, variant=name) for name, value in told for task, shift in (("a", 0.0), ("b", 0.02))]
-    append_rows(tmp_path / "changes.csv", [*rows, row("expert (oracle)", "a", 1.0, role="reference", variant="", K=0, omega="")])
+    append_rows(tmp_path / "changes.csv", [*rows, row("expert (oracle)", "a", 1.0, **REFERENCE)])
     found = changes_table(DOMAIN, read_study(tmp_path, "changes")).cells
     assert found["variant"].tolist() == [name for name, _ in told]
     assert found["new concept"].tolist() == ["0.91 ± 0.01", "0.41 ± 0.01", "0.51 ± 0.01"]
@@ -262,23 +268,20 @@ def test_changes_stand_in_their_order_with_the_headline_if_it_was_measured(tmp_p
     assert changes_table(driving, read_study(tmp_path, "changes")).cells["new concept"].tolist() == ["0.10"]
 
 
+@pytest.mark.slow
 def test_ablations_comparison_and_curves_are_not_mixed(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     append_rows(results / "own.csv", [row("FTL-IGM", "a", 0.33, K=2, omega="1.2")])
     assert set(read_study(results)["value"]) == {0.33}
     assert len(read_study(results, "comparison")) == 10
     assert len(read_rows(results)) == 17
     assert read_study(results, "nothing").empty
-    assert main(["report", f"--results={results}", "--out=out"]) == 0
+    Path("README.md").write_text(f"{BEGIN}\n{END}")
+    assert main(["report", f"--results={results}", "--out=out", "--readme=README.md"]) == 0
+    short = short_overview(all_methods(read_study(results, "comparison"), read_study(results))).markdown()
+    assert Path("README.md").read_text() == f"{BEGIN}\n{short}{END}"
     written = {path.name for path in Path("out").rglob("*")}
-    assert written >= {
-        "overview.md",
-        "comparison.md",
-        "comparison.tex",
-        "comparison_accuracy.png",
-        "curves.md",
-        "curves.png",
-        "accuracy.md",
-    }
+    assert written >= {f"{name}.md" for name in ("overview", "comparison", "curves", "accuracy")}
+    assert written >= {"comparison.tex", "comparison_accuracy.png", "curves.png"}
     assert "0.33" in (Path("out") / DOMAIN.name / "accuracy.md").read_text()
 
 
@@ -295,13 +298,8 @@ def test_the_papers_numbers_of_driving_stand_beside_the_same_planner_alone() -> 
     committed = read_study(ROOT / "results", "comparison")
     cells = comparison_table(driving, committed).cells
     ours = cells[cells["method"] == "FTL-IGM"].set_index("metric")
-    assert ours["paper"].to_dict() == {
-        "closed loop success": "-",
-        "closed loop crash": "-",
-        "closed loop strict success": "-",
-        "closed loop success (step veto)": "0.24",
-        "closed loop crash (step veto)": "0.32",
-    }
+    papers = {"success": "-", "crash": "-", "strict success": "-", "success (step veto)": "0.24", "crash (step veto)": "0.32"}
+    assert ours["paper"].to_dict() == {f"closed loop {name}": value for name, value in papers.items()}
     # Fewer crashes are better, with every planner: the CVAE crashes less than ours with the paper's.
     theirs = cells[cells["method"] == "CVAE"].set_index("metric")
     crash = "closed loop crash (step veto)"
@@ -309,10 +307,9 @@ def test_the_papers_numbers_of_driving_stand_beside_the_same_planner_alone() -> 
     assert theirs.loc[crash, "ours is"].startswith("-0.")
 
 
-def test_the_overviews_figure_has_a_panel_for_each_domain_and_diamonds_where_settings_are_the_same() -> None:
-    beside = all_methods(*(read_study(ROOT / "results", name) for name in ("comparison", "")))
-    figure = overview_dots(beside)
-    panels = {axes.get_title(loc="left"): axes for axes in figure.get_axes()}
+@pytest.mark.slow
+def test_the_overviews_figure_has_a_panel_for_each_domain_and_diamonds_where_settings_are_the_same(committed: pd.DataFrame) -> None:
+    panels = {axes.get_title(loc="left"): axes for axes in overview_dots(committed).get_axes()}
     assert set(panels) == {"agent", "driving", "mocap", "object_rearrangement", "tabletop"}
     diamonds = {
         name: sorted(round(float(line.get_xdata()[0]), 2) for line in axes.lines if line.get_marker() == "D")  # type: ignore[arg-type]

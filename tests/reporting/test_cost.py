@@ -29,7 +29,7 @@ def script(name: str, monkeypatch: pytest.MonkeyPatch) -> Script:
     return runpy.run_path(str(ROOT / "benchmarks" / f"{name}.py"))
 
 
-def test_operations_bytes_and_calls_are_those_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_operations_of_layers_and_convolutions_bytes_and_calls_are_those_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = script("counting", monkeypatch)["counted"]
     layer, x = nn.Linear(3, 5), torch.ones(7, 3)
     found = counted(lambda: layer(x).sum().backward(), layer.parameters())
@@ -42,13 +42,14 @@ def test_operations_bytes_and_calls_are_those_counted_by_hand(monkeypatch: pytes
     assert counted(lambda: large.exp()).far == 2 * 2**20
     product, weight = torch.ones(2, 3), torch.ones(3, 4, requires_grad=True)
     work = counted(lambda: (product @ weight).exp().sum().backward())
-    assert sorted((call.name, times) for call, times in work.heavy.items()) == [
-        ("aten.exp.default", 1),
-        ("aten.mm.default", 1),  # forward, and the gradient of the weight: other shapes
-        ("aten.mm.default", 1),
-    ]
+    heavy = sorted((call.name, times) for call, times in work.heavy.items())
+    assert heavy == [("aten.exp.default", 1), *[("aten.mm.default", 1)] * 2]  # forward, and the weight's gradient: other shapes
     assert work.recorded == 4  # product, exponential, sum, and the one that the backward pass starts from
     assert work.backward == work.calls - work.recorded > 0
+    layer, x = nn.Conv1d(4, 6, 5, padding=2), torch.ones(2, 4, 8)
+    found = counted(lambda: layer(x).sum().backward(), layer.parameters())
+    forward = 2 * (2 * 6 * 8) * (4 * 5)
+    assert (found.products, found.convolutions, found.gradients) == (0, forward, forward)
 
 
 def test_a_call_by_itself_takes_the_time_of_its_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,14 +60,6 @@ def test_a_call_by_itself_takes_the_time_of_its_shapes(monkeypatch: pytest.Monke
     assert few.arguments[0].shape == (8, 256)
     assert much.arguments[0].strides == (1, 2048)
     assert 0 < operator_time.seconds(few, 0) < operator_time.seconds(much, 2**22)
-
-
-def test_operations_of_convolutions_are_those_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
-    counted = script("counting", monkeypatch)["counted"]
-    layer, x = nn.Conv1d(4, 6, 5, padding=2), torch.ones(2, 4, 8)
-    found = counted(lambda: layer(x).sum().backward(), layer.parameters())
-    forward = 2 * (2 * 6 * 8) * (4 * 5)
-    assert (found.products, found.convolutions, found.gradients) == (0, forward, forward)
 
 
 def test_a_step_of_inversion_multiplies_as_often_as_its_layers_say(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,6 +77,7 @@ def test_a_step_of_inversion_multiplies_as_often_as_its_layers_say(monkeypatch: 
     assert counting["counted"](made.compute, made.parameters).products == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_network_that_no_memory_here_holds_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
     steps, counting = script("steps", monkeypatch), script("counting", monkeypatch)
     step = steps["ours"]("agent").inversion
@@ -95,13 +89,11 @@ def test_a_network_that_no_memory_here_holds_is_counted_too(monkeypatch: pytest.
     assert on_paper.products == here.products > 0  # calls are more: some operators are several there
 
 
-def test_the_model_of_time_finds_the_coefficients_that_made_the_times(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_the_model_of_time_finds_what_made_the_times_and_is_checked_on_other_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     cost = script("cost", monkeypatch)
     draw = torch.Generator().manual_seed(0)
-    measured, counts = (
-        torch.rand(30, 3, generator=draw, dtype=torch.float64),
-        torch.rand(30, 5, generator=draw, dtype=torch.float64),
-    )
+    measured, counts = (torch.rand(30, width, generator=draw, dtype=torch.float64) for width in (3, 5))
     rows = torch.cat((measured, 10 ** (9 * counts)), dim=1).tolist()
     true = dict(zip(cost["FITTED"], (1e-11, 1e-10, 0.0, 4e-10, 3e-9), strict=True))
     durations = [sum(row[:3]) + sum(true[name] * value for name, value in zip(true, row[3:], strict=True)) for row in rows]
@@ -110,10 +102,6 @@ def test_the_model_of_time_finds_the_coefficients_that_made_the_times(monkeypatc
     told = cost["with_errors"]([{"step": "a", "seconds": durations[0] / 1.5, "features": rows[0]}], found)
     assert told[0]["error"] == pytest.approx(0.5, abs=1e-4)
     assert cost["errors"](told) == {"mean": 0.5, "median": 0.5, "largest": 0.5, "within ten per cent": 0.0, "steps": 1}
-
-
-def test_steps_that_are_checked_are_not_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
-    cost = script("cost", monkeypatch)
     fit, check = cost["to_fit"](), cost["to_check"]()
     assert len(check) >= 20
     grid = [cost["of_grid"](kind, cost["BASE"]) for kind in ("inversion", "sampling")]
@@ -171,6 +159,7 @@ def demonstrations() -> list[Demonstrations]:
     return [data.select(name) for name in list(dict.fromkeys(data.concepts))[:2]]
 
 
+@pytest.mark.slow  # to import diffusers alone takes seconds
 def test_diffusers_makes_the_same_plans_of_the_same_noise_and_learns_as_well(
     tiny: Path, demonstrations: list[Demonstrations], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -196,6 +185,7 @@ def test_diffusers_makes_the_same_plans_of_the_same_noise_and_learns_as_well(
     assert losses[0] < 1.1 * losses[1]
 
 
+@pytest.mark.slow
 def test_textual_inversion_one_by_one_learns_what_a_batch_learns(
     tiny: Path, demonstrations: list[Demonstrations], monkeypatch: pytest.MonkeyPatch
 ) -> None:

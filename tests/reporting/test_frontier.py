@@ -10,9 +10,10 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import append_rows
-from ftl_lightning.evaluation.row import Row
 from ftl_lightning.reporting.figures import frontier
 from ftl_lightning.reporting.frontier import frontier_table, read_frontier, write_frontier
+from tests.evaluation.rows import row as measured
+from tests.reporting.test_speed import write as write_speed
 
 DOMAIN = load_domain("object_rearrangement")
 
@@ -34,7 +35,7 @@ ROWS = [
 ]
 
 
-def test_measurements_are_added_and_the_same_are_replaced(tmp_path: Path) -> None:
+def test_measurements_are_added_the_same_are_replaced_and_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "frontier.json"
     assert read_frontier(path).empty
     write_frontier(path, ROWS)
@@ -44,6 +45,9 @@ def test_measurements_are_added_and_the_same_are_replaced(tmp_path: Path) -> Non
     assert found.loc[found["method"] == "BC", "accuracy"].tolist() == [0.8, 0.7]
     assert found["novelty"].isna().all()
     assert found.loc[found["method"] == "FTL-IGM", "temperature"].tolist() == [1.0, 0.1, 0.1]
+    path.write_text('{"speed": 3}')
+    with pytest.raises(UserError, match=r"frontier.json: expected rows of domain, suite"):
+        read_frontier(tmp_path)
 
 
 def test_a_file_from_before_forms_is_read_and_added_to(tmp_path: Path) -> None:
@@ -55,12 +59,6 @@ def test_a_file_from_before_forms_is_read_and_added_to(tmp_path: Path) -> None:
     assert found[["method", "form", "accuracy"]].to_numpy().tolist() == [["FTL-IGM", "", 0.4], ["FTL-IGM", "with modes", 0.75]]
     cells = frontier_table(DOMAIN, found).cells
     assert cells["method"].tolist() == ["FTL-IGM", "FTL-IGM with modes"]
-
-
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "frontier.json").write_text('{"speed": 3}')
-    with pytest.raises(UserError, match=r"frontier.json: expected rows of domain, suite"):
-        read_frontier(tmp_path)
 
 
 def test_the_frontier_is_a_line_of_means_in_the_order_of_temperatures_with_both_reference_points(tmp_path: Path) -> None:
@@ -77,13 +75,14 @@ def test_the_frontier_is_a_line_of_means_in_the_order_of_temperatures_with_both_
     assert titles == ["new concept, validation", "new concept, paper"]
 
 
-def test_the_report_draws_it_where_the_file_is(tmp_path: Path) -> None:
-    values = {"domain": DOMAIN.name, "setting": "new concept", "task": "t", "method": "BC", "K": 1, "omega": "1.0", "seed": 0}
-    values |= {"demonstrations": 5, "n": 9, "metric": "accuracy", "value": 1.0, "model_hash": "m", "config_hash": "c"}
-    append_rows(tmp_path / "r" / "own.csv", [Row(**values)])  # type: ignore[arg-type]
-    picture = tmp_path / "out" / DOMAIN.name / "frontier.png"
-    assert main(["report", f"--results={tmp_path / 'r'}", f"--out={tmp_path / 'out'}"]) == 0
-    assert not picture.exists()
-    write_frontier(tmp_path / "r" / "frontier.json", ROWS)
-    assert main(["report", f"--results={tmp_path / 'r'}", f"--out={tmp_path / 'out'}"]) == 0
-    assert picture.stat().st_size > 1000
+@pytest.mark.slow
+def test_the_report_draws_it_and_seconds_of_learning_where_their_files_are(tmp_path: Path) -> None:
+    append_rows(tmp_path / "r" / "own.csv", [measured(method="BC", variant="")])
+    pictures = [Path("out") / DOMAIN.name / "frontier.png", Path("out") / "speed.png"]
+    for there in (False, True):
+        if there:
+            write_frontier(tmp_path / "r" / "frontier.json", ROWS)
+            write_speed(tmp_path / "r" / "speed.json")
+        assert main(["report", "--results=r", "--out=out"]) == 0
+        assert [path.exists() for path in pictures] == [there, there]
+    assert min(path.stat().st_size for path in pictures) > 1000

@@ -28,14 +28,11 @@ def test_p_is_the_share_of_sign_patterns_that_are_as_far_from_zero() -> None:
     assert sign_flip([0.3, 0.2, -0.1]) == sign_flip([-0.3, -0.2, 0.1])
 
 
-def test_ties_count_as_far_whatever_floats_make_of_them() -> None:
+def test_ties_count_as_far_whatever_floats_make_of_them_and_zeros_have_no_sign_to_flip() -> None:
     # 0.1 + 0.2 - 0.3 is not zero in floats; every pattern of a sum of zero is as far.
     assert sign_flip([0.1, 0.2, -0.3]) == 1.0
     assert sign_flip([0.7, -0.1]) == sign_flip([0.8 - 0.1, 0.6 - 0.7]) == 1.0
     assert sign_flip([0.1 / 3] * 3 + [-0.1]) == 1.0
-
-
-def test_differences_of_zero_have_no_sign_to_flip() -> None:
     assert sign_flip([0.0] * 9) == 1.0
     assert sign_flip([]) == 1.0
     assert sign_flip([0.1, 0.2, 0.3, *[0.0] * 50]) == sign_flip([0.1, 0.2, 0.3])
@@ -80,13 +77,10 @@ def test_more_baselines_need_more_pairs() -> None:
     assert [lead.p for lead in leads(wide, Compared("ours"), [*map(Compared, ["BC", "CVAE", "language", "fourth"])])] == [None] * 4
 
 
-def test_tasks_weigh_alike_however_many_seeds_each_has() -> None:
+def test_tasks_weigh_alike_however_many_seeds_each_has_and_only_pairs_that_both_have_are_compared() -> None:
     found = one(ours=[[0.9], [0.5, 0.5, 0.5]], BC=[[0.5], [0.4, 0.4, 0.4]])
     assert found.difference == pytest.approx((0.4 + 0.1) / 2)
     assert found.pairs == 4
-
-
-def test_only_pairs_of_task_and_seed_that_both_have_are_compared() -> None:
     rows = measured(ours=[[0.9, 0.9]], BC=[[0.5]])
     (found,) = leads(rows, Compared("ours"), [*map(Compared, ["BC", "not measured"])])
     assert found.pairs == 1

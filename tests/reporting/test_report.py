@@ -1,36 +1,29 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ftl_lightning.cli import main
 from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
 from ftl_lightning.evaluation.row import Row
-from ftl_lightning.reporting.comparison import comparison_table
+from ftl_lightning.reporting.comparison import all_methods, comparison_table, short_overview
 from ftl_lightning.reporting.figures import accuracy_bars
-from ftl_lightning.reporting.report import BEGIN, END
+from ftl_lightning.reporting.report import BEGIN, END, _splice
 from ftl_lightning.reporting.table import summarise
 from ftl_lightning.reporting.tables import tables
-from tests.conftest import ROOT
+from tests.conftest import ROOT, refused
+from tests.evaluation.rows import REFERENCE
+from tests.evaluation.rows import row as usual_row
 
 DOMAIN = load_domain("object_rearrangement")
 
 
-def row(setting: str, task: str, value: float, seed: int = 0, **changes: object) -> Row:
-    values = {
-        "domain": DOMAIN.name,
-        "setting": setting,
-        "task": task,
-        "method": "FTL-IGM",
-        "variant": "free",
-        "K": 2,
-        "omega": "1.2",
-        "demonstrations": 5,
-        "seed": seed,
-    }
-    values |= {"n": 50, "metric": "accuracy", "value": value, "model_hash": "m", "config_hash": f"c{seed}"}
-    return Row(**(values | changes))  # type: ignore[arg-type]
+def row(setting: str, task: str, value: float, seed: int = 0, **changes: Any) -> Row:
+    usual = {"setting": setting, "task": task, "value": value, "seed": seed, "config_hash": f"c{seed}"}
+    return usual_row(**(usual | changes))
 
 
 @pytest.fixture
@@ -41,22 +34,16 @@ def results(tmp_path: Path) -> Path:
         for task, value in zip(("one", "two"), values, strict=True)
         for seed in (0, 1)
     ]
-    rows += [
-        row("new concept", task, 0.1, method="random scenes", variant="", role="reference", K=0, omega="")
-        for task in ("one", "two")
-    ]
+    rows += [row("new concept", task, 0.1, method="random scenes", **REFERENCE) for task in ("one", "two")]
     rows += [row("new concept", "one", 0.7, omega="learned", K=1, config_hash="d")]
     append_rows(tmp_path / "r" / "rows.csv", rows)
     return tmp_path / "r"
 
 
 def test_a_number_tells_error_over_tasks_from_spread_over_seeds(tmp_path: Path) -> None:
-    append_rows(
-        tmp_path / "r.csv",
-        [row("s", task, value, seed) for task, seed, value in (("a", 0, 0.2), ("a", 1, 0.4), ("b", 0, 0.6), ("b", 1, 0.8))],
-    )
+    values = (("a", 0, 0.2), ("a", 1, 0.4), ("b", 0, 0.6), ("b", 1, 0.8))
+    append_rows(tmp_path / "r.csv", [row("s", task, value, seed) for task, seed, value in values])
     number = summarise(read_rows(tmp_path / "r.csv"))
-    assert number is not None
     assert number.mean == pytest.approx(0.5)
     assert number.error == pytest.approx(0.2)  # task means 0.3 and 0.7
     assert number.spread == pytest.approx(0.2 / 2**0.5)  # seed means 0.4 and 0.6
@@ -90,18 +77,10 @@ def test_tables_stand_beside_the_papers_numbers(results: Path) -> None:
     assert "±" not in found["accuracy"].latex()
 
 
-def test_what_each_change_is_worth_has_a_table_of_its_own_in_the_order_of_its_rows(results: Path, tmp_path: Path) -> None:
-    append_rows(
-        results / "changes.csv", [row("new concept", "one", 0.9, variant="ours"), row("new concept", "one", 0.2, variant="flat")]
-    )
-    assert main(["report", "--results", str(results), "--out", str(tmp_path / "out")]) == 0
-    found = (tmp_path / "out" / DOMAIN.name / "changes.md").read_text()
-    assert found.index("| ours | 0.90 |") < found.index("| flat | 0.20 |")
-    assert "ours" not in (tmp_path / "out" / DOMAIN.name / "accuracy.md").read_text()
-
-
-def test_the_report_writes_files_and_updates_a_readme(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    readme = tmp_path / "README.md"
+def test_the_report_writes_files_and_updates_a_readme(results: Path) -> None:
+    changes = [row("new concept", "one", value, variant=name) for name, value in (("ours", 0.9), ("flat", 0.2))]
+    append_rows(results / "changes.csv", changes)
+    readme, folder = Path("README.md"), Path("out") / DOMAIN.name
     readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
     options = [f"--results={results}", "--out=out", f"--readme={readme}"]
     assert main(["report", *options]) == 0
@@ -110,17 +89,28 @@ def test_the_report_writes_files_and_updates_a_readme(results: Path, tmp_path: P
     assert text.endswith(f"{END}\nafter\n")
     assert "old" not in text
     assert "| training composition | FTL-IGM (free) | 0.90 ± 0.10 (seeds 0.00) | 0.90 ± 0.04 | +0.00 |" in text
-    folder = Path("out") / DOMAIN.name
     assert {path.name for path in folder.iterdir()} >= {"accuracy.md", "accuracy.tex", "accuracy.png"}
-    readme.write_text("no marks")
-    assert main(["report", *options]) == 2
-    assert "expected the lines" in capsys.readouterr().err
+    # What each change is worth has a table to itself, in the order of its rows.
+    found = (folder / "changes.md").read_text()
+    assert found.index("| ours | 0.90 |") < found.index("| flat | 0.20 |")
+    assert "ours" not in (folder / "accuracy.md").read_text()
 
 
-def test_the_readmes_table_is_what_the_committed_results_say(tmp_path: Path) -> None:
-    copy = tmp_path / "README.md"
+def test_a_file_to_update_that_is_missing_or_has_no_marks_is_told(capsys: pytest.CaptureFixture[str], results: Path) -> None:
+    told = refused(capsys, ["report", f"--results={results}", "--out=report", "--readme=missing.md"])
+    assert told == "error: missing.md: expected a Markdown file, found nothing\n"
+    Path("README.md").write_text("no marks")
+    with pytest.raises(UserError, match=r"^README\.md: expected the lines "):
+        _splice(Path("README.md"), "")
+
+
+@pytest.mark.slow
+def test_the_readmes_table_is_what_the_committed_results_say() -> None:
+    """What ``--readme`` writes, without the files of the whole report; that these are as committed is a test of outputs."""
+    beside = all_methods(read_study(ROOT / "results", "comparison"), read_study(ROOT / "results"))
+    copy = Path("README.md")
     copy.write_text((ROOT / "README.md").read_text())
-    assert main(["report", f"--results={ROOT / 'results'}", "--out=out", f"--readme={copy}"]) == 0
+    _splice(copy, short_overview(beside).markdown())
     assert copy.read_text() == (ROOT / "README.md").read_text()
 
 
@@ -162,7 +152,7 @@ def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_c
     concepts = replace(DOMAIN.concepts, suites={"mine": DOMAIN.concepts.suites["validation"]})
     alone = replace(DOMAIN, paper=None, concepts=concepts)
     rows = [row(setting, task, 0.5, K=K) for setting in ("mine", "new concept") for task in "ab" for K in (1, 2)]
-    rows += [row("mine", "a", 0.1, method="random scenes", variant="", role="reference", K=0, omega="")]
+    rows += [row("mine", "a", 0.1, method="random scenes", **REFERENCE)]
     append_rows(tmp_path / "r.csv", rows)
     results = read_rows(tmp_path / "r.csv")
     found = {table.name: table.cells for table in tables(alone, results)}
@@ -176,14 +166,13 @@ def test_a_domain_without_a_paper_and_its_suites_has_tables_without_the_papers_c
 
 def test_every_published_number_belongs_to_a_task_or_setting() -> None:
     tasks = {(task.setting, task.name) for suite in DOMAIN.concepts.suites.values() for task in suite.tasks}
-    assert DOMAIN.paper is not None
     for published in DOMAIN.paper.numbers:
         assert published.setting in {setting for setting, _ in tasks}
         assert not published.task or (published.setting, published.task) in tasks
         assert 0 <= published.value <= 1
 
 
-def test_what_a_killed_process_left_is_no_result(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_is_no_result_and_models_of_the_papers_size_stand_apart(tmp_path: Path) -> None:
     append_rows(tmp_path / "r.csv", [row("new concept", "one", 1.0)])
     whole = (tmp_path / "r.csv").read_text()
     (tmp_path / ".r.csv.abcd.csv").write_text(whole)
@@ -191,16 +180,6 @@ def test_what_a_killed_process_left_is_no_result(tmp_path: Path) -> None:
     (tmp_path / ".hidden").mkdir()
     (tmp_path / ".hidden" / "r-checkpoint.csv").write_text(whole)
     assert len(read_rows(tmp_path)) == len(read_study(tmp_path)) == 1
-
-
-def test_models_of_the_papers_size_stand_apart_from_ablations(tmp_path: Path) -> None:
-    append_rows(tmp_path / "r.csv", [row("new concept", "one", 1.0)])
     append_rows(tmp_path / "paper_size.csv", [row("new concept", "one", 0.5)])
     assert read_study(tmp_path)["value"].tolist() == [1.0]
     assert read_study(tmp_path, "paper_size")["value"].tolist() == [0.5]
-
-
-def test_a_missing_file_to_update_is_told_before_anything_is_written(capsys: pytest.CaptureFixture[str], results: Path) -> None:
-    assert main(["report", f"--results={results}", "--out=report", "--readme=missing.md"]) == 2
-    assert capsys.readouterr().err == "error: missing.md: expected a Markdown file, found nothing\n"
-    assert not Path("report").exists()

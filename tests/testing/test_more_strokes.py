@@ -22,11 +22,13 @@ def model() -> FewShot:
     return FewShot.from_pretrained("strokes")
 
 
-def test_no_new_kind_is_one_of_pretraining(model: FewShot) -> None:
+def test_no_new_kind_is_one_of_pretraining_and_the_card_names_the_model_that_ships(model: FewShot) -> None:
     every = (*KNOWN, *VALIDATION, *TEST)
     assert len(set(every)) == len(every)
     plain = {text.removeprefix(MIRRORED).removeprefix(BACKWARDS) for text in model.training_concepts}
     assert plain == {*KNOWN, RANDOM}
+    assert re.findall("hash `([0-9a-f]{16})`", CARD.read_text(encoding="utf-8")) == [model.model.hash]
+    assert set(model.domain.plans.columns) == {"x", "y"}
 
 
 @pytest.mark.parametrize("kind", [*KNOWN, *VALIDATION, *TEST])
@@ -39,12 +41,9 @@ def test_fresh_strokes_are_recognised_and_differ_from_each_other(judge: Judge, k
     assert not np.array_equal(found, drawn(kind, 100, seed=8))
 
 
-def test_one_hand_draws_more_alike_than_many() -> None:
+def test_one_hand_draws_alike_and_mirrored_and_backwards_strokes_are_not_taken_for_the_kind_itself(judge: Judge) -> None:
     many, one = drawn("heart", 100, 0), drawn("heart", 100, 0, alike=0.8)
     assert one.std(axis=0).mean() < 0.5 * many.std(axis=0).mean()
-
-
-def test_mirrored_and_backwards_strokes_are_not_taken_for_the_kind_itself(judge: Judge) -> None:
     assert judge.rate(drawn(MIRRORED + "letter L", 50, 0), "letter L") == 0
     back, forth = drawn(BACKWARDS + "letter L", 200, 0).mean(axis=0), drawn("letter L", 200, 0).mean(axis=0)
     assert np.abs(back[::-1] - forth).max() < 0.5 < np.abs(back - forth).max()
@@ -57,11 +56,7 @@ def test_noise_is_no_kind_rather_than_another(judge: Judge) -> None:
     assert judge.distance(noise, "circle") > 3 * judge.distance(drawn("circle", 50, 1), "circle")
 
 
-def test_the_card_names_the_model_that_ships(model: FewShot) -> None:
-    assert re.findall("hash `([0-9a-f]{16})`", CARD.read_text(encoding="utf-8")) == [model.model.hash]
-    assert set(model.domain.plans.columns) == {"x", "y"}
-
-
+@pytest.mark.slow
 def test_a_new_kind_is_learned_from_five_strokes_in_a_hundred_steps(model: FewShot, judge: Judge) -> None:
     five = drawn("heart", 5, seed=11, alike=0.6)
     before = model.sample(model["circle"] * 0.0, 40).states.numpy()
