@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 MARKERS = {
-    "slow": "takes more than five seconds of work",
+    "slow": "takes more than about a second, where the fast suite can do without it; above five it must have a marker",
     "browser": "opens a page in Chromium",
     "release": "builds or installs the package, or checks types of its users",
     "notebook": "executes a notebook",
