@@ -44,6 +44,7 @@ def test_a_long_test_without_a_marker_fails_and_what_has_one_is_left_out(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # which takes seconds
     monkeypatch.setattr(time, "sleep", time.sleep)  # the inner hooks count it, too
     pytester.makeconftest(Path(suites.__file__).read_text("utf-8").replace("LIMIT = 5.0", "LIMIT = 0.2"))
     pytester.makepyfile(LONG)
