@@ -8,17 +8,22 @@ LOGS := logs/$(DOMAIN)
 PROCESSES := --numprocesses logical --maxprocesses 4
 MARKED := slow or browser or release or notebook or cluster or fuzz
 
+# Without it every interpreter compiles all that it imports, for seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: install minilm run test test-all coverage lint format report ablation comparison benchmark docs docs-sphinx docs-pages fields
 
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
-	@echo "1 of 3: the environment .venv"
+	@echo "1 of 4: the environment .venv"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@echo "2 of 3: torch, by pip, which knows where its build for this machine lies"
+	@echo "2 of 4: torch, by pip, which knows where its build for this machine lies"
 	$(BIN)/python -m pip install --constraint constraints.txt torch uv
-	@echo "3 of 3: ftl-lightning with the extras $(EXTRAS), by uv"
+	@echo "3 of 4: ftl-lightning with the extras $(EXTRAS), by uv"
 	$(BIN)/uv pip install --python $(BIN)/python --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	@echo "4 of 4: bytecode of what the program imports, so that its first start takes no longer than others"
+	$(BIN)/python -m ftl_lightning fit --help >/dev/null
 	touch $@
 
 minilm: install # the language model behind the shipped tables of embeddings
@@ -38,9 +43,9 @@ test: install # before a commit: every rule, formula and error, one tiny fit and
 test-all: install # with the slow tests, browser, release, notebooks, clusters and hostile input
 	$(BIN)/python -m pytest $(PROCESSES)
 
-coverage: install # statements and branches that each of the two suites runs, child processes included
+coverage: install # statements and branches that `make test` runs, then those that all tests run; child processes included
 	$(BIN)/python -m pytest $(PROCESSES) --cov --cov-report term -m "not ($(MARKED))"
-	$(BIN)/python -m pytest $(PROCESSES) --cov --cov-report term
+	$(BIN)/python -m pytest $(PROCESSES) --cov --cov-append --cov-report term -m "$(MARKED)"
 
 lint: install
 	$(BIN)/ruff check .

@@ -29,11 +29,14 @@ autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_mock_imports = [name for name in ("minari", "pyarrow") if importlib.util.find_spec(name) is None]  # extras
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False  # Lightning's and torch's own documentation is theirs
+autodoc_use_type_comments = False  # there are none
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+
+toc_object_entries = False  # two thousand entries, which every page would build anew
 
 html_theme = "furo"
 html_title = f"ftl-lightning {__version__}"

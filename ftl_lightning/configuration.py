@@ -16,13 +16,15 @@ package (:mod:`ftl_lightning.shipped`); a former name of a shipped file (:mod:`f
 Interpolations such as ``${seed_everything}`` are left as they are.
 """
 
+import copy
 import functools
+import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -100,7 +102,7 @@ def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]
     Raises:
         UserError: as :func:`load`.
     """
-    return [(part, _plain(OmegaConf.to_container(keys, resolve=False))) for part, keys in _parts(path, verb)]
+    return list(_parts(path, verb))
 
 
 def _plain(keys: object) -> dict[str, Any]:
@@ -109,21 +111,21 @@ def _plain(keys: object) -> dict[str, Any]:
     return {str(key): value for key, value in keys.items()}
 
 
-def _parts(path: str | Path, verb: str) -> Iterator[tuple[Path, DictConfig]]:
+def _parts(path: str | Path, verb: str) -> Iterator[tuple[Path, dict[str, Any]]]:
     section = section_of(verb)
     today = _today(path, section)
     for file in [_File(find(path), section)] if today is None else today:
         yield from _merged(file, ())
 
 
-def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictConfig]]:
+def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Every file with keys of its own, those of its section after the others. ``above`` are the files that led here."""
     path = file.path
     if path.resolve() in (one.resolve() for one in above):
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
-    if not isinstance(names, ListConfig | list) or not all(isinstance(name, str) for name in names):
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
     for name in names:
         for below in _beside(file, name):
@@ -131,10 +133,10 @@ def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, DictCo
     sections = {} if file.section is None else {name: keys.pop(name, None) for name in SECTIONS}
     yield path, keys
     for name, own in sections.items():
-        if own is not None and not isinstance(own, DictConfig):
+        if own is not None and not isinstance(own, dict):
             raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(own))}")
     if file.section and (own := sections[file.section]) is not None:
-        yield path, own
+        yield path, _plain(own)
 
 
 def _beside(file: _File, name: str) -> list[_File]:
@@ -188,10 +190,10 @@ def _relative(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def _read(path: Path) -> DictConfig:
+def _read(path: Path) -> dict[str, Any]:
     expect_readable(path, "configuration", LONGEST)
     try:
-        keys = OmegaConf.load(path)
+        keys = _parsed(path.read_text("utf-8"))
     except (
         OSError,
         ValueError,
@@ -204,9 +206,15 @@ def _read(path: Path) -> DictConfig:
     ) as error:
         told = short(str(error), 200) or "no mapping of keys"
         raise UserError(f"{path}: expected a configuration file (YAML), found {told}") from error
-    if not isinstance(keys, DictConfig):
+    if not isinstance(keys, dict):
         raise UserError(f"{path}: expected a mapping of keys, found a list")
-    return keys
+    return _plain(copy.deepcopy(keys))
+
+
+@functools.lru_cache
+def _parsed(text: str) -> object:
+    """The content of a YAML file; a command reads each file several times, and parsing takes the most of it."""
+    return OmegaConf.to_container(OmegaConf.load(io.StringIO(text)), resolve=False)
 
 
 LONGEST = 200_000

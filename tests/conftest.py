@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import torch
 from filelock import FileLock
 
 from ftl_lightning.cli import main
@@ -101,6 +100,8 @@ def _in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.chdir(tmp_path)  # what a test logs and writes is of no other test
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))  # no concepts of the person who runs the tests
+    import torch  # not above: the process that hands out the tests needs no torch
+
     torch.set_num_threads(1)
 
 
@@ -142,10 +143,10 @@ def tiny_of(once: Once) -> Callable[[str], Path]:
 
     def model(domain: str) -> Path:
         def fit(folder: Path) -> None:
-            few = ["--trainer.max_steps=10", "--data.steps_per_epoch=5", "--data.batch_size=8", "--evaluation.samples=1"]
+            few = ["--trainer.max_steps=5", "--data.steps_per_epoch=5", "--data.batch_size=8", "--evaluation.samples=1"]
             few += ["--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.diversity=false"]
             with pytest.MonkeyPatch.context() as patch:
-                patch.setenv("XDG_CACHE_HOME", str(once("drawn", lambda folder: None)))
+                _draw_once(patch, once)
                 succeed(*tiny.fit(Path(f"{domain}.yaml"), *few))
 
         return once(f"tiny_{domain}", fit) / "logs" / domain / "fit" / "pretrained"
@@ -155,8 +156,16 @@ def tiny_of(once: Once) -> Callable[[str], Path]:
 
 @pytest.fixture
 def drawn(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the demonstrations that other tests of this run have drawn from a cache in common."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(once("drawn", lambda folder: None)))
+    """Take demonstrations that other tests of this run have drawn from a common cache; make up those of the table-top."""
+    _draw_once(monkeypatch, once)
+
+
+def _draw_once(patch: pytest.MonkeyPatch, once: Once) -> None:
+    from ftl_lightning.domains.tabletop.source import Expert
+    from tests.domains.tabletop_samples import made_up
+
+    patch.setenv("XDG_CACHE_HOME", str(once("drawn", lambda folder: None)))
+    patch.setattr(Expert, "draw", made_up)  # the simulator takes ten seconds for the demonstrations of a tiny fit
 
 
 @pytest.fixture(scope="session")

@@ -59,8 +59,9 @@ Nothing here looks at the clock on the wall, which goes on while a machine does 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with the most marked tests first, since a file is the work of one process: so all end at about the same time."""
-    heavy = Counter(item.path for item in items if marked(item))
-    items.sort(key=lambda item: (-heavy[item.path], item.path))
+    files = {item: item.nodeid.partition("::")[0] for item in items}
+    heavy = Counter(file for item, file in files.items() if marked(item))
+    items.sort(key=lambda item: (-heavy[files[item]], files[item]))
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:

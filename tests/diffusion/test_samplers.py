@@ -1,4 +1,7 @@
-"""The samplers against diffusers' schedulers, on an epsilon that is known in closed form."""
+"""The samplers against diffusers' schedulers, on an epsilon that is known in closed form.
+
+Tests import diffusers, not the module: it takes seconds, in every process that collects tests.
+"""
 
 import functools
 import itertools
@@ -7,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from torch import Tensor
 
 from ftl_lightning.diffusion.samplers import SAMPLERS, Sampling, ddim, ddpm, dpm_solver, timesteps
@@ -47,6 +49,8 @@ def betas() -> Any:
 
 
 def test_the_schedule_is_the_cosine_one_and_timesteps_cover_it() -> None:
+    from diffusers import DDPMScheduler
+
     theirs = DDPMScheduler(num_train_timesteps=100, beta_schedule="squaredcos_cap_v2").alphas_cumprod
     assert torch.allclose(ALPHA_BAR, theirs, atol=1e-5)
     assert timesteps(100, 100) == list(range(99, -1, -1))
@@ -56,6 +60,8 @@ def test_the_schedule_is_the_cosine_one_and_timesteps_cover_it() -> None:
 
 
 def test_ddpm_equals_diffusers() -> None:
+    from diffusers import DDPMScheduler
+
     scheduler = DDPMScheduler(num_train_timesteps=100, trained_betas=betas(), variance_type="fixed_small", clip_sample_range=1.0)
     scheduler.set_timesteps(100)
     ours = ddpm(exact, noise(), ALPHA_BAR, 100, 1.0)
@@ -64,6 +70,8 @@ def test_ddpm_equals_diffusers() -> None:
 
 @pytest.mark.parametrize("steps", [10, 25, 100])
 def test_ddim_equals_diffusers(steps: int) -> None:
+    from diffusers import DDIMScheduler
+
     # Their spacing of few steps differs from ours at the ends, so each of our steps is given to them as a schedule of two.
     x = torch.randn(SHAPE, generator=generator())
     scheduler = DDIMScheduler(num_train_timesteps=100, trained_betas=betas(), clip_sample_range=1.0)
@@ -78,6 +86,8 @@ def test_ddim_equals_diffusers(steps: int) -> None:
 
 @pytest.mark.parametrize("steps", [10, 20])
 def test_dpm_solver_equals_diffusers(steps: int) -> None:
+    from diffusers import DPMSolverMultistepScheduler
+
     scheduler = DPMSolverMultistepScheduler(
         num_train_timesteps=100, trained_betas=betas(), solver_order=2, lower_order_final=False, final_sigmas_type="zero"
     )

@@ -14,15 +14,16 @@ from ftl_lightning.demonstrations.features import Observed
 from ftl_lightning.diffusion.image_encoder import ImageEncoders
 from ftl_lightning.domains.data import PretrainingData
 from ftl_lightning.domains.tabletop import source
-from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
+from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
 from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.seeding import generator, task_key
+from ftl_lightning.seeding import generator
 from ftl_lightning.trainer import Trainer
 from tests.conftest import ROOT
+from tests.domains.tabletop_samples import made_up
 
 perturb = VIEWS["points"].perturb
 assert perturb is not None
@@ -35,27 +36,6 @@ SMALL: dict[str, Any] = {
     "perturb": True,
     "prediction": "clean",
 }
-
-
-@pytest.fixture
-def pretrained(tiny_of: Callable[[str], Path], drawn: None) -> Path:
-    """Folder of a small pretrained model."""
-    return tiny_of("tabletop")
-
-
-def made_up(self: source.Expert, task: str, count: int, seed: int, **_: bool) -> Demonstrations:
-    """Demonstrations in which everything is anywhere, in place of the simulator's."""
-    draw = generator("cpu", seed, task_key(task))
-    anywhere = torch.rand(count, 6, 5, 4, generator=draw) * torch.tensor([1, 0.4, 0.4, 0.1]) + torch.tensor([0, 0.3, -0.2, 0])
-    anywhere[..., 0] = (anywhere[..., 0] > 0.3).float()
-    pose = torch.zeros(count, 6, 8)
-    pose[..., :3] = anywhere[:, :, 0, 1:]
-    image = torch.randint(256, (count, 6, 3, 64, 64), generator=draw, dtype=torch.uint8)
-    observed = {IMAGE: image, POSE: pose, PLACES: anywhere}
-    kinds = {"domain": NAME, "state_names": STATE_NAMES, "state_units": STATE_UNITS, "per_step": tuple(observed)}
-    return Demonstrations(
-        states=pose[..., [0, 1, 2, 7]], lengths=torch.full((count,), 6), concepts=(task,) * count, observed=observed, **kinds
-    )
 
 
 @pytest.fixture
@@ -94,7 +74,6 @@ def test_what_begins_elsewhere_and_corrections_join_the_training_set() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("pretrained")
 def test_eyes_are_taught_places(tmp_path: Path) -> None:
     data = PretrainingData(domain=NAME, **SIZES)
     losses: list[float] = []
@@ -198,8 +177,9 @@ def test_mistakes_are_told_in_one_line(data: PretrainingData) -> None:
 
 
 @pytest.mark.slow
-def test_a_model_is_corrected_by_the_expert(pretrained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_is_corrected_by_the_expert(tiny_of: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
     script = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_dagger.py"))
+    pretrained = tiny_of("tabletop")
     monkeypatch.setattr("sys.argv", ["x", f"--pretrained={pretrained}", f"--task={PUSH}", "--count=2", "--out=made.safetensors"])
     script["main"]()
     made = Demonstrations.load("made.safetensors")

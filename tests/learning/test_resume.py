@@ -17,21 +17,21 @@ OFTEN = ["--trainer.callbacks+=lightning.pytorch.callbacks.ModelCheckpoint", "--
 OFTEN += ["--trainer.callbacks.save_top_k=-1", "--trainer.callbacks.filename=often-{step}"]
 OFTEN += ["--trainer.callbacks.enable_version_counter=false"]
 OURS, BC, CVAE = (Path(f"{method}object_rearrangement.yaml") for method in ("", "bc/", "cvae/"))
-VALIDATED = "--trainer.check_val_every_n_epoch=1"
-SLOW = [(path, "--trainer.limit_val_batches=0") for path in sizes.CONFIGURATIONS]
-SLOW += [(BC, "--model.members=2"), (CVAE, VALIDATED)]
+VALIDATED, UNSEEN = "--trainer.check_val_every_n_epoch=1", "--trainer.limit_val_batches=0"
+SLOW = [(path, UNSEEN) for path in sizes.CONFIGURATIONS if path != OURS]
+SLOW += [(BC, "--model.members=2"), (CVAE, VALIDATED), (OURS, VALIDATED)]
 SLOW += [(OURS, "--trainer.check_val_every_n_epoch=2"), (OURS, "--trainer.val_check_interval=2")]
 
 
 @pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize(
-    ("path", "option"), [(OURS, VALIDATED), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)], ids=str
+    ("path", "option"), [(OURS, UNSEEN), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)], ids=str
 )
 def test_every_shipped_configuration_goes_on_to_the_same_bytes(path: Path, option: str) -> None:
     fit = [*sizes.fit(path, *RUN, option)]
     succeed(*fit, *OFTEN, "--model.output=unbroken")
     (checkpoints,) = Path("logs").glob("*/fit/checkpoints")
-    for step in (3, 5) if path == OURS else (5,):  # at the end of an epoch, and within another
+    for step in (3, 5) if path == OURS and option != UNSEEN else (5,):  # at the end of an epoch, and within another
         succeed(*fit, f"--model.output=again{step}", f"--ckpt_path={checkpoints / f'often-step={step}.ckpt'}")
         found = Path(f"again{step}/model.safetensors").read_bytes()
         assert found == Path("unbroken/model.safetensors").read_bytes(), step

@@ -1,4 +1,4 @@
-"""What the tests of the page share: one browser for a process, and one server for a module."""
+"""What the tests of the page share: one browser and one server for a module."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from tests.play.browser import Browser
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Browser]":
-    """A browser, which opens a page after the other."""
+    """A browser, which opens a page after the other. It ends with the module: a page that stays open draws its films for ever."""
     pytest.importorskip("selenium", reason="selenium is not installed")
     from tests.play.browser import browser, installed
 
