@@ -4,6 +4,7 @@
 """
 
 import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -50,7 +51,8 @@ LEFT_OUT, SECONDS = pytest.StashKey[Counter[str]](), pytest.StashKey[float]()
 NONE = Counter[str]()
 LIMIT = 5.0
 """Seconds of work of a test without a marker: of processors, child processes included, and of ``time.sleep``. What the fixture
-``once`` makes for a whole run is no work of the test that needs it first.
+``once`` makes for a whole run is no work of the test that needs it first. There is no limit where lines are traced, for coverage or
+by a debugger.
 
 Nothing here looks at the clock on the wall, which goes on while a machine does something else.
 """
@@ -139,7 +141,7 @@ def pytest_runtest_makereport(
     """Fail a test that takes long and has no marker."""
     report = yield
     seconds = work() - item.stash[SECONDS]
-    if call.when != "teardown" and report.passed and seconds > LIMIT and not marked(item):
+    if call.when != "teardown" and report.passed and seconds > LIMIT and not marked(item) and sys.gettrace() is None:
         expected = f"at most {LIMIT:.0f} s of work, or one of the markers {', '.join(MARKERS)}"
         report.outcome, report.longrepr = "failed", f"{item.nodeid}: {call.when}: expected {expected}, found {seconds:.1f} s"
     return report

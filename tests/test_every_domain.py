@@ -12,7 +12,7 @@ from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.testing.strokes import strokes
-from tests.conftest import CONF, succeed
+from tests.conftest import CONF, Once, succeed
 from tests.tiny import QUIET
 
 NEW = {
@@ -35,31 +35,54 @@ QUICK = [
 QUICK += ["--evaluation.sampler=ddim", "--evaluation.references=false", "--evaluation.diversity=false", "--evaluation.figures=0"]
 
 
-@pytest.mark.usefixtures("drawn")
-@pytest.mark.parametrize("domain", NEW)
-def test_a_domain_is_fitted_inverted_and_sampled_from(domain: str, tiny_of: Callable[[str], Path]) -> None:
-    pretrained, new = tiny_of(domain), "new.npz" if domain == "own" else "new.safetensors"
-    known = load_model(pretrained).domain
-    if domain == "own":
-        np.savez(new, states=strokes("heart", 2, 1), concepts="heart")
-    else:
-        recordings = pretrained.parents[3] / "recordings"  # of human motion
-        source = known.source(recordings if recordings.is_dir() else None)
-        drawn = (
-            source.split("train", 1, 0) if domain == "driving" else source.draw(NEW[domain], 2, 0)
-        )  # which an expert drives slowly
-        replace(drawn.rows([0, 1]), concepts=(NEW[domain],) * 2).save(new)
-    invert = ["invert", f"--config={CONF / domain}.yaml", f"--model.pretrained={pretrained}", f"--data.demonstrations={new}"]
-    succeed(*invert, *QUICK, *(["--evaluation.closed_loop=false"] if known.closed_loop else []))
-    (log,) = Path("logs").glob("*/invert")
-    (file,) = (log / "concepts").iterdir()
-    concept = Concept.load(file)
-    assert concept.origin.name == NEW[domain]
-    assert concept.embeddings.isfinite().all()
-    if known.metrics:
+@pytest.fixture(params=NEW)
+def learned(request: pytest.FixtureRequest, once: Once, tiny_of: Callable[[str], Path], drawn: None) -> tuple[str, Path, Path]:
+    """A domain, its tiny model, and a folder with demonstrations of a new concept and the logs of its inversion."""
+    domain, pretrained = request.param, tiny_of(request.param)
+
+    def invert(folder: Path) -> None:
+        known, new = load_model(pretrained).domain, demonstrations(domain)
+        if domain == "own":
+            np.savez(new, states=strokes("heart", 2, 1), concepts="heart")
+        else:
+            recordings = pretrained.parents[3] / "recordings"  # of human motion
+            source = known.source(recordings if recordings.is_dir() else None)
+            # An expert drives slowly.
+            drawn = source.split("train", 1, 0) if domain == "driving" else source.draw(NEW[domain], 2, 0)
+            replace(drawn.rows([0, 1]), concepts=(NEW[domain],) * 2).save(new)
+        options = [*QUICK, *(["--evaluation.closed_loop=false"] if known.closed_loop else [])]
+        options += [f"--model.pretrained={pretrained}", f"--data.demonstrations={new}"]
+        succeed("invert", f"--config={CONF / domain}.yaml", *options)
+
+    return domain, pretrained, once(f"learned_{domain}", invert)
+
+
+def demonstrations(domain: str) -> str:
+    """The name of the file of the new concept."""
+    return "new.npz" if domain == "own" else "new.safetensors"
+
+
+def concept(folder: Path) -> Path:
+    """The file of the concept that was learned."""
+    (file,) = folder.glob("logs/*/invert/concepts/*")
+    return file
+
+
+def test_a_domain_is_fitted_and_a_new_concept_is_learned_and_evaluated(learned: tuple[str, Path, Path]) -> None:
+    domain, pretrained, folder = learned
+    found = Concept.load(concept(folder))
+    assert found.origin.name == NEW[domain]
+    assert found.embeddings.isfinite().all()
+    if load_model(pretrained).domain.metrics:
+        (log,) = folder.glob("logs/*/invert")
         assert set(read_rows(log / "results.csv")["task"]) == {NEW[domain]}
-    starts = [f"--initial={new}"] if known.observed else ["--count=2"]
-    succeed("sample", f"--pretrained={pretrained}", f"--concept={file}", *starts, "--steps=2", "--sampler=ddim")
+
+
+def test_what_was_learned_is_sampled_from(learned: tuple[str, Path, Path]) -> None:
+    domain, pretrained, folder = learned
+    observed = load_model(pretrained).domain.observed
+    starts = [f"--initial={folder / demonstrations(domain)}"] if observed else ["--count=2"]
+    succeed("sample", f"--pretrained={pretrained}", f"--concept={concept(folder)}", *starts, "--steps=2", "--sampler=ddim")
     samples = Demonstrations.load("states.safetensors").states
     assert len(samples) == 2
     assert samples.isfinite().all()

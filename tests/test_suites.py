@@ -1,6 +1,7 @@
 """The suites: what ``make test`` leaves out, and that a test without a marker stays short."""
 
 import re
+import sys
 import time
 from pathlib import Path
 
@@ -46,6 +47,7 @@ def test_a_long_test_without_a_marker_fails_and_what_has_one_is_left_out(
     monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # which takes seconds
     monkeypatch.setattr(time, "sleep", time.sleep)  # the inner hooks count it, too
+    monkeypatch.setattr(sys, "gettrace", lambda: None)  # whatever measures coverage here
     pytester.makeconftest(Path(suites.__file__).read_text("utf-8").replace("LIMIT = 5.0", "LIMIT = 0.2"))
     pytester.makepyfile(LONG)
     done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-v")
@@ -54,8 +56,10 @@ def test_a_long_test_without_a_marker_fails_and_what_has_one_is_left_out(
     assert set(failed) == {*expected, ("test_that_makes_a_fixture", "setup")}
     done.assert_outcomes(passed=4, failed=3, errors=1)
     assert "left out" not in done.stdout.str()
-    done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-m", SHORT)
+    done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "--collect-only", "-m", SHORT)
     done.stdout.fnmatch_lines(["3 tests left out (2 slow, 1 browser): `make test-all` runs all, `pytest -m NAME` one kind"])
+    monkeypatch.setattr(sys, "gettrace", lambda: print)
+    pytester.runpytest_inprocess("-p", "no:cacheprovider", "-k", "computes").assert_outcomes(passed=1)
 
 
 def test_make_leaves_out_every_marker() -> None:

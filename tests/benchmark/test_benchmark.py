@@ -268,7 +268,7 @@ def test_the_committed_leaderboard_is_what_the_submissions_say() -> None:
     assert "replay" in {one.name for one in submissions}
 
 
-@pytest.mark.parametrize("form", ["npz", "lerobot"])
+@pytest.mark.parametrize("form", ["npz", pytest.param("lerobot", marks=pytest.mark.slow)])
 def test_data_are_written_with_cards_and_hashes(form: str) -> None:
     pytest.importorskip("pyarrow")
     assert main(["benchmark", "--data", "data", "--suites", "reaches", "--seeds", "0", "--format", form]) == 0

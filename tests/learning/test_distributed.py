@@ -19,7 +19,7 @@ from ftl_lightning.trainer import Trainer
 from tests import tiny as sizes
 from tests.conftest import CONF, TINY, environment, inversion_module, refused, started, succeed
 
-STEPS = 20
+STEPS = 50
 FIT = [f"--data.steps_per_epoch={STEPS // 2}", f"--trainer.max_steps={STEPS}", "--trainer.log_every_n_steps=1"]
 FIT += ["--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.diversity=false"]
 TWO = ["--trainer.devices=2", "--trainer.strategy=ddp"]
