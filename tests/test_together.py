@@ -135,7 +135,9 @@ def test_what_a_killed_process_leaves_is_removed_when_the_file_is_written_again(
 
 @pytest.mark.slow
 def test_a_report_removes_what_a_killed_one_left() -> None:
-    report = ["report", f"--results={ROOT / 'results' / 'tabletop.csv'}", "--out=."]
+    rows = (ROOT / "results" / "tabletop.csv").read_text("utf-8").splitlines(keepends=True)
+    Path("rows.csv").write_text("".join(rows[:60]))
+    report = ["report", "--results=rows.csv", "--out=."]
     succeed(*report)
     before = sorted(Path().rglob("*"))
     whole = next(path for path in before if path.suffix == ".md")

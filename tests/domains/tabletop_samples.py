@@ -1,5 +1,7 @@
 """Demonstrations of the table-top that need no simulator."""
 
+from typing import Any
+
 import torch
 
 from ftl_lightning.demonstrations.container import Demonstrations
@@ -17,7 +19,12 @@ def made_up(self: Expert, task: str, count: int, seed: int, **_: bool) -> Demons
     pose[..., :3] = anywhere[:, :, 0, 1:]
     image = torch.randint(256, (count, 6, 3, 64, 64), generator=draw, dtype=torch.uint8)
     observed = {IMAGE: image, POSE: pose, PLACES: anywhere}
-    kinds = {"domain": self.domain, "state_names": STATE_NAMES, "state_units": STATE_UNITS, "per_step": tuple(observed)}
+    kinds: dict[str, Any] = {
+        "domain": self.domain,
+        "state_names": STATE_NAMES,
+        "state_units": STATE_UNITS,
+        "per_step": tuple(observed),
+    }
     return Demonstrations(
         states=pose[..., [0, 1, 2, 7]], lengths=torch.full((count,), 6), concepts=(task,) * count, observed=observed, **kinds
     )

@@ -1,11 +1,12 @@
 """``fit`` in two processes: the losses of one with the doubled batch, one that writes, and one line when one of them ends."""
 
+import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -13,11 +14,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributed import TCPStore
 
+from ftl_lightning.cli import main
 from ftl_lightning.errors import UserError
 from ftl_lightning.processes import Dropout, drawn, rows_of
 from ftl_lightning.trainer import Trainer
 from tests import tiny as sizes
-from tests.conftest import CONF, TINY, environment, inversion_module, refused, started, succeed
+from tests.conftest import CONF, TINY, inversion_module, refused, started, succeed
 
 STEPS = 50
 FIT = [f"--data.steps_per_epoch={STEPS // 2}", f"--trainer.max_steps={STEPS}", "--trainer.log_every_n_steps=1"]
@@ -67,33 +69,38 @@ def ended(*runs: "subprocess.Popen[str]") -> Iterator[list[tuple[str, str]]]:
             run.kill()
 
 
+def rank(number: int, every: Sequence[tuple[list[str], str]]) -> None:
+    """One of two processes, which make fits one after another; what it writes is in a file of its number."""
+    names = {"MASTER_ADDR": "127.0.0.1", "NODE_RANK": "0", "WORLD_SIZE": "2", "TORCHELASTIC_USE_AGENT_STORE": "True"}
+    os.environ |= names | {"LOCAL_RANK": str(number)}
+    out, err = Path(f"{number}.out"), Path(f"{number}.err")
+    with out.open("w") as told, err.open("w") as trouble, redirect_stdout(told), redirect_stderr(trouble):
+        for arguments, os.environ["MASTER_PORT"] in every:
+            if main(arguments):
+                sys.exit(1)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the logs of each case in two processes, which fit one case after another: starting takes longer than that."""
-    folder = tmp_path_factory.mktemp("two")
+    """Folder with the logs of each case in two processes: forks of this one, since an interpreter takes longer to start."""
     # Each case has a store, at a port that the system chose: a process that is ahead joins no group that the other one leaves.
     stores = [TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False) for _ in CASES]
-    every = [([*fit(path, f"two/{path}", 4), *TWO], str(store.port)) for path, store in zip(CASES, stores, strict=True)]
-    script = "import os, sys\nfrom ftl_lightning.cli import main\n"
-    script += f"for arguments, os.environ['MASTER_PORT'] in {every!r}:\n    if main(arguments):\n        sys.exit(1)"
-    names = {"MASTER_ADDR": "127.0.0.1", "NODE_RANK": "0", "WORLD_SIZE": "2", "TORCHELASTIC_USE_AGENT_STORE": "True"}
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", script],
-            env=environment(LOCAL_RANK=str(rank), **names),
-            cwd=folder,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("two"))
+        every = [([*fit(path, f"two/{path}", 4), *TWO], str(store.port)) for path, store in zip(CASES, stores, strict=True)]
+        both = [multiprocessing.get_context("fork").Process(target=rank, args=(number, every)) for number in range(2)]
+        for one in both:
+            one.start()
+        for one in both:
+            one.join()
+        (first, trouble), (second, more) = (
+            [Path(f"{number}.{kind}").read_text() for kind in ("out", "err")] for number in range(2)
         )
-        for rank in range(2)
-    ]
-    with ended(*both) as ((first, trouble), (second, more)):
-        assert [one.returncode for one in both] == [0, 0], trouble + more
-    assert first.count("pretrained model: ") == len(CASES)
-    assert second == ""  # one of them speaks
-    assert "error" not in trouble + more
-    return folder
+        assert [one.exitcode for one in both] == [0, 0], trouble + more
+        assert first.count("pretrained model: ") == len(CASES)
+        assert second == ""  # one of them speaks
+        assert "error" not in trouble + more
+        return Path.cwd()
 
 
 @pytest.mark.cluster

@@ -1,5 +1,6 @@
 """Pretraining: what is drawn, what a fit writes, and how it goes on from a checkpoint or refuses one."""
 
+import multiprocessing
 import os
 import signal
 from pathlib import Path
@@ -22,7 +23,7 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions
 from ftl_lightning.trainer import Trainer
 from tests import tiny as sizes
-from tests.conftest import python, refused, succeed
+from tests.conftest import refused, succeed
 
 FIT = sizes.fit(Path("object_rearrangement.yaml"), "--data.batch_size=8", "--data.steps_per_epoch=8")
 FIT += ["--evaluation.samples=1", "--evaluation.steps=2", "--evaluation.figures=0"]
@@ -78,18 +79,17 @@ def test_training_lowers_the_loss(tiny: Path) -> None:
     assert losses[-1] < losses[0] < 1.0
 
 
-KILLED = """
-import os, signal, sys
-from ftl_lightning.cli import main
-from ftl_lightning.learning import PretrainingModule
-step = PretrainingModule.training_step
-def killed(self, batch):
-    if self.global_step == 12:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return step(self, batch)
-PretrainingModule.training_step = killed
-main(sys.argv[1:])
-"""
+def killed(arguments: list[str]) -> None:
+    """A fit that is killed in its thirteenth step; called in a process of its own."""
+    step = PretrainingModule.training_step
+
+    def last(self: PretrainingModule, batch: Any) -> torch.Tensor:
+        if self.global_step == 12:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(self, batch)
+
+    PretrainingModule.training_step = last  # type: ignore[method-assign]
+    main(arguments)
 
 
 @pytest.mark.slow
@@ -98,7 +98,10 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_result() -> None:
     often = [f"--trainer.callbacks.{name}" for name in ("save_last=true", "every_n_train_steps=5", "filename=often")]
     often = ["--trainer.callbacks+=lightning.pytorch.callbacks.ModelCheckpoint", *often]
     succeed(*options, "--model.output=unbroken", "--trainer.logger.init_args.version=unbroken")
-    assert python("-c", KILLED, *options, *often, "--model.output=again").returncode == -signal.SIGKILL
+    run = multiprocessing.get_context("fork").Process(target=killed, args=([*options, *often, "--model.output=again"],))
+    run.start()
+    run.join()
+    assert run.exitcode == -signal.SIGKILL
     assert torch.load(CHECKPOINTS / "last.ckpt", weights_only=True)["global_step"] == 10
     assert not Path("again").exists()
     succeed(*options, "--ckpt_path=last", "--model.output=again")
