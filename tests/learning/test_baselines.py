@@ -163,10 +163,16 @@ CHEAP = (Path("bc/object_rearrangement.yaml"), Path("cvae/object_rearrangement.y
 
 
 @pytest.mark.usefixtures("drawn")
-@pytest.mark.parametrize("path", [pytest.param(one, marks=[] if one in CHEAP else pytest.mark.slow) for one in BASELINES], ids=str)
-def test_every_baseline_from_fit_to_results(path: Path) -> None:
+@pytest.mark.parametrize(
+    ("path", "members"),
+    [
+        *(pytest.param(one, [], marks=[] if one in CHEAP else pytest.mark.slow) for one in BASELINES),
+        pytest.param(CHEAP[0], ["--model.members=2"], marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_every_baseline_from_fit_to_results(path: Path, members: list[str]) -> None:
     domain = path.stem
-    members = ["--model.members=2"] if path == CHEAP[0] else []
     steps = ["--data.batch_size=8", "--data.steps_per_epoch=2", "--trainer.max_steps=2"]
     succeed(*sizes.fit(path, *members, *QUIET, *steps, "--model.output=made"))
     model = load_model("made")
