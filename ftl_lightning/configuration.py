@@ -102,20 +102,16 @@ def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]
     Raises:
         UserError: as :func:`load`.
     """
-    return list(_parts(path, verb))
+    section = section_of(verb)
+    today = _today(path, section)
+    files = [_File(find(path), section)] if today is None else today
+    return [part for file in files for part in _merged(file, ())]
 
 
 def _plain(keys: object) -> dict[str, Any]:
     if not isinstance(keys, dict):
         raise UserError(f"configuration: expected a mapping of keys, found {short(str(keys))}")
     return {str(key): value for key, value in keys.items()}
-
-
-def _parts(path: str | Path, verb: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-    section = section_of(verb)
-    today = _today(path, section)
-    for file in [_File(find(path), section)] if today is None else today:
-        yield from _merged(file, ())
 
 
 def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
@@ -213,7 +209,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 @functools.lru_cache
 def _parsed(text: str) -> object:
-    """The content of a YAML file; a command reads each file several times, and parsing takes the most of it."""
+    """The content of a YAML file, parsed once for the several times that a command reads it."""
     return OmegaConf.to_container(OmegaConf.load(io.StringIO(text)), resolve=False)
 
 

@@ -73,8 +73,7 @@ def rank(number: int, every: Sequence[tuple[list[str], str]]) -> None:
     """One of two processes, which make fits one after another; what it writes is in a file of its number."""
     names = {"MASTER_ADDR": "127.0.0.1", "NODE_RANK": "0", "WORLD_SIZE": "2", "TORCHELASTIC_USE_AGENT_STORE": "True"}
     os.environ |= names | {"LOCAL_RANK": str(number)}
-    out, err = Path(f"{number}.out"), Path(f"{number}.err")
-    with out.open("w") as told, err.open("w") as trouble, redirect_stdout(told), redirect_stderr(trouble):
+    with Path(f"{number}.out").open("w") as out, Path(f"{number}.err").open("w") as err, redirect_stdout(out), redirect_stderr(err):
         for arguments, os.environ["MASTER_PORT"] in every:
             if main(arguments):
                 sys.exit(1)
