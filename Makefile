@@ -50,7 +50,7 @@ coverage: install # statements and branches that `make test` runs, then those th
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers auto
 
 format: install
 	$(BIN)/ruff check --fix .

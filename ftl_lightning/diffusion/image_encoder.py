@@ -140,7 +140,7 @@ class _ResNet18(nn.Module):
             for name, child in module.named_children():
                 if isinstance(child, nn.BatchNorm2d):
                     setattr(module, name, nn.GroupNorm(GROUPS, child.num_features))
-        self.network.pooler = nn.Identity()  # type: ignore[assignment]
+        self.network.pooler = nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
         out: Tensor = self.network(x).last_hidden_state

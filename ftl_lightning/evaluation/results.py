@@ -23,7 +23,7 @@ LARGEST_WHOLE = 2**53
 COLUMNS = [field.name for field in fields(Row)]
 _WHOLE = [field.name for field in fields(Row) if field.type is int]
 _MAYBE_EMPTY = ("setting", "task", "form", "variant", "omega", "model_hash")
-_TEXT = {field.name: str for field in fields(Row) if field.type is str}
+_TEXT = {field.name: object for field in fields(Row) if field.type is str}  # chosen from faster than pandas's strings
 _BEFORE_FORMS = [name for name in COLUMNS if name != "form"]
 _BEFORE_VARIANTS = [name for name in _BEFORE_FORMS if name not in ("variant", "role")]
 """The columns of older files, see :func:`upgraded`."""
