@@ -11,16 +11,14 @@ sections: what they hold counts for that verb alone and is merged after the file
     invert:
       model: {init_args: {pretrained: pretrained/baseline/bc/agent}}
 
-Each name is looked for in the folder of the file that has it, then in the folders above, at last in what is shipped with the
-package (:mod:`ftl_lightning.shipped`); a former name of a shipped file (:mod:`ftl_lightning.renamed`) stands for the file of today.
-Interpolations such as ``${seed_everything}`` are left as they are.
+Each name is searched in the folder of the file, then in the folders above, at last among the files that ship with the package
+(:mod:`ftl_lightning.shipped`). Interpolations such as ``${seed_everything}`` are not resolved.
 """
 
 import copy
 import functools
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +28,7 @@ from yaml import YAMLError
 
 from ftl_lightning.errors import UserError, short
 from ftl_lightning.limits import expect_readable
-from ftl_lightning.printing import say
-from ftl_lightning.regrouped import class_of, regrouped
-from ftl_lightning.renamed import renamed
-from ftl_lightning.shipped import CONFIGURATIONS, shipped
+from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
 SECTIONS = ("fit", "invert")
@@ -44,14 +39,6 @@ _OPTIONS = ("--config", "-c")
 def section_of(verb: str) -> str | None:
     """The section that counts for a verb; ``None`` for one whose files have no sections."""
     return {"fit": "fit", "invert": "invert", "validate": "fit", "test": "fit"}.get(verb)
-
-
-@dataclass(frozen=True)
-class _File:
-    """A file with the section that counts in it: empty for none, ``None`` where there are no sections."""
-
-    path: Path
-    section: str | None
 
 
 def find(path: str | Path) -> Path:
@@ -86,10 +73,7 @@ def load(path: str | Path, verb: str = "") -> dict[str, Any]:
         UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
     """
     try:
-        files = parts(path, verb)
-        named = class_of([keys for _, keys in files], section_of(verb) or "")
-        today = [OmegaConf.create(regrouped(keys, str(part), named)) for part, keys in files]
-        merged = OmegaConf.merge(OmegaConf.create(), *today)
+        merged = OmegaConf.merge(OmegaConf.create(), *(OmegaConf.create(keys) for _, keys in parts(path, verb)))
         found = OmegaConf.to_container(merged, resolve=False)
     except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
@@ -102,10 +86,7 @@ def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]
     Raises:
         UserError: as :func:`load`.
     """
-    section = section_of(verb)
-    today = _today(path, section)
-    files = [_File(find(path), section)] if today is None else today
-    return [part for file in files for part in _merged(file, ())]
+    return list(_merged(find(path), section_of(verb), ()))
 
 
 def _plain(keys: object) -> dict[str, Any]:
@@ -114,9 +95,8 @@ def _plain(keys: object) -> dict[str, Any]:
     return {str(key): value for key, value in keys.items()}
 
 
-def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Every file with keys of its own, those of its section after the others. ``above`` are the files that led here."""
-    path = file.path
+def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Every file with its keys, the section's after the others. ``above`` are the files that led here."""
     if path.resolve() in (one.resolve() for one in above):
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
     keys = _read(path)
@@ -124,62 +104,30 @@ def _merged(file: _File, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[s
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: key '{DEFAULTS}': expected a list of configuration files, found {short(str(names))}")
     for name in names:
-        for below in _beside(file, name):
-            yield from _merged(below, (*above, path))
-    sections = {} if file.section is None else {name: keys.pop(name, None) for name in SECTIONS}
+        yield from _merged(_beside(path, name), section, (*above, path))
+    sections = {} if section is None else {name: keys.pop(name, None) for name in SECTIONS}
     yield path, keys
     for name, own in sections.items():
         if own is not None and not isinstance(own, dict):
             raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(own))}")
-    if file.section and (own := sections[file.section]) is not None:
+    if section and (own := sections[section]) is not None:
         yield path, _plain(own)
 
 
-def _beside(file: _File, name: str) -> list[_File]:
-    """The file that ``defaults`` of a file name; of a former name those of today."""
-    path = file.path
+def _beside(path: Path, name: str) -> Path:
+    """The file that ``defaults`` of a file names."""
     try:
         for folder in path.absolute().parents:
             if (folder / name).is_file():
                 # As the user writes it: relative where the file is.
-                return [_File(folder / name if path.is_absolute() else _relative(folder / name), file.section)]
-            if (today := _today(folder / name, file.section, name)) is not None:
-                return today
-        if (own := shipped(name)).is_file():
-            return [_File(own, file.section)]
-        if (today := _today(name, file.section)) is not None:
-            return today
+                return folder / name if path.is_absolute() else _relative(folder / name)
+        if (ours := shipped(name)).is_file():
+            return ours
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
         told = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({told})") from error
     found = f"found no {short(name, 150)} beside it or in a folder above it"
     raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found}")
-
-
-def _today(path: str | Path, section: str | None, name: str = "") -> list[_File] | None:
-    """The shipped files that stand for a former name of one; ``None`` for another name, or where a file of this name is.
-
-    A path with folders before the name means the shipped files if it leads to them.
-    """
-    new = renamed(path)
-    if new is None or shipped(path).is_file():
-        return None
-    files = []
-    for file in new.files:
-        here, own = Path(new.root + file), CONFIGURATIONS / file
-        if here.is_file() and own.is_file() and here.samefile(own):
-            files.append(_relative(here) if here.is_absolute() else here)
-        elif new.root == f"{CONFIGURATIONS.name}/" and own.is_file():
-            files.append(own)
-        else:
-            return None
-    _say_once(f"note: {name or path} {new.advice}")
-    return [_File(file, None if section is None else new.section) for file in files]
-
-
-@functools.cache
-def _say_once(text: str) -> None:
-    say(text, error=True)
 
 
 def _relative(path: Path) -> Path:

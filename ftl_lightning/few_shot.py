@@ -33,13 +33,13 @@ from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.demonstration_check import Check, check_with, warnings_of
 from ftl_lightning.learning.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
 from ftl_lightning.learning.inversion import Watch
+from ftl_lightning.learning.inversion_settings import INVERSION
 from ftl_lightning.learning.learner import Learner
 from ftl_lightning.learning.library import Library, library
 from ftl_lightning.learning.longer import longer_than_plans
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.progress import bar
 from ftl_lightning.ranges import LARGEST_STEP
-from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.representation import Shown
 from ftl_lightning.seeding import EVALUATION_SEED
 from ftl_lightning.shared_concept import read_folder

@@ -20,14 +20,13 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from ftl_lightning import log_folder, process_group, trust
-from ftl_lightning.configuration import configurations, expanded, load, parts
+from ftl_lightning.configuration import configurations, expanded, parts
 from ftl_lightning.errors import UserError, mistake_behind, short
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.inputs import options
 from ftl_lightning.learning.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_range
-from ftl_lightning.regrouped import regrouped_arguments
 from ftl_lightning.trainer import Trainer
 from ftl_lightning.training_bar import TrainingBar, accuracies
 
@@ -202,6 +201,26 @@ def _expect_values(key: str, found: Namespace | None, given: Sequence[str]) -> N
             raise ArgumentError(None, f'Key "{key}.{name}": expected a value, found null')
 
 
+GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")
+"""Groups of options of the modules that ship."""
+
+
+def _null_in_groups(arguments: Sequence[str]) -> list[str]:
+    """Arguments with ``--model.GROUP.OPTION null`` as ``--model.GROUP={"OPTION": null}``; the parser reads the former as a text."""
+    result, rest = [], list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        option, equals, value = argument.partition("=")
+        group, dot, name = option.removeprefix("--model.").removeprefix("init_args.").partition(".")
+        if not (option.startswith("--model.") and dot and group in GROUPS):
+            result.append(argument)
+            continue
+        if not equals and rest and not rest[0].startswith("--"):
+            equals, value = "=", rest.pop(0)
+        result.append(f'--model.{group}={{"{name}": null}}' if value == "null" else f"{option}{equals}{value}")
+    return result
+
+
 def _behind(error: BaseException) -> str:
     """What the first of the exceptions says that led to this one."""
     while behind := error.__cause__ or error.__context__:
@@ -282,7 +301,6 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
     warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
     for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
         logging.getLogger(name).setLevel(logging.WARNING)
-    files = [load(path, verb) for path in configurations(arguments)]
     try:
         return kind(
             pl.LightningModule,
@@ -293,7 +311,7 @@ def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run:
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
             run=run,
-            args=expanded(regrouped_arguments(arguments, verb, files), verb),
+            args=expanded(_null_in_groups(arguments), verb),
         )
     except OSError as error:
         raise UserError(

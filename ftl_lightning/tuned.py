@@ -7,7 +7,7 @@ from typing import Self
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.inversion_settings import GROUPS, InversionSettings
-from ftl_lightning.renamed import former_settings
+from ftl_lightning.schema import built
 from ftl_lightning.shipped import shipped
 from ftl_lightning.trust import is_installed, is_vouched
 
@@ -43,13 +43,14 @@ class Tuned:
         content = load(path, "invert")
         model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
         options = model.get("init_args") or {}
-        learning = {
-            field.name: GROUPS[field.name](**options[field.name]) if field.name in GROUPS else options[field.name]
-            for field in fields(InversionSettings)
-            if field.name in options and field.name != "seed"
-        }
         sampling = {field.name: evaluation[field.name] for field in fields(Sampling) if field.name in evaluation}
         try:
+            learning = {
+                field.name: built(kind, options[field.name], f"model.{field.name}") if kind else options[field.name]
+                for field in fields(InversionSettings)
+                if field.name in options and field.name != "seed"
+                for kind in [GROUPS.get(field.name)]
+            }
             return cls(
                 inversion=InversionSettings(**learning),
                 learning_steps=int((data.get("init_args") or {}).get("steps", 400)),
@@ -94,9 +95,6 @@ def settings_of(domain: str, folder: str = "conf") -> str:
     """
     from ftl_lightning.configuration import load
 
-    former = former_settings(domain, folder)
-    if shipped(former).is_file():  # a file of one's own
-        return former
     path = f"{folder}/{domain}.yaml"
     if not folder or not shipped(path).is_file():
         return OWN

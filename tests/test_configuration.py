@@ -1,20 +1,18 @@
-"""Configuration files: parts, sections, their order, their mistakes, former names, and what is shipped."""
+"""Configuration files: parts, sections, their order, mistakes in them, and what is shipped."""
 
 import copy
 import functools
 import importlib
 import inspect
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from ftl_lightning.configuration import SECTIONS, _read, _say_once, expanded, find, load, parts
+from ftl_lightning.configuration import SECTIONS, _read, expanded, find, load, parts
 from ftl_lightning.errors import UserError
-from ftl_lightning.lightning_cli import parse
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tuned import settings_of
 from tests.conftest import CONF, ROOT
@@ -129,107 +127,6 @@ def test_an_empty_section_is_none_and_one_that_is_no_mapping_is_refused() -> Non
             load("a.yaml", verb)
 
 
-@pytest.fixture
-def told(capsys: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
-    """What was said on standard error since it was asked for last; a note is said once by a process."""
-    _say_once.cache_clear()
-    return lambda: capsys.readouterr().err.splitlines()
-
-
-Told = Callable[[], list[str]]
-
-
-def said(path: str | Path, verb: str) -> list[dict[str, object]]:
-    """The keys of a file and of those that it builds on, in order, which are what is merged."""
-    return [keys for _, keys in parts(path, verb) if keys]
-
-
-@pytest.mark.parametrize(
-    ("former", "verb", "today", "advice"),
-    [
-        ("invert/agent.yaml", "invert", ["agent.yaml"], "is now conf/agent.yaml (for fit and invert)"),
-        ("invert/mocap_adapter.yaml", "invert", ["mocap_adapter.yaml"], "is now conf/mocap_adapter.yaml (for fit and invert)"),
-        ("baseline/bc/tabletop.yaml", "fit", ["bc/tabletop.yaml"], "is now conf/bc/tabletop.yaml (for fit and invert)"),
-        ("baseline/cvae/invert/agent.yaml", "invert", ["cvae/agent.yaml"], "is now conf/cvae/agent.yaml (for fit and invert)"),
-        (
-            "baseline/language/invert/driving.yaml",
-            "invert",
-            ["verb.yaml", "domain/driving.yaml", "sampling/driving.yaml", "method/language.yaml"],
-            "is now conf/driving.yaml and after it conf/method/language.yaml",
-        ),
-        (
-            "baseline/language/invert/object_rearrangement.yaml",
-            "invert",
-            ["verb.yaml", "domain/object_rearrangement.yaml", "method/language.yaml"],
-            "is now conf/object_rearrangement.yaml and after it conf/method/language.yaml",
-        ),
-        ("verb/fit.yaml", "fit", ["verb.yaml"], "is now conf/verb.yaml (for fit and invert)"),
-        ("verb/invert.yaml", "invert", ["verb.yaml"], "is now conf/verb.yaml (for fit and invert)"),
-        ("verb/common.yaml", "", ["verb.yaml"], "is now conf/verb.yaml"),
-        ("domain/fit/mocap.yaml", "fit", ["domain/mocap.yaml"], "is now conf/domain/mocap.yaml (for fit and invert)"),
-        ("method/invert/bc.yaml", "invert", ["method/bc.yaml"], "is now conf/method/bc.yaml (for fit and invert)"),
-        ("sampling/object_rearrangement.yaml", "", [], "says what is the default; leave it out"),
-    ],
-)
-def test_a_former_name_stands_for_the_files_of_today(
-    former: str, verb: str, today: list[str], advice: str, told: Told, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever the verb of the run is: the name says which section was meant."""
-    expected = [keys for name in today for _, keys in shipped_parts((CONF / name).resolve(), verb or "fit") if keys]
-    write("mine.yaml", f"defaults: [conf/{former}]\n")
-    for path, running in (("mine.yaml", "fit"), ("mine.yaml", "invert"), (f"conf/{former}", "invert"), (f"conf/{former}", "test")):
-        found = said(path, running)
-        assert found == expected if verb else not today or "seed_everything" in found[0], (path, running)
-        assert not {key for keys in found for key in keys} & {"fit", "invert"}
-    assert told() == [f"note: conf/{former} {advice}"]
-    # In a checkout the path may be written in other ways, and from files within the folder without it.
-    checkout = Path("checkout")
-    checkout.mkdir()
-    (checkout / "conf").symlink_to(CONF)
-    assert said(checkout.absolute() / "conf" / former, "fit") == found
-    assert len(told()) == 1
-    monkeypatch.chdir(checkout)
-    assert said(f"./conf/{former}", "fit") == said(f"conf/{former}", "fit") == found
-
-
-def test_a_former_name_needs_no_prefix_in_a_folder_of_the_shipped_files(tmp_path: Path, told: Told) -> None:
-    shutil.copytree(CONF, tmp_path / "copy" / "conf")
-    package = tmp_path / "copy" / "conf"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ftl_lightning.configuration.CONFIGURATIONS", package)
-        write(str(package / "mine.yaml"), "defaults: [verb/fit.yaml, domain/fit/agent.yaml, method/fit/ftl_igm.yaml]\n")
-        assert load(package / "mine.yaml", "fit")["data"]["init_args"]["horizon"] == 128
-    assert told() == [
-        "note: verb/fit.yaml is now conf/verb.yaml (for fit and invert)",
-        "note: domain/fit/agent.yaml is now conf/domain/agent.yaml (for fit and invert)",
-        "note: method/fit/ftl_igm.yaml is now conf/method/ftl_igm.yaml (for fit and invert)",
-    ]
-
-
-def test_a_file_of_one_s_own_wins_over_a_former_name_which_never_means_another_of_them(told: Told) -> None:
-    write("conf/agent.yaml", "x: mine\n")
-    write("mine.yaml", "defaults: [conf/invert/agent.yaml]\n")
-    assert load("conf/agent.yaml", "invert") == {"x": "mine"}
-    for path in ("conf/invert/agent.yaml", "mine.yaml"):
-        assert load(path, "invert") == load(CONF / "agent.yaml", "invert")
-    assert len(told()) == 1
-    write("conf/invert/agent.yaml", "x: mine\n")
-    assert load("conf/invert/agent.yaml", "invert") == load("mine.yaml", "invert") == {"x": "mine"}
-    assert told() == []
-
-
-@pytest.mark.parametrize("name", ["conf/invert/chess.yaml", "conf/baseline/telepathy/agent.yaml", "elsewhere/invert/agent.yaml"])
-def test_a_name_that_never_was_is_missing(name: str, told: Told) -> None:
-    with pytest.raises(UserError, match="expected a configuration file, found nothing"):
-        load(name, "invert")
-    assert told() == []
-
-
-def test_a_run_with_a_former_name_says_one_line(told: Told) -> None:
-    parse("fit", ["--config=conf/baseline/bc/agent.yaml"])
-    assert told() == ["note: conf/baseline/bc/agent.yaml is now conf/bc/agent.yaml (for fit and invert)"]
-
-
 def test_settings_go_with_a_domain_by_its_name() -> None:
     assert settings_of("agent") == "conf/agent.yaml"
     assert settings_of("agent", "conf/in_context") == "conf/in_context/agent.yaml"
@@ -240,8 +137,6 @@ def test_settings_go_with_a_domain_by_its_name() -> None:
         "conf/chess.yaml", "defaults: [conf/verb.yaml, conf/method/ftl_igm.yaml]\ninvert: {model: {init_args: {pretrained: x}}}\n"
     )
     assert settings_of("chess") == "conf/chess.yaml"
-    write("conf/invert/chess.yaml", "model: {init_args: {omega: 2.0}}\n")
-    assert settings_of("chess") == "conf/invert/chess.yaml"
 
 
 read_once = functools.cache(_read)

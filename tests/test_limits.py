@@ -26,11 +26,10 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import InversionData, PretrainingData
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.inversion_settings import INVERSION, InversionSettings
 from ftl_lightning.limits import MOST_HEADER, MOST_TENSORS, VARIABLE
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
-from ftl_lightning.regrouped import INVERSION
 from ftl_lightning.sampling_command import SampleOptions
 from ftl_lightning.targets import expect_writable_file, expect_writable_folder
 from ftl_lightning.trainer import Trainer

@@ -1,7 +1,6 @@
 """The results file: one :class:`~ftl_lightning.evaluation.row.Row` for every evaluated number."""
 
 import csv
-import itertools
 import math
 import re
 from dataclasses import asdict, fields
@@ -10,7 +9,6 @@ from typing import Any
 
 import pandas as pd
 
-from ftl_lightning.domains.paper import FORMS
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
 from ftl_lightning.limits import MOST_TEXT, expect_readable
@@ -24,23 +22,13 @@ COLUMNS = [field.name for field in fields(Row)]
 _WHOLE = [field.name for field in fields(Row) if field.type is int]
 _MAYBE_EMPTY = ("setting", "task", "form", "variant", "omega", "model_hash")
 _TEXT = {field.name: object for field in fields(Row) if field.type is str}  # chosen from faster than pandas's strings
-_BEFORE_FORMS = [name for name in COLUMNS if name != "form"]
-_BEFORE_VARIANTS = [name for name in _BEFORE_FORMS if name not in ("variant", "role")]
-"""The columns of older files, see :func:`upgraded`."""
-_IN_BRACKETS = r"\((?P<variant>.*)\)"
-_JOINED = (" ".join(forms) for count in range(1, len(FORMS) + 1) for forms in itertools.combinations(FORMS, count))
-_ENDING = f"(?P<form>{'|'.join(_JOINED)})"
-"""What names in older files end with."""
 _SUBJECT = ["domain", "setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
 _KEY = [*_SUBJECT, "n", "config_hash"]
 """What makes a row the same measurement as another, which it then replaces."""
 
 
 def append_rows(path: str | Path, rows: list[Row]) -> None:
-    """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all.
-
-    An older file gets today's columns, also where no rows are added, see :func:`upgraded`.
-    """
+    """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all."""
     add_rows(path, pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS))
 
 
@@ -56,35 +44,6 @@ def add_rows(path: str | Path, table: pd.DataFrame) -> None:
             table = known if table.empty else pd.concat([known, table])
         with atomic(path) as temporary:
             table.drop_duplicates(_KEY, keep="last").to_csv(temporary, index=False)
-
-
-def upgraded(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows of an older file, under today's columns; nothing else changes, nor their order.
-
-    Before there was ``form``, a method's name told it: ``'FTL-IGM with modes'``. Before there were ``variant`` and ``role``, the
-    name told the variant, too, in brackets, ``'FTL-IGM with modes (entities, free)'``, and an empty omega marked a reference line,
-    whose name may have brackets of its own, ``'expert (oracle)'``.
-    """
-    if "role" not in table:
-        reference = table["omega"] == ""
-        table = _split(table.assign(variant="", role=reference.map({False: METHOD, True: REFERENCE})), ~reference, _IN_BRACKETS)
-    return (table if "form" in table else split_forms(table.assign(form=""), table["role"] == METHOD))[COLUMNS]
-
-
-def split_forms(table: pd.DataFrame, older: pd.Series) -> pd.DataFrame:
-    """With the forms of older rows, which their methods' names end with, in the column ``form``.
-
-    Args:
-        table: with the columns ``method`` and ``form``.
-        older: whether a row is from before there was ``form``; others stay as they are.
-    """
-    return _split(table, older, _ENDING)
-
-
-def _split(table: pd.DataFrame, chosen: pd.Series, ending: str) -> pd.DataFrame:
-    """With what chosen rows' methods end with, a pattern of one named group, in the column of that name."""
-    parts = table["method"].str.extract(rf"(?s)^(?P<method>.+?)(?: {ending})?\Z")
-    return table.assign(**{str(name): values.fillna("").where(chosen, table[name]) for name, values in parts.items()})
 
 
 def labels(rows: pd.DataFrame) -> pd.Series:
@@ -134,14 +93,14 @@ def _read(file: Path) -> pd.DataFrame:
     table = _table(file, _TEXT)
     if not isinstance(table.index, pd.RangeIndex):
         raise UserError(f"expected {len(table.columns)} cells in each row, found more in some; it is damaged")
-    if list(table.columns) not in (COLUMNS, _BEFORE_FORMS, _BEFORE_VARIANTS):
+    if list(table.columns) != COLUMNS:
         columns = short(", ".join(map(str, table.columns)), 80)
         raise UserError(f"expected the columns {short(', '.join(COLUMNS), 140)}, found {columns}")
     if (bad := _bad_cell(table)) is not None:
         row, column, expected = bad
         cell = _table(file, str).fillna("").iloc[row][column]
         raise UserError(f"row {row + 2}, column {column!r}: expected {expected}, found {shown(cell)}; it is damaged")
-    return upgraded(table)
+    return table
 
 
 def _table(file: Path, kinds: Any) -> pd.DataFrame:
@@ -178,7 +137,7 @@ def read_rows(path: str | Path) -> pd.DataFrame:
     """Read one results file, or all ``.csv`` files of a folder.
 
     Raises:
-        UserError: if there is none, or a file has other columns. Files of older versions are read too, see :func:`upgraded`.
+        UserError: if there is none, or a file has other columns.
     """
     path = Path(path)
     if not path.exists():

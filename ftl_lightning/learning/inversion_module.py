@@ -17,6 +17,7 @@ from ftl_lightning.learning.inversion import Inversion, check_settings, warn_of_
 from ftl_lightning.learning.inversion_settings import (
     ADAPTED,
     AUTO,
+    INVERSION,
     MIXED,
     MODES,
     AdapterOptions,
@@ -29,7 +30,6 @@ from ftl_lightning.learning.inversion_settings import (
 )
 from ftl_lightning.learning.resume import ExactResume
 from ftl_lightning.option_groups import flat, groups_of
-from ftl_lightning.regrouped import INVERSION
 
 _USUAL = InversionSettings()
 _FORMS = {AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}"}

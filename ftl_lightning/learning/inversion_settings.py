@@ -10,7 +10,6 @@ from ftl_lightning.diffusion.schedule import LARGEST_POWER
 from ftl_lightning.errors import UserError, shown
 from ftl_lightning.option_groups import replaced
 from ftl_lightning.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
-from ftl_lightning.regrouped import INVERSION
 
 EXPLAINED = 0.4
 """Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
@@ -28,6 +27,31 @@ MEAN, CONCEPTS = STARTS = "mean", "concepts"
 FULL, REDUCED = PRECISIONS = "32-true", "bf16-mixed"
 """Of products while concepts are learned."""
 FORMS = (UNSAID, PAPER, AUTO, ONE, MODES, ADAPTED, MIXED)
+
+INVERSION: Mapping[str, str] = {
+    "initial_omega": "weights.initial",
+    "off_span": "embeddings.off_span",
+    "initial_spread": "embeddings.initial_spread",
+    "start": "embeddings.start",
+    "restarts": "budget.restarts",
+    "screening": "budget.screening",
+    "learning_rate": "budget.learning_rate",
+    "weight_learning_rate": "weights.learning_rate",
+    "samples": "budget.samples",
+    "mode_samples": "modes.samples",
+    "modes": "modes.sets",
+    "tolerance": "budget.tolerance",
+    "precision": "budget.precision",
+    "knots": "embeddings.knots",
+    "guidance_scale": "weights.scale",
+    "adapter": "adapter.rank",
+    "adapter_learning_rate": "adapter.learning_rate",
+    "adapter_scope": "adapter.scope",
+    "loss": "loss.kind",
+    "timestep_power": "loss.timestep_power",
+    "training_omega": "weights.training",
+}
+"""Place of each option of a group, ``'group.option'``, by its flat name in results, checkpoints and the Python API."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,7 +270,7 @@ class InversionSettings:
         return self.changed(start=MEAN, restarts=1, screening=0, **options)
 
     def changed(self, **options: Any) -> Self:
-        """The same with some options changed, which are given by their flat names (:data:`ftl_lightning.regrouped.INVERSION`)."""
+        """The same with some options changed, given by their flat names (:data:`INVERSION`)."""
         return replaced(self, options, INVERSION)
 
 

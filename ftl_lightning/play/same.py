@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ftl_lightning.concepts.concept import file_name
-from ftl_lightning.regrouped import INVERSION
+from ftl_lightning.learning.inversion_settings import INVERSION
 
 FOLDER = "concepts"
 """Where commands write learned concepts."""

@@ -15,7 +15,6 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import PAPERS_METHOD
-from ftl_lightning.evaluation.results import split_forms
 from ftl_lightning.evaluation.row import label
 from ftl_lightning.reporting.listed import read_listed
 from ftl_lightning.reporting.table import MISSING, Table, make_table, of_method, select
@@ -45,7 +44,7 @@ class _Row:
     method: str
     seed: int
     n: int
-    form: str | None = None
+    form: str = ""
     variant: str = ""
     temperature: float = math.nan
     accuracy: float = math.nan
@@ -56,8 +55,6 @@ class _Row:
 def read_frontier(path: str | Path) -> pd.DataFrame:
     """The measurements of a file, or of the folder that holds it; none where there is no file.
 
-    Older rows have no ``form``; their methods' names tell it, see :func:`ftl_lightning.evaluation.results.split_forms`.
-
     Raises:
         UserError: naming the file and the row, for one of something else.
     """
@@ -66,9 +63,7 @@ def read_frontier(path: str | Path) -> pd.DataFrame:
     if not path.is_file() or path.suffix != ".json":
         return pd.DataFrame(columns=COLUMNS)
     rows = [asdict(row) for row in read_listed(path, "rows", _Row, f"rows of {', '.join(COLUMNS)}")]
-    table = pd.DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(_NUMBERS, float))
-    older = table["form"].isna()
-    return split_forms(table.assign(form=table["form"].fillna("").astype(str)), older)
+    return pd.DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(_NUMBERS, float))
 
 
 def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:

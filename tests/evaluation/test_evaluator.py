@@ -28,7 +28,7 @@ from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, share, standard_error
-from ftl_lightning.evaluation.results import COLUMNS, append_rows, labels, read_rows
+from ftl_lightning.evaluation.results import append_rows, labels, read_rows
 from ftl_lightning.evaluation.row import Row, label
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning.model_folder import read_model
@@ -221,50 +221,6 @@ def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path, form: 
     assert new["form"].tolist() == [form, "", "", "", ""]
     append_rows(path, [row(task="a, b", method="FTL-IGM", form=form, variant="steps, set, near span 0.1", value=0.75)])
     assert read_rows(path)["value"].tolist() == [1.0, 0.25, 0.1, 0.5, 0.75]  # the same measurement, replaced
-
-
-BEFORE_FORMS = """domain,setting,task,method,variant,role,K,omega,demonstrations,seed,n,metric,value,model_hash,config_hash,version
-d,s,a,FTL-IGM,free,method,2,1.2,5,0,50,accuracy,0.5,00e1,c,0.1.0
-d,s,a,FTL-IGM with modes over time,"free, 8 knots",method,2,learned,5,0,50,accuracy,0.333333,00e1,d,0.1.0
-d,s,a,FTL-IGM over time with adapter,free,method,1,1.0,5,0,50,accuracy,1e-06,00e1,e,0.1.0
-d,s,a,MINE with adapter,,method,1,1.0,5,0,50,accuracy,1.0,00e1,f,0.1.0
-d,s,a,without modes,,method,1,1.0,5,0,50,accuracy,1.0,00e1,g,0.1.0
-d,s,a,a walk with modes,,reference,0,,5,0,50,accuracy,0.1,,h,0.1.0
-"""
-TOLD_APART = [("FTL-IGM", ""), ("FTL-IGM", "with modes over time"), ("FTL-IGM", "over time with adapter")]
-TOLD_APART += [("MINE", "with adapter"), ("without modes", ""), ("a walk with modes", "")]
-
-
-@pytest.mark.parametrize("added", [[], [{"task": "b"}]])
-def test_in_a_file_from_before_forms_methods_and_forms_are_told_apart_and_it_keeps_the_rest_text_for_text(
-    added: list[dict[str, object]], tmp_path: Path
-) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text(BEFORE_FORMS)
-    table, old = read_rows(path), pd.read_csv(path, dtype=str, keep_default_na=False)
-    assert table.columns.tolist() == COLUMNS
-    assert list(zip(table["method"], table["form"], strict=True)) == TOLD_APART
-    assert [label(*told) for told in TOLD_APART] == old["method"].tolist()
-    append_rows(path, [row(**changes) for changes in added])
-    new = pd.read_csv(path, dtype=str, keep_default_na=False)
-    assert new.columns.tolist() == COLUMNS
-    assert len(new) == len(old) + len(added)
-    assert list(zip(new["method"], new["form"], strict=True))[: len(old)] == TOLD_APART
-    kept = [name for name in old.columns if name != "method"]
-    assert new[kept].head(len(old)).equals(old[kept])
-    written = path.read_bytes()
-    append_rows(path, [])
-    assert path.read_bytes() == written  # once is enough
-
-
-def test_the_same_measurement_in_an_older_file_is_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text(BEFORE_FORMS)
-    same = {"method": "FTL-IGM", "form": "with modes over time", "variant": "free, 8 knots", "omega": "learned"}
-    append_rows(path, [row(task="a", config_hash="d", value=0.75, **same)])
-    table = read_rows(path)
-    assert len(table) == len(TOLD_APART)
-    assert table.loc[table["form"] == "with modes over time", "value"].tolist() == [0.75]
 
 
 def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_by_name_and_version(tiny: Path) -> None:

@@ -1,6 +1,6 @@
 """Options in groups, and the flat names under which results, checkpoints, models' records and the Python API know them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import FrozenInstanceError, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -9,13 +9,23 @@ import pytest
 
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
-from ftl_lightning.learning.inversion_settings import GROUPS, BudgetOptions, InversionSettings, LossOptions, ModeOptions
+from ftl_lightning.learning.inversion_settings import (
+    GROUPS,
+    INVERSION,
+    BudgetOptions,
+    InversionSettings,
+    LossOptions,
+    ModeOptions,
+)
+from ftl_lightning.lightning_cli import parse
 from ftl_lightning.methods.ftl_igm import pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
+from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING
 from ftl_lightning.option_groups import flat, groups_of, replaced
-from ftl_lightning.regrouped import INVERSION, PRETRAINING
-from tests.conftest import inversion_module
+from ftl_lightning.tuned import Tuned
+from tests.conftest import CONF, inversion_module
 
+OBJECTS = CONF / "object_rearrangement.yaml"
 PRETRAINING_GROUPS: Mapping[str, type] = {"loss": pretraining.LossOptions, "codes": Codes}
 OTHER: dict[str, Any] = {"initial_omega": 0.7, "off_span": 0.5, "initial_spread": 0.2, "start": "concepts", "knots": 4}
 OTHER |= {"restarts": 2, "screening": 3, "learning_rate": 0.02, "samples": 5, "tolerance": 0.3, "precision": "bf16-mixed"}
@@ -97,6 +107,41 @@ def test_hyper_parameters_are_flat_under_the_names_that_results_know(tiny: Path)
     found |= {"code_share": 0.5, "code_knots": 2, "code_size": 16, "code_noise": 0.3, "code_relative": True}
     assert {name: fit.hparams[name] for name in PRETRAINING} == found
     assert not {"codes", "budget"} & fit.hparams.keys()
+
+
+@pytest.mark.parametrize(
+    "null",
+    [
+        ["--model.budget.tolerance", "null", "--model.weights.training=null"],
+        ["--model.init_args.budget.tolerance=null", "--model.init_args.weights.training", "null"],
+    ],
+    ids=str,
+)
+def test_null_in_a_group_is_null_and_the_rest_of_the_group_stays(null: Sequence[str]) -> None:
+    options = ["--model.budget.tolerance=0.1", "--model.budget.samples=7", "--model.weights={training: 0.9, initial: 0.7}"]
+    found = parse("invert", [f"--config={OBJECTS}", *options, *null])["model"]["init_args"]
+    assert (found["budget"]["samples"], found["budget"]["tolerance"]) == (7, None)
+    assert (found["weights"]["initial"], found["weights"]["training"]) == (0.7, None)
+
+
+def test_null_of_an_option_that_is_in_no_group_leaves_the_others_beside_it() -> None:
+    found = parse("fit", [f"--config={OBJECTS}", "--model.denoiser_args.dropout=null"])["model"]["init_args"]["denoiser_args"]
+    assert "hidden_dim" in found
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ("{budget: {samples: 0}}", r"own\.yaml: model\.budget\.samples: expected 1 or more, found 0"),
+        ("{budget: {sample: 3}}", r"own\.yaml: key 'model\.budget\.sample': expected one of samples, .*, found another key"),
+        ("{budget: 3}", r"own\.yaml: key 'model\.budget': expected a mapping, found 3"),
+        ("{loss: {kind: 3}}", r"own\.yaml: key 'model\.loss\.kind': expected a text, found 3"),
+    ],
+)
+def test_a_mistake_in_the_settings_of_a_learner_is_one_line(options: str, told: str) -> None:
+    Path("own.yaml").write_text(f"model: {{init_args: {options}}}\n")
+    with pytest.raises(UserError, match=told):
+        Tuned.read("own.yaml")
 
 
 def test_what_is_no_group_is_told_in_one_line() -> None:

@@ -1,6 +1,5 @@
 """The file of accuracy over coverage, and its figure."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -50,10 +49,9 @@ def test_measurements_are_added_the_same_are_replaced_and_a_file_of_something_el
         read_frontier(tmp_path)
 
 
-def test_a_file_from_before_forms_is_read_and_added_to(tmp_path: Path) -> None:
+def test_the_same_measurement_is_replaced_and_others_stay(tmp_path: Path) -> None:
     path = tmp_path / "frontier.json"
-    older = [row("FTL-IGM with modes", 0.1, 0.5, 1.0), row("FTL-IGM", 0.1, 0.4, 1.5)]
-    path.write_text(json.dumps({"rows": [{name: cell for name, cell in told.items() if name != "form"} for told in older]}))
+    write_frontier(path, [row("FTL-IGM", 0.1, 0.5, 1.0, form="with modes"), row("FTL-IGM", 0.1, 0.4, 1.5)])
     write_frontier(path, [row("FTL-IGM", 0.1, 0.75, 1.0, form="with modes")])
     found = read_frontier(path)
     assert found[["method", "form", "accuracy"]].to_numpy().tolist() == [["FTL-IGM", "", 0.4], ["FTL-IGM", "with modes", 0.75]]

@@ -20,10 +20,21 @@ from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.option_groups import flat, groups_of
 from ftl_lightning.processes import drawn
 from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
-from ftl_lightning.regrouped import PRETRAINING
 
 WINDOWS = 4096
 """Of demonstrations, from which the scales of cosines are taken."""
+PRETRAINING: Mapping[str, str] = {
+    "condition_dropout": "loss.condition_dropout",
+    "loss": "loss.kind",
+    "timestep_power": "loss.timestep_power",
+    "loss_discount": "loss.discount",
+    "code_share": "codes.share",
+    "code_knots": "codes.knots",
+    "code_size": "codes.size",
+    "code_noise": "codes.noise",
+    "code_relative": "codes.relative",
+}
+"""Place of each option of a group, ``'group.option'``, by its flat name in the records of models."""
 
 
 @dataclass(frozen=True, kw_only=True)
