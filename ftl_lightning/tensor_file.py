@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from ftl_lightning.targets import expect_file
 
 _HEADER = "ftl_lightning"
 FORMAT = 1
-"""Version of a file's form, unless its kind has versions of its own; a reader refuses others."""
+"""Version of the format of a file, unless its kind has another; a reader refuses all others."""
 
 
 def cache_folder() -> Path:
@@ -131,7 +131,7 @@ def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any
         kind: what the file is, checked when it is read.
         tensors: by name.
         header: anything JSON can hold.
-        version: of the form of this kind of file.
+        version: of the format of this kind.
     """
     # One metadata key: safetensors does not keep the order of several, and bytes would differ from run to run.
     text = json.dumps({"kind": kind, "format": version, **header}, sort_keys=True)
@@ -148,16 +148,16 @@ def save_tensors(
         temporary.write_bytes(serialise(kind, tensors, header, version))
 
 
-def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,)) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_tensors(path: str | Path, kind: str, version: int = FORMAT) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what :func:`save_tensors` wrote.
 
     Args:
         path: the file.
         kind: what it is expected to be.
-        versions: of the form of this kind that the caller reads.
+        version: of the format of this kind.
 
     Returns:
-        Tensors by name, and the header with the file's version as ``format``.
+        Tensors by name, and the header.
 
     Raises:
         UserError: for a file that is missing, damaged, or of another kind.
@@ -165,7 +165,7 @@ def load_tensors(path: str | Path, kind: str, versions: Sequence[int] = (FORMAT,
     with _opened(Path(path), kind) as (file, text):
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
     with about(path):
-        return tensors, expect_kind(parse_json(text), kind, versions)
+        return tensors, expect_kind(parse_json(text), kind, version)
 
 
 def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]], Any]:
@@ -198,7 +198,7 @@ def _opened(path: Path, kind: str) -> Iterator[tuple[Any, str]]:
         raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({short(str(error), 100)})") from error
 
 
-def expect_kind(header: object, kind: str, versions: Sequence[int] = (FORMAT,)) -> dict[str, Any]:
+def expect_kind(header: object, kind: str, version: int = FORMAT) -> dict[str, Any]:
     """Refuse the header of a file of another kind or version.
 
     Raises:
@@ -208,10 +208,8 @@ def expect_kind(header: object, kind: str, versions: Sequence[int] = (FORMAT,)) 
     if not isinstance(header, dict) or found != kind:
         told = f"a {short(str(found))} file" if found else "a file of other software"
         raise UserError(f"expected a {kind} file, found {told}")
-    version = header.get("format")
-    if type(version) is not int or version not in versions:
-        expected = " or ".join(map(str, versions))
-        raise UserError(f"key 'format': expected {expected}, found {shown(version)}; it is of another version")
+    if header.get("format") != version or isinstance(header["format"], bool):
+        raise UserError(f"key 'format': expected {version}, found {shown(header.get('format'))}; it is of another version")
     return header
 
 

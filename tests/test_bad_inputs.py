@@ -12,8 +12,10 @@ import pytest
 import safetensors.torch
 import torch
 
+from ftl_lightning.concepts import concept
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.configuration import load
+from ftl_lightning.demonstrations import file_format
 from ftl_lightning.domains.from_file import read_demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import COLUMNS, read_rows
@@ -171,17 +173,15 @@ def test_weights_that_are_no_numbers_though_the_hash_is_right() -> None:
 # Learned concepts
 
 SHIPPED = json.loads((ROOT / "pretrained/agent/config.json").read_text())
-ORIGIN = {"kind": "concept", "format": 1, "name": PUSH, "domain": "agent", "encoder": SHIPPED["encoder"]}
+ORIGIN = {"kind": "concept", "format": concept.VERSION, "name": PUSH, "domain": "agent", "encoder": SHIPPED["encoder"]}
 ORIGIN |= {"pretrained": SHIPPED["hash"], "demonstrations": ZERO, "count": 5, "weights": "fixed", "loss": 0.1}
-PLAIN = {"embeddings": torch.zeros(2, 384), "weights": torch.ones(2)}
-KNOTS = ORIGIN | {"format": 3, "axes": "mode component knot n"}
-THREE = {"embeddings": torch.zeros(2, 1, 384), "weights": torch.ones(2)}
-MODES = ORIGIN | {"format": 2, "axes": "mode component n", "mixed": False}
+PLAIN = {"embeddings": torch.zeros(2, 1, 384), "weights": torch.ones(2)}
+MODES = ORIGIN | {"mixed": False}
 
 
 def adapted(outputs: int, rank: int) -> dict[str, torch.Tensor]:
     layer = "adapter/net.time.0.weight"
-    return THREE | {f"{layer}/up": torch.zeros(outputs, 2), f"{layer}/down": torch.zeros(rank, 32)}
+    return PLAIN | {f"{layer}/up": torch.zeros(outputs, 2), f"{layer}/down": torch.zeros(rank, 32)}
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +194,7 @@ def agent() -> ConceptModel:
     [
         *((header, PLAIN, "file of other software") for header in ([], {})),
         (ORIGIN | {"kind": ["concept"]}, PLAIN, "expected a concept file"),
-        (ORIGIN | {"format": "1"}, PLAIN, "key 'format': expected 1 or 2 or 3 or 4, found '1'"),
+        (ORIGIN | {"format": "5"}, PLAIN, "key 'format': expected 5, found '5'"),
         (ORIGIN | {"format": [1]}, PLAIN, "key 'format'"),
         (ORIGIN | {"name": nested(100)}, PLAIN, "deep"),
         (ORIGIN | {"name": {"a": 1}}, PLAIN, "key 'name': expected a text"),
@@ -207,25 +207,28 @@ def agent() -> ConceptModel:
         (ORIGIN | {"domain": "driving"}, PLAIN, "key 'domain': expected 'agent'"),
         (ORIGIN, PLAIN | {"weights": torch.ones(1)}, "key 'weights': expected float32 of shape (2,), found float32 of shape (1,)"),
         *((ORIGIN, PLAIN | {"weights": ones}, "key 'weights'") for ones in (torch.ones(2, 2), torch.ones(2, dtype=torch.int64))),
-        (ORIGIN, PLAIN | {"embeddings": torch.zeros(2, 384, dtype=torch.float64)}, "key 'embeddings': expected float32"),
-        (ORIGIN, PLAIN | {"embeddings": torch.zeros(2, 383)}, "key 'embeddings': expected 384 numbers each, found 383"),
+        (ORIGIN, PLAIN | {"embeddings": torch.zeros(2, 1, 384, dtype=torch.float64)}, "key 'embeddings': expected float32"),
+        (ORIGIN, PLAIN | {"embeddings": torch.zeros(2, 1, 383)}, "key 'embeddings': expected 384 numbers each, found 383"),
         (ORIGIN, PLAIN | {"embeddings": torch.zeros(768)}, "key 'embeddings'"),
-        (ORIGIN, {"embeddings": torch.zeros(0, 384), "weights": torch.zeros(0)}, "key 'embeddings'"),
-        (ORIGIN, PLAIN | {"embeddings": torch.full((2, 384), float("nan"))}, "'embeddings'"),
+        (ORIGIN, {"embeddings": torch.zeros(0, 1, 384), "weights": torch.zeros(0)}, "key 'embeddings'"),
+        (ORIGIN, PLAIN | {"embeddings": torch.full((2, 1, 384), float("nan"))}, "'embeddings'"),
         (ORIGIN, PLAIN | {"weights": torch.tensor([1.0, float("inf")])}, "'weights'"),
         (ORIGIN, PLAIN | {"more": torch.zeros(1)}, "found more too"),
         (ORIGIN, {"weights": torch.ones(2)}, "found none of embeddings"),
         (MODES, PLAIN, "found none of mode_embeddings, mode_weights"),
-        (MODES, PLAIN | {"mode_embeddings": torch.zeros(3, 2, 384), "mode_weights": torch.zeros(2, 2)}, "key 'mode_weights'"),
-        (MODES, PLAIN | {"mode_embeddings": torch.zeros(3, 1, 384), "mode_weights": torch.zeros(3, 2)}, "key 'mode_embeddings'"),
-        (MODES | {"mixed": "no"}, PLAIN | {"mode_embeddings": torch.zeros(3, 2, 384), "mode_weights": torch.zeros(3, 2)}, "mixed"),
-        (KNOTS | {"axes": 3}, THREE, "key 'axes'"),
-        (KNOTS, PLAIN, "key 'embeddings'"),
-        (KNOTS, THREE | {"embeddings": torch.zeros(2, 0, 384)}, "key 'embeddings'"),
-        (KNOTS, THREE | {"adapter/net.time.0.weight/up": torch.zeros(128, 2)}, "key 'adapter/net.time.0.weight'"),
-        (KNOTS, THREE | {"adapter/x/up": torch.zeros(3, 2), "adapter/x/down": torch.zeros(2, 3)}, "key 'adapter/x'"),
-        (KNOTS, adapted(128, 3), "key 'adapter/net.time.0.weight': expected shapes (outputs, rank) and (rank, inputs)"),
-        (KNOTS, adapted(127, 2), "key 'adapter/net.time.0.weight': expected the sizes (128, 32), found (127, 32)"),
+        (MODES, PLAIN | {"mode_embeddings": torch.zeros(3, 2, 1, 384), "mode_weights": torch.zeros(2, 2)}, "key 'mode_weights'"),
+        (MODES, PLAIN | {"mode_embeddings": torch.zeros(3, 1, 1, 384), "mode_weights": torch.zeros(3, 2)}, "key 'mode_embeddings'"),
+        (
+            MODES | {"mixed": "no"},
+            PLAIN | {"mode_embeddings": torch.zeros(3, 2, 1, 384), "mode_weights": torch.zeros(3, 2)},
+            "mixed",
+        ),
+        (ORIGIN, PLAIN | {"embeddings": torch.zeros(2, 384)}, "key 'embeddings': expected shape (K, knots, n), found (2, 384)"),
+        (ORIGIN, PLAIN | {"embeddings": torch.zeros(2, 0, 384)}, "key 'embeddings'"),
+        (ORIGIN, PLAIN | {"adapter/net.time.0.weight/up": torch.zeros(128, 2)}, "key 'adapter/net.time.0.weight'"),
+        (ORIGIN, PLAIN | {"adapter/x/up": torch.zeros(3, 2), "adapter/x/down": torch.zeros(2, 3)}, "key 'adapter/x'"),
+        (ORIGIN, adapted(128, 3), "key 'adapter/net.time.0.weight': expected shapes (outputs, rank) and (rank, inputs)"),
+        (ORIGIN, adapted(127, 2), "key 'adapter/net.time.0.weight': expected the sizes (128, 32), found (127, 32)"),
     ],
     ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
 )
@@ -236,7 +239,7 @@ def test_a_learned_concept(agent: ConceptModel, header: object, tensors: dict[st
 
 # Demonstrations
 
-FORM = {"kind": "demonstrations", "format": 2, "domain": "agent", "concepts": ["", ""], "per_step": []}
+FORM = {"kind": "demonstrations", "format": file_format.VERSION, "domain": "agent", "concepts": ["", ""], "per_step": []}
 STATES = {"states": torch.zeros(2, 3, 13), "lengths": torch.full((2,), 3), "observed/world": torch.zeros(2, 52)}
 
 
@@ -252,8 +255,9 @@ STATES = {"states": torch.zeros(2, 3, 13), "lengths": torch.full((2,), 3), "obse
         (FORM | {"provenance": [1]}, STATES, "key 'provenance': expected a mapping"),
         (FORM | {"domain": 3}, STATES, "key 'domain': expected a text"),
         (FORM | {"domain": "driving"}, STATES, "key 'domain': expected 'agent', found 'driving'"),
-        (FORM | {"format": 3}, STATES, "key 'compressed'"),
-        (FORM | {"format": 3, "compressed": {"observed/x": [2, 10**12]}}, STATES, "observed/x"),
+        (FORM | {"format": 3}, STATES, "key 'format': expected 4, found 3"),
+        (FORM | {"compressed": [3]}, STATES, "key 'compressed'"),
+        (FORM | {"compressed": {"observed/x": [2, 10**12]}}, STATES, "observed/x"),
         (FORM, STATES | {"states": torch.zeros(2, 3, 13, dtype=torch.float64)}, "key 'states': expected float32"),
         *((FORM, STATES | {"states": states}, "key 'states'") for states in (torch.zeros(2, 3), torch.zeros(2, 3, 5))),
         (FORM, STATES | {"states": torch.full((2, 3, 13), float("nan"))}, "key 'states': expected finite numbers"),

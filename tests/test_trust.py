@@ -14,6 +14,7 @@ from nbclient import NotebookClient
 
 from ftl_lightning import trust
 from ftl_lightning.cli import main
+from ftl_lightning.concepts.concept import VERSION
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.registry import load_domain
@@ -218,17 +219,24 @@ def concept() -> None:
     """A learned concept of the shipped model."""
     content = json.loads((ROOT / "pretrained/driving/config.json").read_text())
     origin = {"name": "merge", "domain": content["domain"], "encoder": content["encoder"], "pretrained": content["hash"]}
-    header = {"kind": "concept", "format": 1, **origin, "demonstrations": "0" * 16, "count": 5, "weights": "fixed", "loss": 0.1}
-    tensors = {"embeddings": torch.ones(1, content["concept_dim"]), "weights": torch.ones(1)}
+    header = {
+        "kind": "concept",
+        "format": VERSION,
+        **origin,
+        "demonstrations": "0" * 16,
+        "count": 5,
+        "weights": "fixed",
+        "loss": 0.1,
+    }
+    tensors = {"embeddings": torch.ones(1, 1, content["concept_dim"]), "weights": torch.ones(1)}
     safetensors.torch.save_file(tensors, "c.safetensors", {"ftl_lightning": json.dumps(header)})
 
 
 @found
 @pytest.mark.parametrize("place", ["logs", "pretrained"])
-@pytest.mark.parametrize("form", [1, 2])
-def test_folders_that_a_search_finds_are_read_as_data(place: str, form: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_that_a_search_finds_are_read_as_data(place: str, capsys: pytest.CaptureFixture[str]) -> None:
     concept()
-    model(DOMAIN, format=form, initial_state_dim=3)
+    model(DOMAIN)
     Path(place).mkdir()
     Path("model").rename(f"{place}/a")
     # The planted folder has the hash of the model, which ships, too, and is found.

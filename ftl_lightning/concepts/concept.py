@@ -1,6 +1,6 @@
 """A learned concept and its file."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Self
@@ -17,20 +17,17 @@ from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor, expect_range
 from ftl_lightning.representation import Shown, counted, numbers
 from ftl_lightning.schema import built, expect_type
 from ftl_lightning.shipped import shipped
-from ftl_lightning.tensor_file import FORMAT, expect_finite, load_tensors, save_tensors
+from ftl_lightning.tensor_file import expect_finite, load_tensors, save_tensors
 
 KIND = "concept"
-VERSIONS = (FORMAT, 2, 3, 4)
-"""Of the file's form: 4 for a concept that is composed from another set, 3 for one with knots or an adapter, 2 for one with modes,
-1 for the paper's. Each is written in the first form that can hold it."""
-AXES = {2: "mode component n", 3: "mode component knot n", 4: "mode component knot n"}
-"""What the dimensions of the modes' embeddings are in each form; those of a concept lack the first."""
-EMBEDDINGS = ("embeddings", "mode_embeddings")
-"""Names of the tensors that have an axis of knots, but in files of the first two forms, whose concepts have one knot."""
+VERSION = 5
+"""Version of the file format."""
+MODES = ("mode_embeddings", "mode_weights")
+"""Tensors of the modes, with the header's key ``mixed``; only in files of concepts that have modes."""
 COMPOSING = ("composing_embeddings", "composing_weights")
-"""Names of the tensors of a set that a concept is composed from."""
+"""Tensors of the set that a concept is composed from; only in files of concepts that have one."""
 ADAPTER = "adapter/"
-"""Names of an adapter's tensors begin so."""
+"""Prefix of the tensors of an adapter."""
 
 
 @dataclass(frozen=True)
@@ -136,14 +133,14 @@ class Concept(Shown):
     quality: QualityRecord | None = None
 
     def __post_init__(self) -> None:
-        _expect_shapes(self._sets, ("K", "knots", "n"))
+        _expect_shapes(self._sets)
 
     @property
     def _sets(self) -> dict[str, Tensor]:
         """Embeddings and weights, by the names of a file's tensors."""
         found = {"embeddings": self.embeddings, "weights": self.weights}
         if self.modes is not None:
-            found |= {"mode_embeddings": self.modes.embeddings, "mode_weights": self.modes.weights}
+            found |= dict(zip(MODES, (self.modes.embeddings, self.modes.weights), strict=True))
         if self.composing is not None:
             found |= dict(zip(COMPOSING, self.composing, strict=True))
         return found
@@ -232,10 +229,7 @@ class Concept(Shown):
             UserError: for numbers that are not finite.
         """
         self.expect_finite(str(path))
-        tensors = dict(self._sets)
         header = {**asdict(self.origin), "components": len(self.weights)}
-        form = 3 if self.knots > 1 or self.adapter is not None else FORMAT if self.modes is None else 2
-        form = form if self.composing is None else 4
         if self.modes is not None:
             header |= {"mixed": self.modes.mixed}
             header |= {} if self.modes.stretch == STRETCH else {"stretch": self.modes.stretch}
@@ -245,13 +239,9 @@ class Concept(Shown):
             header |= {"quality": asdict(self.quality)}
         if self.adapter is not None and self.adapter.everywhere:
             header |= {"everywhere": True}
-        if form in AXES:
-            header |= {"axes": AXES[form]}
-        if form >= 3:
-            tensors |= {f"{ADAPTER}{name}": factor for name, factor in (self.adapter.tensors() if self.adapter else {}).items()}
-        else:
-            tensors |= {name: values.flatten(-2) for name, values in tensors.items() if name in EMBEDDINGS}
-        save_tensors(path, KIND, {name: values.contiguous() for name, values in tensors.items()}, header, form)
+        factors = {} if self.adapter is None else self.adapter.tensors()
+        tensors = {**self._sets, **{f"{ADAPTER}{name}": factor for name, factor in factors.items()}}
+        save_tensors(path, KIND, {name: values.contiguous() for name, values in tensors.items()}, header, VERSION)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -263,33 +253,27 @@ class Concept(Shown):
         Raises:
             UserError: for a file that is missing, damaged or not a concept.
         """
-        tensors, header = load_tensors(shipped(path), KIND, VERSIONS)
-        form = header["format"]
-        several = form == 2 or "mixed" in header
-        keys = [*(field.name for field in fields(Origin)), *(("axes",) if form in AXES else ()), *(("mixed",) if several else ())]
-        names = ["embeddings", "weights", *(("mode_embeddings", "mode_weights") if several else ())]
-        names += COMPOSING if form == 4 else ()
+        tensors, header = load_tensors(shipped(path), KIND, VERSION)
+        several, composed = "mixed" in header, COMPOSING[0] in tensors
+        names = ["embeddings", "weights", *(MODES if several else ()), *(COMPOSING if composed else ())]
+        keys = [field.name for field in fields(Origin)]
         missing = [key for key in keys if key not in header] + [name for name in names if name not in tensors]
         with about(path):
             if missing:
                 raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
-            if form in AXES and header["axes"] != AXES[form]:
-                raise UserError(f"key 'axes': expected {AXES[form]!r}, found {shown(header['axes'])}; a newer version may read it")
             factors = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
-            if unknown := set(tensors) - set(names) - ({f"{ADAPTER}{name}" for name in factors} if form >= 3 else set()):
+            if unknown := set(tensors) - set(names) - {f"{ADAPTER}{name}" for name in factors}:
                 raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
-            _expect_shapes({name: tensors[name] for name in names}, ("K", "knots", "n") if form >= 3 else ("K", "n"))
-            if form < 3:  # one knot, which has no axis
-                tensors |= {name: tensors[name].unsqueeze(-2) for name in names if name in EMBEDDINGS}
-            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere") if form >= 3 else False
+            _expect_shapes({name: tensors[name] for name in names})
+            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere")
             adapter = LowRank.from_tensors(factors, everywhere) if factors else None
-            mixed = expect_type(header["mixed"], bool, "mixed") if several else False
+            mixed = expect_type(header.get("mixed", False), bool, "mixed")
             stretch = expect_type(header.get("stretch", STRETCH), float, "stretch")
             expect_factor("key 'stretch'", stretch, 0)
-            modes = Modes(tensors["mode_embeddings"], tensors["mode_weights"], mixed, stretch) if several else None
-            origin = built(Origin, {field.name: header[field.name] for field in fields(Origin)}, "")
+            modes = Modes(tensors[MODES[0]], tensors[MODES[1]], mixed, stretch) if several else None
+            origin = built(Origin, {key: header[key] for key in keys}, "")
             choice = built(Choice, header["choice"], "choice") if header.get("choice") else None
-            composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if form == 4 else None
+            composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if composed else None
             quality = built(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
             concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality)
             if header.get("components", len(concept.weights)) != len(concept.weights):
@@ -303,19 +287,18 @@ def file_name(concept: str) -> str:
     return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
 
 
-def _expect_shapes(tensors: Mapping[str, Tensor], axes: Sequence[str]) -> None:
-    """Refuse a concept's tensors whose shapes or types are not those of one.
+def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
+    """Check that the tensors of a concept are float32 and that their shapes go together.
 
     Args:
-        tensors: ``embeddings``, ``weights`` and, with modes, ``mode_embeddings`` and ``mode_weights``; what it is composed from.
-        axes: names of the embeddings' axes, the components' first.
+        tensors: ``embeddings`` ``(K, knots, n)``, ``weights`` ``(K,)``; maybe :data:`MODES` and :data:`COMPOSING`.
 
     Raises:
-        UserError: naming the first.
+        UserError: naming the first tensor of another shape or type.
     """
     shape = tuple(tensors["embeddings"].shape)
-    if len(shape) != len(axes) or not all(shape):
-        raise UserError(f"key 'embeddings': expected shape ({', '.join(axes)}), found {shape}")
+    if len(shape) != 3 or not all(shape):
+        raise UserError(f"key 'embeddings': expected shape (K, knots, n), found {shape}")
     modes = max((*tensors.get("mode_embeddings", torch.empty(0)).shape, 0)[0], 1)
     composing = (*tuple(tensors.get(COMPOSING[1], tensors["weights"]).shape)[:1], *shape[1:])
     expected = {"embeddings": shape, "weights": shape[:1], "mode_embeddings": (modes, *shape), "mode_weights": (modes, shape[0])}

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from ftl_lightning.concepts.concept import ADAPTER, KIND, VERSIONS, Origin, QualityRecord
+from ftl_lightning.concepts.concept import ADAPTER, KIND, MODES, VERSION, Origin, QualityRecord
 from ftl_lightning.errors import UserError, about
 from ftl_lightning.representation import counted
 from ftl_lightning.schema import built
@@ -42,21 +42,19 @@ def summary(path: str | Path) -> Summary | None:
     if isinstance(header, dict) and isinstance(header.get("kind"), str) and header["kind"] != KIND:
         return None
     with about(path):
-        told = expect_kind(header, KIND, VERSIONS)
+        told = expect_kind(header, KIND, VERSION)
         names = [field.name for field in fields(Origin)]
         if missing := [*(key for key in names if key not in told), *({"embeddings", "weights"} - set(shapes))]:
             raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
         origin = built(Origin, {name: told[name] for name in names}, "")
         quality = built(QualityRecord, told["quality"], "quality") if told.get("quality") is not None else None
-        return Summary(origin, _form(shapes, told["format"], told.get("mixed") is True), quality)
+        return Summary(origin, _form(shapes, told.get("mixed") is True), quality)
 
 
-def _form(shapes: Shapes, version: int, mixed: bool) -> str:
-    """A concept's form by the shapes of its tensors; in files of the first two versions a component has one knot and no axis of
-    knots.
-    """
-    modes, embeddings = shapes.get("mode_embeddings", ()), shapes["embeddings"]
+def _form(shapes: Shapes, mixed: bool) -> str:
+    """The form of a concept, by the shapes of its tensors."""
+    modes, embeddings = shapes.get(MODES[0], ()), shapes["embeddings"]
     parts = ["mixtures" if mixed else counted(modes[0], "mode")] if modes else []
     parts += ["adapter"] if any(name.startswith(ADAPTER) for name in shapes) else []
-    over_time = version >= 3 and len(embeddings) == 3 and embeddings[1] > 1
+    over_time = len(embeddings) == 3 and embeddings[1] > 1
     return f"{' and '.join(parts) or 'one set'}{' over time' if over_time else ''}"

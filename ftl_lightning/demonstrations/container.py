@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.data_names import written_to
 from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed, take
-from ftl_lightning.demonstrations.file_format import INITIAL, read, write
+from ftl_lightning.demonstrations.file_format import read, write
 from ftl_lightning.demonstrations.file_keys import KIND, OBSERVED
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.extras import expect_extra
@@ -252,9 +252,7 @@ class Demonstrations(Shown):
             return cls(**contents)
 
     def fitted(self, features: Mapping[str, Feature]) -> Self:
-        """The same with the observed features of a domain.
-
-        The initial states of form 1 hold them one after another; what follows them is what no model sees.
+        """The demonstrations themselves, whose observed features are those of a domain.
 
         Args:
             features: of the domain, by name.
@@ -262,25 +260,13 @@ class Demonstrations(Shown):
         Raises:
             UserError: for a feature that is missing or has another type or shape.
         """
-        separate = self
-        if set(self.observed) == {INITIAL} and INITIAL not in features and features:
-            values, per_step = self.observed[INITIAL], bool(self.per_step)
-            sizes = [feature.size for feature in features.values()]
-            if values.shape[-1] < sum(sizes):
-                raise UserError(f"key 'initial_states': expected {sum(sizes)} numbers each or more, found {values.shape[-1]}")
-            parts = values[..., : sum(sizes)].split(sizes, dim=-1)
-            observed = {
-                name: part.unflatten(-1, feature.shape).contiguous()
-                for (name, feature), part in zip(features.items(), parts, strict=True)
-            }
-            separate = replace(self, observed=observed, per_step=tuple(features) if per_step else ())
         for name, feature in features.items():
-            if (held := separate.features.get(name)) is None or not held.fits(feature):
+            if (held := self.features.get(name)) is None or not held.fits(feature):
                 told = "none" if held is None else held.words
-                if held is not None and held.shape[1:] == feature.shape and name not in separate.per_step:
+                if held is not None and held.shape[1:] == feature.shape and name not in self.per_step:
                     told += " (observed at every time? then list it in per_step)"
                 raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {told}")
-        return separate
+        return self
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:

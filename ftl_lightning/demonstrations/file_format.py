@@ -1,4 +1,4 @@
-"""The file of demonstrations: what stands in it, in all forms that are still read."""
+"""The file of demonstrations."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,14 +17,9 @@ from ftl_lightning.extras import expect_extra
 from ftl_lightning.schema import expect_type
 from ftl_lightning.tensor_file import load_tensors, save_tensors
 
-VERSION = 3
-"""Of the form of a file with images: they are compressed (zlib), 1-D uint8 under their keys, with their shapes by key in the header
-as ``compressed``. Forms 1 and 2 still load."""
-PLAIN = 2
-"""The form of a file without images. Older files of this form hold images that are not compressed; form 1 had ``initial_states`` in
-place of observed features and scenes."""
-INITIAL = "initial_state"
-"""The observed feature that the initial states of form 1 become."""
+VERSION = 4
+"""Version of the file format. Images are compressed (zlib), 1-D uint8 under their keys; the header has their shapes by key as
+``compressed``."""
 
 
 class Contents(TypedDict):
@@ -61,11 +56,11 @@ def write(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, 
     images = {key: values for key, values in tensors.items() if values.dtype == torch.uint8}
     shapes = {"compressed": {key: list(values.shape) for key, values in images.items()}} if images else {}
     stored = {**tensors, **{key: compressed(values) for key, values in images.items()}}
-    save_tensors(path, KIND, stored, {**header, **shapes}, VERSION if images else PLAIN)
+    save_tensors(path, KIND, stored, {**header, **shapes}, VERSION)
 
 
 def read(path: str | Path) -> Contents:
-    """Read what :func:`write` wrote, in any of its forms, an ``.npz`` file without objects, or a data set.
+    """Read what :func:`write` wrote, an ``.npz`` file without objects, or a data set.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, of another kind, or says something of another type.
@@ -82,7 +77,7 @@ def read(path: str | Path) -> Contents:
 
         return read_data_set(name)
     path = Path(path)
-    tensors, header = read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, (1, PLAIN, VERSION))
+    tensors, header = read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, VERSION)
     with about(path):
         if "states" not in tensors:
             told = short(", ".join(tensors)) or "nothing"
@@ -91,12 +86,9 @@ def read(path: str | Path) -> Contents:
         demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
         texts = {key: _texts(key, header[key]) for key in TEXTS if key in header}
         per_step, scenes = texts.get("per_step", ()), tensors.get("scenes")
-        if header.get("format") == VERSION and demos:
+        if "compressed" in header and demos:
             tensors |= decompressed_images(tensors, header.get("compressed"), per_step)
         observed = {name.removeprefix(OBSERVED): values for name, values in tensors.items() if name.startswith(OBSERVED)}
-        if (initial := tensors.get("initial_states")) is not None:  # form 1
-            observed, per_step = {INITIAL: initial}, (INITIAL,) if initial.dim() == 3 else ()
-            scenes = initial[:, 0] if initial.dim() == 3 else initial
         return {
             "states": states,
             "lengths": tensors.get("lengths", torch.full((demos,), time)),

@@ -216,18 +216,16 @@ class Random(NamedTuple):
         checkpoint[_RANDOM] = self._asdict()
 
     @classmethod
-    def read(cls, checkpoint: Mapping[str, Any]) -> "Random | None":
-        """From a checkpoint; ``None`` where an older version wrote it without.
+    def read(cls, checkpoint: Mapping[str, Any]) -> "Random":
+        """From a checkpoint.
 
         Raises:
-            UserError: if it is damaged.
+            UserError: if the states are missing or damaged.
         """
-        if _RANDOM not in checkpoint:
-            return None
         try:
             found = cls(**checkpoint[_RANDOM])
             torch.Generator().set_state(found.cpu)
-        except (TypeError, RuntimeError) as error:
+        except (KeyError, TypeError, RuntimeError) as error:
             raise UserError(f"ckpt_path: key {_RANDOM!r}: expected states of generators, found something else") from error
         if not isinstance(found.iterations, int) or not 0 <= found.iterations <= 9 or not isinstance(found.cuda, Tensor | None):
             raise UserError(f"ckpt_path: key {_RANDOM!r}: expected states of generators, found something else")

@@ -177,7 +177,6 @@ class InversionModule(ExactResume, Adaptation):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another module, model, concepts or kind of weights; the frozen model is in none."""
-        with_knots(checkpoint, self.inversion.embeddings.shape)
         super().on_load_checkpoint(checkpoint)
         self._found = {}
 
@@ -227,20 +226,3 @@ class InversionModule(ExactResume, Adaptation):
     def training_weight(self, task: EvaluationTask) -> float:
         omega = self.settings.weights.training if task.learned else None
         return super().training_weight(task) if omega is None else omega
-
-
-def with_knots(checkpoint: dict[str, Any], shape: torch.Size) -> None:
-    """Give embeddings of a checkpoint the shape ``(run, K, knots, n)`` where an older version wrote ``(run, K, knots * n)``: the
-    parameter, what the rule of stopping keeps of it, and the state of its optimiser, which is that of the first parameter.
-    """
-    flat = (*shape[:2], shape[2] * shape[3])
-    held = dict.fromkeys(
-        ("inversion.embeddings", "inversion.stopping.embeddings", "inversion.stopping._sums"), checkpoint["state_dict"]
-    )
-    for optimizer in checkpoint.get("optimizer_states", ()):
-        match optimizer:
-            case {"state": {0: dict() as moments}}:
-                held |= dict.fromkeys(("exp_avg", "exp_avg_sq"), moments)
-    for name, tensors in held.items():
-        if isinstance(value := tensors.get(name), Tensor) and value.shape == flat:
-            tensors[name] = value.reshape(shape)

@@ -1,7 +1,7 @@
 """The configuration of a pretrained model: what its ``config.json`` says."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,11 @@ from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST, expect_range
 from ftl_lightning.schema import expect_type, read_json
 from ftl_lightning.shipped import missing_model
-from ftl_lightning.tensor_file import FORMAT
 
 CONFIG = "config.json"
 """In a model's folder."""
 VERSION = 2
-"""Of the configuration's form. Form 1, which still loads, did not name observed features."""
+"""Version of the configuration's format."""
 LONGEST = 10_000
 """States in a plan; networks over time have the same weights for any number."""
 DIFFUSION = "diffusion"
@@ -84,33 +83,12 @@ def read_config(folder: str | Path) -> dict[str, Any]:
         raise UserError(missing_model(folder))
     found = read_json(path)
     with about(path):
-        version = found.get("format") if isinstance(found, dict) else None
-        if type(version) is not int or version not in (FORMAT, VERSION):
-            raise UserError(
-                f"expected the configuration of a pretrained model, found something else (its format is not {FORMAT} or {VERSION})"
-            )
+        if not isinstance(found, dict) or found.get("format") != VERSION:
+            raise UserError(f"expected the configuration of a pretrained model, found something else (its format is not {VERSION})")
         content: dict[str, Any] = {"kind": DIFFUSION} | found
         for key in ("kind", "hash", "domain"):
             expect_type(content.get(key), str, key)
         return content
-
-
-def upgrade(content: dict[str, Any], domain: Domain) -> None:
-    """Bring a configuration of form 1 to form 2, in place: features are those of its domain and view.
-
-    Args:
-        content: of :func:`read_config`, of either form.
-        domain: that it names.
-    """
-    if content["format"] == VERSION:
-        return
-    size = content.pop("initial_state_dim", 0)
-    for key in ("entities", "looks", "state_columns"):
-        content.pop(key, None)
-    view = find_view(domain, expect_type(content.get("view", ""), str, "view"))
-    features = domain.observed if view is None else view.features
-    content["observed"] = {name: asdict(feature) for name, feature in features.items()} if size else {}
-    content["format"] = VERSION
 
 
 def expect_domain(config: ModelConfig, domain: Domain) -> None:

@@ -13,7 +13,7 @@ from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.learning.concept_model import KIND, ConceptModel
-from ftl_lightning.learning.model_config import CONFIG, VERSION, expect_domain, read_config, upgrade
+from ftl_lightning.learning.model_config import CONFIG, VERSION, expect_domain, read_config
 from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weights
 from ftl_lightning.learning.prepared import blank
 from ftl_lightning.schema import built
@@ -61,8 +61,6 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
             raise UserError(f"key 'kind': expected {kind.method.kind!r}, found {found!r}, the model of another method")
         if domain is None and content["domain"] != OWN:
             domain = domain_of_file(content["domain"])
-        if domain is not None:
-            upgrade(content, domain)
         del content["format"]
         expected_hash = content.pop("hash")
         config = built(kind.Config, content, "")

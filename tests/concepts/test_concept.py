@@ -1,14 +1,15 @@
-"""A learned concept's file: form 1 without modes, form 2 with them."""
+"""The file of a learned concept."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from safetensors import safe_open
 
-from ftl_lightning.concepts.concept import AXES, KIND, Concept, Origin
+from ftl_lightning.concepts.concept import KIND, VERSION, Concept, Origin
 from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import save_tensors
@@ -44,8 +45,6 @@ def test_committed_files_are_read_and_written_with_the_same_bytes() -> None:
 def test_a_concept_with_modes_comes_back_from_its_file(mixed: bool) -> None:
     own = concept(mixed=mixed)
     own.save("c.safetensors")
-    assert header("c.safetensors")["format"] == 2
-    assert header("c.safetensors")["axes"] == "mode component n"
     found = Concept.load("c.safetensors")
     assert torch.equal(found.modes.embeddings, own.modes.embeddings)
     assert torch.equal(found.modes.weights, own.modes.weights)
@@ -58,42 +57,40 @@ def test_a_concept_with_modes_comes_back_from_its_file(mixed: bool) -> None:
     assert Path("c.safetensors").read_bytes() == before
 
 
-def test_a_concept_without_modes_is_written_in_the_first_form_and_has_no_modes_when_read() -> None:
+def test_a_concept_without_modes_has_no_modes_when_read() -> None:
     concept(modes=0).save("c.safetensors")
-    assert header("c.safetensors")["format"] == 1
-    assert not {"axes", "mixed"} & header("c.safetensors").keys()
+    assert "mixed" not in header("c.safetensors")
     assert Concept.load("c.safetensors").modes is None
     assert Concept.load("c.safetensors").composition.modes is None
 
 
-def written(form: int, without: str = "", **changes: object) -> str:
-    """A file whose header differs from that of a concept with modes."""
+def write_changed(version: int = VERSION, without: str = "", **changes: object) -> None:
+    """Write ``c.safetensors``, a concept with modes that lacks a key or a tensor, or whose header has changes."""
     own = concept()
-    tensors = {"embeddings": own.embeddings[:, 0], "weights": own.weights}
-    tensors |= {"mode_embeddings": own.modes.embeddings[:, :, 0], "mode_weights": own.modes.weights}
-    told = {**ORIGIN.__dict__, "axes": AXES[2], "mixed": False, **changes}
+    tensors = {"embeddings": own.embeddings, "weights": own.weights}
+    tensors |= {"mode_embeddings": own.modes.embeddings, "mode_weights": own.modes.weights}
+    content = {**ORIGIN.__dict__, "mixed": False, **changes}
     kept = {name: tensor for name, tensor in tensors.items() if name != without}
-    save_tensors("c.safetensors", KIND, kept, {key: value for key, value in told.items() if key != without}, form)
-    return "c.safetensors"
+    save_tensors("c.safetensors", KIND, kept, {key: value for key, value in content.items() if key != without}, version)
 
 
 @pytest.mark.parametrize(
-    ("path", "message"),
+    ("changes", "message"),
     [
-        (
-            {"form": 2, "axes": "mode time component n"},
-            "key 'axes': expected 'mode component n', found 'mode time component n'; a newer version may read it",
-        ),
-        ({"form": 5}, "key 'format': expected 1 or 2 or 3 or 4, found 5; it is of another version"),
-        ({"form": 2, "without": "axes"}, "expected the keys of a concept, found none of axes"),
-        ({"form": 2, "without": "mode_weights"}, "expected the keys of a concept, found none of mode_weights"),
-        ({"form": 1, "without": "embeddings"}, "expected the keys of a concept, found none of embeddings"),
+        ({"version": 1}, f"key 'format': expected {VERSION}, found 1; it is of another version"),
+        ({"version": VERSION + 1}, f"key 'format': expected {VERSION}, found {VERSION + 1}; it is of another version"),
+        ({"without": "mixed"}, "expected the tensors embeddings, weights, found mode_embeddings, mode_weights too"),
+        ({"without": "mode_weights"}, "expected the keys of a concept, found none of mode_weights"),
+        ({"without": "embeddings"}, "expected the keys of a concept, found none of embeddings"),
+        ({"without": "name"}, "expected the keys of a concept, found none of name"),
+        ({"mixed": 1}, "key 'mixed': expected true or false, found 1"),
     ],
     ids=str,
 )
-def test_a_form_that_cannot_be_read_is_told_in_one_line(path: dict[str, object], message: str) -> None:
+def test_a_file_that_cannot_be_read_is_one_line(changes: dict[str, Any], message: str) -> None:
+    write_changed(**changes)
     with pytest.raises(UserError) as told:
-        Concept.load(written(**path))  # type: ignore[arg-type]
+        Concept.load("c.safetensors")
     assert str(told.value) == f"c.safetensors: {message}"
 
 

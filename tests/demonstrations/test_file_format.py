@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -6,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Feature
-from ftl_lightning.domains.registry import load_domain
+from ftl_lightning.demonstrations.file_format import VERSION
 from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import file_hash, save_tensors, serialise
+from ftl_lightning.tensor_file import file_hash, save_tensors
 from tests.demonstrations.samples import demonstrations
 
 shapes = st.tuples(st.integers(1, 4), st.integers(1, 5), st.integers(1, 6))
@@ -70,71 +70,8 @@ def test_what_is_observed_may_be_the_scene_itself(tmp_path: Path) -> None:
     assert torch.equal(found.scenes, same)
 
 
-def header(found: Demonstrations) -> dict[str, object]:
-    """What every form of file says of demonstrations."""
-    return {name: getattr(found, name) for name in ("domain", "state_names", "state_units", "concepts")}
-
-
-def test_files_without_images_keep_their_form_and_their_bytes(tmp_path: Path) -> None:
-    path, plain = tmp_path / "d.safetensors", demonstrations(torch.ones(2, 3, 1), observed={"place": torch.ones(2, 3)})
-    plain.save(path)
-    assert path.read_bytes() == serialise("demonstrations", plain.tensors, header(plain) | {"per_step": (), "provenance": {}}, 2)
-
-
-FIRST = {"domain": "driving", "state_names": ["x"], "state_units": ["m"], "concepts": ["a", "b"], "provenance": {"seed": 1}}
-
-
-def first_form(path: Path, initial: torch.Tensor | None, time: int = 4) -> Demonstrations:
-    """What loads of a file of form 1, as it was written before features had names."""
-    tensors = {"states": torch.zeros(2, time, 1), "lengths": torch.tensor([time, 2])}
-    save_tensors(path, "demonstrations", tensors | ({} if initial is None else {"initial_states": initial}), FIRST, 1)
-    return Demonstrations.load(path)
-
-
-def test_files_of_the_first_form_still_load(tmp_path: Path) -> None:
-    path = tmp_path / "d.safetensors"
-    plain = first_form(path, None)
-    assert (plain.observed, plain.scenes, plain.per_step) == ({}, None, ())
-    assert plain.provenance == {"seed": 1}
-    always = torch.arange(2 * 4 * 5.0).reshape(2, 4, 5)
-    found = first_form(path, always)
-    assert found.per_step == ("initial_state",)
-    assert torch.equal(found.observed["initial_state"], always)
-    assert torch.equal(found.initial_states.require_scenes(), always[:, 0])
-    once = first_form(path, always[:, 0])
-    assert once.per_step == ()
-    assert torch.equal(once.initial_states.require_scenes(), always[:, 0])
-
-
-def test_columns_of_the_first_form_become_the_domains_features(tmp_path: Path) -> None:
-    always = torch.arange(2 * 4 * 7.0).reshape(2, 4, 7)
-    features = {"pose": Feature((2,)), "grid": Feature((2, 2))}
-    found = first_form(tmp_path / "d.safetensors", always).fitted(features)
-    assert found.per_step == ("pose", "grid")
-    assert torch.equal(found.observed["pose"], always[..., :2])
-    assert torch.equal(found.observed["grid"], always[..., 2:6].reshape(2, 4, 2, 2))
-    assert torch.equal(found.initial_states.require_scenes(), always[:, 0])  # the column that no model sees is part of it
-    once = first_form(tmp_path / "d.safetensors", always[:, 0]).fitted(features)
-    assert once.per_step == ()
-    assert torch.equal(once.observed["grid"], always[:, 0, 2:6].reshape(2, 2, 2))
-    whole = first_form(tmp_path / "d.safetensors", always).fitted({})
-    assert set(whole.observed) == {"initial_state"}  # a domain that observes nothing takes nothing
-    with pytest.raises(UserError, match="key 'initial_states': expected 8 numbers each or more, found 7"):
-        first_form(tmp_path / "d.safetensors", always).fitted(features | {"more": Feature((2,))})
-
-
-def test_drivings_columns_of_the_first_form_are_traffic_scenario_and_a_seed_that_no_model_sees(tmp_path: Path) -> None:
-    domain = load_domain("driving")
-    drives = domain.source(None).split("train", 2, 0).select("merge")
-    scenes = drives.initial_states.require_scenes()
-    seeds = scenes[:, None, -1:].expand(-1, drives.states.shape[1], -1)
-    old = torch.cat((*(drives.observed[name] for name in domain.observed), seeds), dim=-1)
-    assert old.shape[2] == 37
-    tensors = {"states": drives.states, "lengths": drives.lengths, "initial_states": old}
-    save_tensors(tmp_path / "old.safetensors", "demonstrations", tensors, header(drives) | {"provenance": {}}, 1)
-    found = Demonstrations.load(tmp_path / "old.safetensors").fitted(domain.observed)
-    assert found.per_step == drives.per_step
-    for name, values in drives.observed.items():
-        assert torch.equal(found.observed[name], values)
-    assert torch.equal(found.initial_states.require_scenes(), scenes)
-    assert found.hash == drives.hash
+@pytest.mark.parametrize("version", [1, VERSION - 1, VERSION + 1, True, "4"])
+def test_a_file_of_another_version_is_refused(version: Any) -> None:
+    save_tensors("d.safetensors", "demonstrations", {"states": torch.zeros(2, 4, 1)}, {}, version)
+    with pytest.raises(UserError, match=rf"^d\.safetensors: key 'format': expected {VERSION}, found .*; it is of another version$"):
+        Demonstrations.load("d.safetensors")

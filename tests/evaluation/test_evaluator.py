@@ -28,8 +28,8 @@ from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
 from ftl_lightning.evaluation.judged import Judged, share, standard_error
-from ftl_lightning.evaluation.results import append_rows, labels, read_rows
-from ftl_lightning.evaluation.row import Row, label
+from ftl_lightning.evaluation.results import append_rows, read_rows
+from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
@@ -192,35 +192,6 @@ def test_rows_are_added_replaced_and_keep_their_types_and_a_foreign_file_is_refu
     pd.DataFrame({"a": [1]}).to_csv(path, index=False)
     with pytest.raises(UserError, match=r"r\.csv: expected the columns domain, setting"):
         read_rows(tmp_path)
-
-
-OLD = """domain,setting,task,method,K,omega,demonstrations,seed,n,metric,value,model_hash,config_hash,version
-d,s,"a, b","FTL-IGM (steps, set, near span 0.1)",2,1.2,5,0,50,accuracy,0.5,00e1,c,0.1.0
-d,s,"a, b",expert (oracle),0,,0,0,50,accuracy,1.0,,r,0.1.0
-d,s,"a, b",language,0,1.2,5,0,50,accuracy,0.25,00e1,e,0.1.0
-d,s,"a, b",in-context,0,none,5,0,50,accuracy,0.1,00e1,f,0.1.0
-"""
-
-
-@pytest.mark.parametrize("form", ["", "with modes"])
-def test_a_file_from_before_variants_is_read_and_added_to(tmp_path: Path, form: str) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text(OLD.replace("FTL-IGM (", f"{label('FTL-IGM', form)} ("))
-    table, old = read_rows(path), pd.read_csv(path, dtype=str, keep_default_na=False)
-    assert table[["method", "form", "variant", "role"]].to_numpy().tolist() == [
-        ["FTL-IGM", form, "steps, set, near span 0.1", "method"],
-        ["expert (oracle)", "", "", "reference"],
-        ["language", "", "", "method"],
-        ["in-context", "", "", "method"],
-    ]
-    assert labels(table).tolist() == old["method"].tolist()
-    append_rows(path, [row()])
-    new = pd.read_csv(path, dtype=str, keep_default_na=False)
-    kept = [name for name in old.columns if name != "method"]
-    assert new[kept].head(len(old)).equals(old[kept])  # text for text
-    assert new["form"].tolist() == [form, "", "", "", ""]
-    append_rows(path, [row(task="a, b", method="FTL-IGM", form=form, variant="steps, set, near span 0.1", value=0.75)])
-    assert read_rows(path)["value"].tolist() == [1.0, 0.25, 0.1, 0.5, 0.75]  # the same measurement, replaced
 
 
 def test_a_configuration_knows_demonstrations_by_their_content_or_as_a_data_set_by_name_and_version(tiny: Path) -> None:
