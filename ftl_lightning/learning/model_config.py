@@ -19,8 +19,6 @@ VERSION = 2
 """Version of the configuration's format."""
 LONGEST = 10_000
 """States in a plan; networks over time have the same weights for any number."""
-DIFFUSION = "diffusion"
-"""The kind of a model whose configuration names none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +83,9 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     with about(path):
         if not isinstance(found, dict) or found.get("format") != VERSION:
             raise UserError(f"expected the configuration of a pretrained model, found something else (its format is not {VERSION})")
-        content: dict[str, Any] = {"kind": DIFFUSION} | found
         for key in ("kind", "hash", "domain"):
-            expect_type(content.get(key), str, key)
-        return content
+            expect_type(found.get(key), str, key)
+        return found
 
 
 def expect_domain(config: ModelConfig, domain: Domain) -> None:
