@@ -21,6 +21,7 @@ import safetensors.torch
 import torch
 
 from ftl_lightning.commands import generate
+from ftl_lightning.demonstrations import file_format
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.data import InversionData, PretrainingData
@@ -200,7 +201,7 @@ def test_a_header_that_is_none(name: str, capsys: Told) -> None:
     refused(capsys, READ["concept"], "x: expected a concept file")
 
 
-FORM = {"kind": "demonstrations", "format": 3, "domain": "agent", "concepts": ["", ""], "per_step": []}
+FORM = {"kind": "demonstrations", "format": file_format.VERSION, "domain": "agent", "concepts": ["", ""], "per_step": []}
 STATES = {"states": torch.zeros(2, 3, 13), "lengths": torch.full((2,), 3), "observed/world": torch.zeros(2, 52)}
 GIGABYTE = 2**30
 

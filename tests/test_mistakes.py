@@ -24,6 +24,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.demos.boring_classes import BoringModel
 
 from ftl_lightning.cli import main
+from ftl_lightning.concepts.concept import VERSION
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.domains.data import InversionData
 from ftl_lightning.domains.object_rearrangement.datamodule import ObjectRearrangementData
@@ -111,7 +112,9 @@ BUDGET = "key 'model.budget': expected some of samples, restarts, screening, lea
         ("invert", "model.adapter.rank=true", "adapter"),
         ("invert", "model.components=1.5", "components"),
         ("invert", "model.budget=null", BUDGET),
-        *(("invert", f"model.{key}=null", "key 'model.budget.samples': expected int") for key in ("samples", "budget.samples")),
+        ("invert", "model.budget.samples=null", "key 'model.budget.samples': expected int"),
+        ("invert", "model.samples=3", "model.samples"),
+        ("fit", "model.condition_dropout=0.25", "model.condition_dropout"),
         ("invert", "model.modes.sets=null", "key 'model.modes.sets': expected a value, found null"),
         *(("invert", f"model.{at}budget.sample=3", "argument 'model.budget.sample' is not accepted") for at in ("", "init_args.")),
         ("invert", "model.budget={sample: 3}", "key 'sample' is not accepted"),
@@ -439,9 +442,9 @@ def test_outputs_that_are_no_files_are_refused_before_any_work(arguments: list[s
 def concept(embedding: float = 0.1, weight: float = 1.0, **header: Any) -> None:
     """A file of a concept of the shipped model of scenes."""
     shipped = json.loads((SHIPPED / "config.json").read_text())
-    told = {"kind": "concept", "format": 1, "name": "circle", "domain": "object_rearrangement", "encoder": shipped["encoder"]}
+    told = {"kind": "concept", "format": VERSION, "name": "circle", "domain": "object_rearrangement", "encoder": shipped["encoder"]}
     told |= {"pretrained": shipped["hash"], "demonstrations": "0" * 16, "count": 5, "weights": "fixed", "loss": 0.1, **header}
-    tensors = {"embeddings": torch.full((2, 384), embedding), "weights": torch.full((2,), weight)}
+    tensors = {"embeddings": torch.full((2, 1, 384), embedding), "weights": torch.full((2,), weight)}
     safetensors.torch.save_file(tensors, "c.safetensors", {"ftl_lightning": json.dumps(told)})
 
 

@@ -9,6 +9,7 @@ import safetensors
 import torch
 
 from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.demonstrations.file_format import VERSION
 from ftl_lightning.errors import UserError
 from ftl_lightning.tensor_file import save_tensors
 from tests.demonstrations.samples import demonstrations
@@ -39,7 +40,7 @@ def test_images_are_compressed_in_files_bit_for_bit(always: bool, tmp_path: Path
     path, before = tmp_path / "d.safetensors", filmed(always)
     before.save(path)
     tensors, header = stored(path)
-    assert (header["format"], header["compressed"]) == (3, {"observed/photo": list(before.observed["photo"].shape)})
+    assert header["compressed"] == {"observed/photo": list(before.observed["photo"].shape)}
     assert tensors["observed/photo"].dim() == 1
     assert tensors["observed/photo"].dtype == torch.uint8
     after = Demonstrations.load(path)
@@ -48,15 +49,6 @@ def test_images_are_compressed_in_files_bit_for_bit(always: bool, tmp_path: Path
     after.observed["photo"][0] = 0  # it can be written to
     if always:
         assert path.stat().st_size < before.observed["photo"].nbytes / 10
-
-
-def test_files_of_the_second_form_load_with_images_that_are_not_compressed(tmp_path: Path) -> None:
-    path, before = tmp_path / "d.safetensors", filmed()
-    header = {"concepts": before.concepts, "per_step": before.per_step}
-    save_tensors(path, "demonstrations", before.tensors, header, 2)
-    after = Demonstrations.load(path)
-    assert torch.equal(after.observed["photo"], before.observed["photo"])
-    assert after.hash == before.hash
 
 
 def squeezed(count: int) -> torch.Tensor:
@@ -100,7 +92,7 @@ def test_damaged_images_are_told_in_one_line(
     path = tmp_path / "d.safetensors"
     filmed().save(path)
     found, told = stored(path)
-    save_tensors(path, "demonstrations", found | tensors, {**told, **header}, 3)
+    save_tensors(path, "demonstrations", found | tensors, {**told, **header}, VERSION)
     with pytest.raises(UserError, match=message) as error:
         Demonstrations.load(path)
     assert str(error.value).startswith(f"{path}: key ")
@@ -111,7 +103,7 @@ def test_nothing_is_decompressed_beyond_what_the_header_says(tmp_path: Path) -> 
     path = tmp_path / "d.safetensors"
     filmed().save(path)
     tensors, header = stored(path)
-    save_tensors(path, "demonstrations", tensors | {PHOTO: squeezed(100_000_000)}, header, 3)
+    save_tensors(path, "demonstrations", tensors | {PHOTO: squeezed(100_000_000)}, header, VERSION)
     tracemalloc.start()
     with pytest.raises(UserError, match="found more"):
         Demonstrations.load(path)
@@ -127,6 +119,6 @@ def test_flipped_bits_of_compressed_images_are_found(tmp_path: Path) -> None:
     for place in range(0, len(tensors[PHOTO]), 97):
         damaged = tensors[PHOTO].clone()
         damaged[place] ^= 1 << (place % 8)
-        save_tensors(path, "demonstrations", tensors | {PHOTO: damaged}, header, 3)
+        save_tensors(path, "demonstrations", tensors | {PHOTO: damaged}, header, VERSION)
         with pytest.raises(UserError, match="key 'observed/photo'"):
             Demonstrations.load(path)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli import main
-from ftl_lightning.concepts.concept import KIND, Concept, Origin, QualityRecord
+from ftl_lightning.concepts.concept import KIND, VERSION, Concept, Origin, QualityRecord
 from ftl_lightning.concepts.modes import Modes
 from ftl_lightning.concepts.summary import summary
 from ftl_lightning.errors import LONGEST, UserError
@@ -56,7 +56,7 @@ def test_a_summary_tells_the_form_without_the_tensors() -> None:
         assert (told.form, told.origin, told.quality) == (form, ORIGIN, None)
     tensors = {"embeddings": torch.zeros(2, 4, 384), "weights": torch.ones(2)}
     tensors |= {"adapter/net.0/down": torch.zeros(2, 1, 4), "adapter/net.0/up": torch.zeros(2, 3, 1)}
-    save_tensors("c.safetensors", KIND, tensors, {**ORIGIN.__dict__, "axes": "mode component knot n"}, 3)
+    save_tensors("c.safetensors", KIND, tensors, ORIGIN.__dict__, VERSION)
     told = summary("c.safetensors")
     assert told.form == "adapter over time"
     assert summary(MOCAP / "model.safetensors") is summary(MOCAP / "judge.safetensors") is None
@@ -89,8 +89,8 @@ def test_quality_is_a_key_that_is_there_only_where_somebody_looked() -> None:
     ids=str,
 )
 def test_a_quality_that_is_none_is_told(quality: object, expected: str) -> None:
-    tensors = {"embeddings": torch.zeros(2, 384), "weights": torch.ones(2)}
-    save_tensors("c.safetensors", KIND, tensors, {**ORIGIN.__dict__, "quality": quality})
+    tensors = {"embeddings": torch.zeros(2, 1, 384), "weights": torch.ones(2)}
+    save_tensors("c.safetensors", KIND, tensors, {**ORIGIN.__dict__, "quality": quality}, VERSION)
     for read in (summary, Concept.load):
         with pytest.raises(UserError, match=expected):
             read("c.safetensors")
