@@ -35,7 +35,7 @@ from ftl_lightning.learning.inversion_settings import FULL, PRECISIONS, REDUCED
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import Tuned, settings_of
+from ftl_lightning.tuned import ModelSettings, settings_of
 
 SUITES = {"object_rearrangement": "validation", "agent": "paper", "driving": "paper", "strokes": ""}
 """Of each domain; none where concepts are those of the demonstrations beside the model."""
@@ -125,7 +125,7 @@ def main() -> None:
     rows = {int(row["concepts"]): row for row in own.get("rows", [])}
     folder = f"pretrained/{options.domain}"
     model = read_model(GenerativeModel, folder)
-    tuned = Tuned.read(settings_of(model.config.domain))
+    tuned = ModelSettings.read(settings_of(model.config.domain))
     most = options.steps or tuned.learning_steps
     endless = concepts(options.domain, model.examples)
     known = [next(endless) for _ in range(max(options.most, GROUPS))]

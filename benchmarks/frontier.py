@@ -26,7 +26,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
 from ftl_lightning.evaluation.generation import Generation, generate
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.learning.adaptation import Adaptation
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_module import InversionModule
@@ -96,7 +96,7 @@ def adapted(form: Form, config: Mapping[str, Any], demonstrations: Demonstration
     return module
 
 
-def row(one: Judged, domain: Domain, subject: Mapping[str, Any]) -> dict[str, Any]:
+def row(one: TaskResult, domain: Domain, subject: Mapping[str, Any]) -> dict[str, Any]:
     """What the file keeps of a task's plans."""
     values = {name: round(value, 6) for name, value in one.values.items()}
     return {
@@ -110,14 +110,14 @@ def row(one: Judged, domain: Domain, subject: Mapping[str, Any]) -> dict[str, An
     }
 
 
-def noisy(real: Sequence[Real], seed: int) -> list[tuple[float, Judged]]:
+def noisy(real: Sequence[Real], seed: int) -> list[tuple[float, TaskResult]]:
     """Demonstrations in turn, each moved as a whole by normal noise, at every level of :data:`NOISE`."""
     draw, found = torch.Generator().manual_seed(seed), []
     for one, level in itertools.product(real, NOISE):
         if one.fresh is not None and (judged := one.replayed()) is not None:
             spread = judged.states.flatten(0, 1).std(dim=0)
             noise = level * spread * torch.randn((len(judged.states), 1, len(spread)), generator=draw)
-            found.append((level, one.added(Judged.of(one.task, judged.states + noise, judged.starts, one.domain))))
+            found.append((level, one.added(TaskResult.of(one.task, judged.states + noise, judged.starts, one.domain))))
     return found
 
 

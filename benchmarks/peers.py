@@ -46,7 +46,7 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.progress import bar
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 Batching = Literal["one by one", "batched"]
 CONCEPTS, PLANS, DENOISING, K, GUIDANCE = 10, 50, 100, 2, 1.2
@@ -308,7 +308,7 @@ def main() -> None:
     model = read_model(GenerativeModel, options.pretrained)
     data = InversionData(model.config.domain, suite="validation", seed=0).demonstrations
     names = list(dict.fromkeys(data.concepts))[: options.concepts]
-    tuned = Tuned.read(options.config).inversion
+    tuned = ModelSettings.read(options.config).inversion
     settings = tuned.changed(tolerance=None, omega=GUIDANCE, components=K, learning_rate=LEARNING_RATE)
     work = Work(model, [data.select(name) for name in names], settings, options.steps, options.repeats)
     found: dict[str, Any] = {

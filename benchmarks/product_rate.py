@@ -27,7 +27,7 @@ from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 SIZES = ((32, 512, 512), (64, 512, 512), (320, 512, 512), (640, 512, 512), (1500, 512, 512), (640, 64, 4096), (1024, 1024, 1024))
 """Rows, inner size and columns; the first ones are those of one concept and of ten, learned and sampled."""
@@ -88,7 +88,7 @@ def main() -> None:
     model = read_model(GenerativeModel, options.pretrained)
     data = InversionData(model.config.domain, suite="validation", seed=0).demonstrations
     names = list(dict.fromkeys(data.concepts))
-    tuned = Tuned.read(f"conf/{model.config.domain}.yaml")
+    tuned = ModelSettings.read(f"conf/{model.config.domain}.yaml")
     settings = tuned.inversion.changed(tolerance=None)
     rates = {" x ".join(map(str, size)): rate(*size) for size in SIZES}
     best = max(rates.values())

@@ -41,7 +41,7 @@ from ftl_lightning.progress import bar
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.seeding import generator, task_key
 from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 DOMAIN, SUITE = "object_rearrangement", "validation"
 PUBLISHED_STEPS = 50_000
@@ -263,7 +263,7 @@ def main() -> None:
     parser.add_argument("--learned", help="an earlier run's file to take from what the published procedure has learned by then")
     parser.add_argument("--full", action="store_true", help="run the published inversion of one concept to its end")
     options = parser.parse_args()
-    model, tuned = read_model(GenerativeModel, options.pretrained), Tuned.read(options.config)
+    model, tuned = read_model(GenerativeModel, options.pretrained), ModelSettings.read(options.config)
     changes = {key: value for key in ("tolerance", "samples") if (value := getattr(options, key)) is not None}
     settings = tuned.inversion.changed(seed=options.seed, modes=1, **changes)
     most = options.steps or tuned.learning_steps

@@ -22,7 +22,7 @@ from ftl_lightning.diffusion.schedule import add_noise, clean_from_epsilon, cosi
 from ftl_lightning.learning.adam import Group
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel, build_denoiser
-from ftl_lightning.tuned import Tuned, settings_of
+from ftl_lightning.tuned import ModelSettings, settings_of
 
 ROOT = Path(__file__).parent.parent
 DOMAINS = ("object_rearrangement", "agent", "driving", "mocap", "tabletop", "strokes")
@@ -217,7 +217,7 @@ class Published:
 def ours(domain: str) -> Published:
     """A model that ships."""
     config = read_model(GenerativeModel, ROOT / "pretrained" / domain).config
-    trained, tuned = config.training["model"], Tuned.read(ROOT / settings_of("own" if domain == "strokes" else domain))
+    trained, tuned = config.training["model"], ModelSettings.read(ROOT / settings_of("own" if domain == "strokes" else domain))
     knots = int(trained.get("code_knots", 1)) if trained.get("code_share") else 1
     settings = tuned.inversion
     return Published(

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this che
 from ftl_lightning.configuration import load
 from ftl_lightning.domains.data import InversionData, PretrainingData
 from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 PAGE = Path(__file__).parent / "differences.md"
 BEGIN, END = "<!-- settings: begin, written by docs/settings.py -->\n", "<!-- settings: end -->\n"
@@ -32,13 +32,13 @@ class Settings:
 
     fit: Mapping[str, Any]
     invert: Mapping[str, Any]
-    tuned: Tuned
+    tuned: ModelSettings
 
     @classmethod
     def of(cls, name: str) -> "Settings":
         """Of a configuration ``conf/NAME.yaml``."""
         path = f"conf/{name}.yaml"
-        return cls(load(path, "fit"), load(path, "invert"), Tuned.read(path))
+        return cls(load(path, "fit"), load(path, "invert"), ModelSettings.read(path))
 
 
 def _default(function: Callable[..., Any], name: str) -> Any:

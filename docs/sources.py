@@ -28,7 +28,7 @@ from ftl_lightning.reporting.paired import mcnemar, up
 from ftl_lightning.reporting.shown import lookup
 from ftl_lightning.reporting.table import Number, select, summarise
 from ftl_lightning.reporting.tables import against
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 ROOT = Path(__file__).parent.parent
 ONE_OF = ("setting", "metric", "method", "form", "variant", "K", "omega")
@@ -63,7 +63,7 @@ COMBINED: Mapping[str, Callable[[list[float]], float]] = {
 }
 """Numbers that are made of several."""
 
-_table, _tuned = cache(read_rows), cache(Tuned.read)
+_table, _tuned = cache(read_rows), cache(ModelSettings.read)
 
 
 class SourceError(Exception):
@@ -184,7 +184,7 @@ def _listed(key: Any) -> list[Any]:
 
 
 def _settings(name: str, rest: Mapping[str, Any]) -> Iterator[float]:
-    """``settings: conf/NAME.yaml``, ``at`` attributes of :class:`Tuned`, or keys of what a ``verb``'s groups come to."""
+    """``settings: conf/NAME.yaml``, ``at`` attributes of :class:`ModelSettings`, or keys of what a ``verb``'s groups come to."""
     return _at(load(name, rest["verb"]) if "verb" in rest else _tuned(name), rest["at"])
 
 

@@ -45,7 +45,7 @@ from ftl_lightning.seeding import EVALUATION_SEED
 from ftl_lightning.shared_concept import read_folder
 from ftl_lightning.shipped import pretrained_folder, shipped_models, shipped_name
 from ftl_lightning.trust import vouching
-from ftl_lightning.tuned import Tuned, settings_of
+from ftl_lightning.tuned import ModelSettings, settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,7 +71,7 @@ class FewShot(Shown):
         known_as: under which name others find the model: one that ships or ``'owner/name'`` on the Hub; empty where there is none.
     """
 
-    def __init__(self, model: ConceptModel, tuned: Tuned) -> None:
+    def __init__(self, model: ConceptModel, tuned: ModelSettings) -> None:
         self.model, self.tuned = model, tuned
         self.settings = ""
         self.folder: Path | None = None
@@ -102,11 +102,11 @@ class FewShot(Shown):
         known_as = ""
         if not folder.is_dir() and is_repository(str(name)):
             folder, known_as = download(str(name)), str(name)
-        with vouching([] if settings is None else Tuned.domains(settings)):
+        with vouching([] if settings is None else ModelSettings.domains(settings)):
             model = load_model(folder, domain).to(place)
         if settings is None:
             settings = settings_of(model.config.domain, model.method.configurations)
-        found = cls(model, Tuned.read(settings))
+        found = cls(model, ModelSettings.read(settings))
         found.settings, found.folder, found.known_as = str(settings), folder, known_as or shipped_name(folder)
         return found
 

@@ -17,7 +17,7 @@ from ftl_lightning.learning.hub import upload
 from ftl_lightning.learning.library import kept_file
 from ftl_lightning.learning.quality import Inspection, inspected
 from ftl_lightning.shared_concept import write_folder
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class LearnedConcept(Composition):
 
     concept: Concept
     model: ConceptModel
-    tuned: Tuned
+    tuned: ModelSettings
     known_as: str = ""
     demonstrations: Demonstrations | None = None
     judging: Domain | None = None

@@ -81,7 +81,7 @@ def _expect_plain(value: object, left: int) -> None:
             _expect_plain(one, left - 1)
 
 
-def built(kind: Callable[..., T], content: object, key: str, *given: object) -> T:
+def from_mapping(kind: Callable[..., T], content: object, key: str, *given: object) -> T:
     """Call a class with arguments that a file or configuration names, each of the type that the class says.
 
     Whole numbers are from 0 to :data:`LARGEST`; narrower ranges are the class's own matter.
@@ -125,7 +125,7 @@ def expect_type(value: Any, kind: Any, key: str) -> Any:
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        return built(kind, value, key)
+        return from_mapping(kind, value, key)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None

@@ -31,7 +31,7 @@ from ftl_lightning.printing import line
 from ftl_lightning.representation import counted
 from ftl_lightning.seeding import generator
 from ftl_lightning.tensor_file import atomic, write_text
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 CARD, FILM, PICTURE, DEMONSTRATIONS = "README.md", "film.gif", "picture.png", "demonstrations.safetensors"
 MOST_BYTES = 1_000_000
@@ -47,7 +47,7 @@ def write_folder(
     folder: Path,
     model: ConceptModel,
     concept: Concept,
-    tuned: Tuned,
+    tuned: ModelSettings,
     known_as: str = "",
     demonstrations: Demonstrations | None = None,
 ) -> None:
@@ -150,7 +150,7 @@ def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> st
     )
 
 
-def _film(model: ConceptModel, concept: Concept, tuned: Tuned) -> tuple[str, bytes] | None:
+def _film(model: ConceptModel, concept: Concept, tuned: ModelSettings) -> tuple[str, bytes] | None:
     """A film of what a concept generates, or a picture, with the name of its file; ``None`` where nothing can be sampled from.
 
     It starts from new initial states of the task, so that it shows no demonstration.
@@ -172,7 +172,7 @@ def _film(model: ConceptModel, concept: Concept, tuned: Tuned) -> tuple[str, byt
     return None
 
 
-def _frames(model: ConceptModel, own: Composition, tuned: Tuned, starts: InitialStates | None) -> list[NDArray[np.uint8]]:
+def _frames(model: ConceptModel, own: Composition, tuned: ModelSettings, starts: InitialStates | None) -> list[NDArray[np.uint8]]:
     """Of a plan, or of an episode where only those are filmed; empty where neither is or the simulator is not installed."""
     domain, loop = model.domain, model.domain.closed_loop
     if domain.show.film is not None:
@@ -187,7 +187,7 @@ def _frames(model: ConceptModel, own: Composition, tuned: Tuned, starts: Initial
         return []
 
 
-def _plans(model: ConceptModel, own: Composition, tuned: Tuned, starts: InitialStates | None, count: int) -> torch.Tensor:
+def _plans(model: ConceptModel, own: Composition, tuned: ModelSettings, starts: InitialStates | None, count: int) -> torch.Tensor:
     seen = {} if starts is None else moved(starts.take(slice(0, count)).observed, model.device)
     return model.sample([own], count, tuned.sampling, [generator("cpu", 0)], seen)[0].cpu()
 

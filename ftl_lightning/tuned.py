@@ -7,13 +7,13 @@ from typing import Self
 from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning.inversion_settings import GROUPS, InversionSettings
-from ftl_lightning.schema import built
+from ftl_lightning.schema import from_mapping
 from ftl_lightning.shipped import shipped
 from ftl_lightning.trust import is_installed, is_vouched
 
 
 @dataclass(frozen=True)
-class Tuned:
+class ModelSettings:
     """The settings that go with a model.
 
     Attributes:
@@ -46,7 +46,7 @@ class Tuned:
         sampling = {field.name: evaluation[field.name] for field in fields(Sampling) if field.name in evaluation}
         try:
             learning = {
-                field.name: built(kind, options[field.name], f"model.{field.name}") if kind else options[field.name]
+                field.name: from_mapping(kind, options[field.name], f"model.{field.name}") if kind else options[field.name]
                 for field in fields(InversionSettings)
                 if field.name in options and field.name != "seed"
                 for kind in [GROUPS.get(field.name)]

@@ -186,7 +186,7 @@ def defaults_of(path: str) -> dict[str, object]:
 
 ENTRIES = [(verb, names) for verb, names in CONFIGS if verb in SECTIONS]
 OTHERWISE = {("evaluation", "replan")}
-"""Values whose default is another one where :class:`~ftl_lightning.tuned.Tuned` reads them."""
+"""Values whose default is another one where :class:`~ftl_lightning.tuned.ModelSettings` reads them."""
 
 
 def repeated(verb: str, names: list[str]) -> dict[tuple[str, str, str], bool]:

@@ -20,7 +20,7 @@ from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.errors import UserError
-from ftl_lightning.few_shot import FewShot, LearnedConcept, Tuned
+from ftl_lightning.few_shot import FewShot, LearnedConcept, ModelSettings
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.learning.prepared import Prepared
@@ -76,7 +76,7 @@ def test_settings_can_come_from_a_file_of_ones_own(scenes: FewShot) -> None:
     path = ROOT / "pretrained" / "object_rearrangement"
     Path("mine.yaml").write_text("model: {init_args: {components: 3, output: x}}\nevaluation: {steps: 7, samples: 2, replan: 4}\n")
     found = FewShot.from_pretrained(path, settings="mine.yaml")
-    assert found.tuned == Tuned(InversionSettings(components=3), 400, Sampling(steps=7), 4)
+    assert found.tuned == ModelSettings(InversionSettings(components=3), 400, Sampling(steps=7), 4)
     Path("mine.yaml").write_text("evaluation: {sampler: euler}\n")
     with pytest.raises(UserError, match=r"mine\.yaml: sampler: expected one of ddpm, ddim, dpm_solver, found 'euler'"):
         FewShot.from_pretrained(path, settings="mine.yaml")
@@ -324,7 +324,9 @@ def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
     limits = Normalization(torch.zeros(2), torch.tensor([1.0, 2.0]))
     net = GenerativeModel(Prepared(config, own_domain(examples, texts, 8, judged), limits, torch.randn(3, 6)))
     net.examples = examples
-    model = FewShot(net.requires_grad_(False).eval(), Tuned(InversionSettings().changed(samples=4), 2, Sampling(steps=5), 1))
+    model = FewShot(
+        net.requires_grad_(False).eval(), ModelSettings(InversionSettings().changed(samples=4), 2, Sampling(steps=5), 1)
+    )
     between = walks("between", 1.0)
     with pytest.raises(UserError, match=r"goal: expected a task of own, such as .*, found 'between'"):
         model.evaluate(between, "between")

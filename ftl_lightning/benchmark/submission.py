@@ -11,7 +11,7 @@ from pathlib import Path
 from ftl_lightning.benchmark.suite import BenchmarkSuite
 from ftl_lightning.errors import about
 from ftl_lightning.limits import expect_readable
-from ftl_lightning.schema import built, read_json
+from ftl_lightning.schema import from_mapping, read_json
 from ftl_lightning.tensor_file import content_hash, write_text
 from ftl_lightning.version import __version__
 
@@ -131,7 +131,7 @@ class Submission:
         """
         expect_readable(path, "submission", MOST)
         with about(path):
-            return built(cls, read_json(path, "a submission"), "")
+            return from_mapping(cls, read_json(path, "a submission"), "")
 
 
 def machine() -> dict[str, str]:

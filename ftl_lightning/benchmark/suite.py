@@ -12,7 +12,7 @@ from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain, Recoveries, Source
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.schema import built, read_json
+from ftl_lightning.schema import from_mapping, read_json
 from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
 from ftl_lightning.tensor_file import bytes_hash, file_hash
 
@@ -218,7 +218,7 @@ def load_suite(name: str) -> BenchmarkSuite:
         raise UserError(f"suites: expected some of {', '.join(suite_names())}, found {short(name)!r}")
     path = FOLDER / f"{name}.json"
     with about(path):
-        return built(BenchmarkSuite, read_json(path, "a suite"), "")
+        return from_mapping(BenchmarkSuite, read_json(path, "a suite"), "")
 
 
 def suites() -> Iterator[BenchmarkSuite]:

@@ -15,7 +15,7 @@ from ftl_lightning.concepts.point import Part
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.ranges import LARGEST_FACTOR, expect_factor, expect_range
 from ftl_lightning.representation import Shown, counted, numbers
-from ftl_lightning.schema import built, expect_type
+from ftl_lightning.schema import expect_type, from_mapping
 from ftl_lightning.shipped import shipped
 from ftl_lightning.tensor_file import expect_finite, load_tensors, save_tensors
 
@@ -271,10 +271,10 @@ class Concept(Shown):
             stretch = expect_type(header.get("stretch", STRETCH), float, "stretch")
             expect_factor("key 'stretch'", stretch, 0)
             modes = Modes(tensors[MODES[0]], tensors[MODES[1]], mixed, stretch) if several else None
-            origin = built(Origin, {key: header[key] for key in keys}, "")
-            choice = built(Choice, header["choice"], "choice") if header.get("choice") else None
+            origin = from_mapping(Origin, {key: header[key] for key in keys}, "")
+            choice = from_mapping(Choice, header["choice"], "choice") if header.get("choice") else None
             composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if composed else None
-            quality = built(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
+            quality = from_mapping(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
             concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")

@@ -7,7 +7,7 @@ from pathlib import Path
 from ftl_lightning.concepts.concept import ADAPTER, KIND, MODES, VERSION, Origin, QualityRecord
 from ftl_lightning.errors import UserError, about
 from ftl_lightning.representation import counted
-from ftl_lightning.schema import built
+from ftl_lightning.schema import from_mapping
 from ftl_lightning.tensor_file import expect_kind, load_header
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -46,8 +46,8 @@ def summary(path: str | Path) -> Summary | None:
         names = [field.name for field in fields(Origin)]
         if missing := [*(key for key in names if key not in told), *({"embeddings", "weights"} - set(shapes))]:
             raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
-        origin = built(Origin, {name: told[name] for name in names}, "")
-        quality = built(QualityRecord, told["quality"], "quality") if told.get("quality") is not None else None
+        origin = from_mapping(Origin, {name: told[name] for name in names}, "")
+        quality = from_mapping(QualityRecord, told["quality"], "quality") if told.get("quality") is not None else None
         return Summary(origin, _form(shapes, told.get("mixed") is True), quality)
 
 

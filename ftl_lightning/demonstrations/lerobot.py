@@ -29,7 +29,7 @@ from ftl_lightning.demonstrations.file_format import Contents
 from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.limits import MOST_TENSORS, MOST_TEXT, expect_readable, expect_unpacked, read_text
 from ftl_lightning.printing import line, say
-from ftl_lightning.schema import built, expect_type, parse_json, read_json
+from ftl_lightning.schema import expect_type, from_mapping, parse_json, read_json
 from ftl_lightning.tensor_file import visible
 
 STATE = "observation.state"
@@ -109,7 +109,7 @@ def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | 
     if own:
         content = read_json(root / BESIDE)
         with about(root / BESIDE):
-            told = built(Beside, content, "")
+            told = from_mapping(Beside, content, "")
     with about(root):
         part = _part(info.features, part)
         names = _observed(info.features, part, observed)

@@ -25,7 +25,7 @@ from ftl_lightning.demonstrations.episodes import Beside, Episode, beside, conte
 from ftl_lightning.demonstrations.file_format import Contents
 from ftl_lightning.demonstrations.observations import PART, feature_parts, states_part
 from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.schema import built
+from ftl_lightning.schema import from_mapping
 
 CONCEPT = "concept"
 """Where an episode's text is, see this module."""
@@ -64,7 +64,7 @@ def read_contents(name: str, part: str = "", observed: Sequence[str] | None = No
         found = minari.load_dataset(name)
         metadata = found.storage.metadata
         with about(name):
-            told = built(Beside, metadata.get(_HEADER, {}), _HEADER)
+            told = from_mapping(Beside, metadata.get(_HEADER, {}), _HEADER)
         own = _HEADER in metadata
         with about(name):
             part = states_part(found.observation_space, part)

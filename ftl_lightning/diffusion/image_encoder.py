@@ -13,7 +13,7 @@ from ftl_lightning.demonstrations.features import Feature, Observed
 from ftl_lightning.errors import UserError, short, shown
 from ftl_lightning.processes import drawn
 from ftl_lightning.ranges import expect_range
-from ftl_lightning.schema import built
+from ftl_lightning.schema import from_mapping
 
 MOST_POINTS = 1000
 MOST_PIXELS = 100_000_000
@@ -253,7 +253,7 @@ class ImageEncoders(nn.Module):
     def __init__(self, observed: Mapping[str, Feature], arguments: Mapping[str, Any]) -> None:
         super().__init__()
         self.names = [name for name, feature in observed.items() if feature.kind == "image"]
-        encoders = [built(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
+        encoders = [from_mapping(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
         self.origins = [encoder.origin for encoder in encoders]
         self.columns = [POINT if isinstance(encoder.head, Points) else 3 for encoder in encoders]
         """Numbers of a keypoint or point."""

@@ -25,7 +25,7 @@ from ftl_lightning.domains.distances import Distance, scaled_distance
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.evaluable import demonstrations_of
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.progress import bar
 from ftl_lightning.seeding import FRESH_SEED
 
@@ -118,7 +118,7 @@ class Real:
             measured[COVERAGE] = coverage(self.domain.distances(plans, self._windows(self.fresh[0]), distance))
         return measured
 
-    def lines(self) -> dict[str, Judged]:
+    def lines(self) -> dict[str, TaskResult]:
         """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples.
 
         Where nothing but novelty is measured, there is nothing to say of demonstrations: theirs is 0.
@@ -130,18 +130,18 @@ class Real:
             judged[FRESH] = self._judged(self.fresh[1])
         return judged
 
-    def replayed(self) -> Judged | None:
+    def replayed(self) -> TaskResult | None:
         """As many plans as are generated, which are the demonstrations in turn; ``None`` without any."""
         if self.demonstrations is None:
             return None
         turns = torch.arange(self.count) % len(self.demonstrations)
         return self._judged(self.demonstrations.rows(turns.tolist()))
 
-    def _judged(self, behaviour: Demonstrations) -> Judged:
+    def _judged(self, behaviour: Demonstrations) -> TaskResult:
         starts = behaviour.initial_states if self.domain.observed else None
-        return self.added(Judged.of(self.task, self._windows(behaviour), starts, self.domain))
+        return self.added(TaskResult.of(self.task, self._windows(behaviour), starts, self.domain))
 
-    def added(self, judged: Judged) -> Judged:
+    def added(self, judged: TaskResult) -> TaskResult:
         """Behaviour with its novelty and coverage."""
         return judged.compared(self.values(judged.states))
 
@@ -157,7 +157,7 @@ def coverage(distances: Tensor) -> float:
 
 
 def real_behaviour(
-    judged: Sequence[Judged],
+    judged: Sequence[TaskResult],
     domain: Domain,
     demonstrated: Callable[[str], Demonstrations | None],
     root: Path | None = None,
@@ -181,7 +181,7 @@ def real_behaviour(
     return behaviour
 
 
-def lines(real: Sequence[Real]) -> dict[str, list[Judged]]:
+def lines(real: Sequence[Real]) -> dict[str, list[TaskResult]]:
     """The reference lines of some tasks, by name."""
     by_task = [behaviour.lines() for behaviour in real]
     return {name: judged for name in (REPLAYED, FRESH) if (judged := [line[name] for line in by_task if name in line])}

@@ -11,7 +11,7 @@ from ftl_lightning.domains.beside import Drawn, beside
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.evaluable import demonstrations_of
-from ftl_lightning.evaluation.judged import Judged, share
+from ftl_lightning.evaluation.judged import TaskResult, share
 from ftl_lightning.evaluation.tensorboard import log_animation
 from ftl_lightning.learning.quality import first_windows
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # half a second of import, for what is drawn later
 
 def draw(
     logger: TensorBoardLogger,
-    judged: Sequence[Judged],
+    judged: Sequence[TaskResult],
     domain: Domain,
     demonstrated: Callable[[str], Demonstrations | None],
     figures: int,
@@ -48,12 +48,12 @@ def draw(
             log_animation(logger, f"{ROLLOUTS}/{name}", pictures, step, behaviour.task.goal, outcome_text(behaviour.outcomes))
 
 
-def title(behaviour: Judged) -> str:
+def title(behaviour: TaskResult) -> str:
     """The task's name and the share of plans that are right, if they are judged."""
     return behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f} right"
 
 
-def picture(behaviour: Judged, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], figures: int) -> "Figure":
+def picture(behaviour: TaskResult, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], figures: int) -> "Figure":
     """Some of a task's plans, framed green where they are right and red where they are wrong, below what was learned from.
 
     Args:

@@ -19,7 +19,7 @@ from ftl_lightning.evaluation.drawing import draw
 from ftl_lightning.evaluation.evaluable import Evaluable, is_evaluable
 from ftl_lightning.evaluation.films import write_films
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
@@ -74,7 +74,7 @@ class Evaluator(pl.Callback):
         self.diversity = diversity
         self.films = films
         self.variant = variant
-        self.judged: list[Judged] = []
+        self.judged: list[TaskResult] = []
         self._projected = False
 
     def _asked(self, data: pl.LightningDataModule) -> tuple[str, ...]:
@@ -166,7 +166,7 @@ class Evaluator(pl.Callback):
         tasks = tasks_of(module.domain, self._asked(data), module.concepts)
         self.judged = generate(module, tasks, self.generation, data.root)
 
-    def _compare(self, module: Evaluable, data: PretrainingData | InversionData) -> Mapping[str, Sequence[Judged]]:
+    def _compare(self, module: Evaluable, data: PretrainingData | InversionData) -> Mapping[str, Sequence[TaskResult]]:
         """Measure novelty and coverage, and what stands beside the method's numbers: the reference lines by name."""
         domain, seed = module.domain, self.generation.seed
         compared = self.references if self.references is not None else not getattr(data, "own", False)

@@ -15,7 +15,7 @@ from torch import Tensor
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, of_wireframe
 from ftl_lightning.domains.wireframe import Wireframe
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.tensor_file import write_text
 
@@ -26,7 +26,7 @@ STEPS, ABSENT = 10_000, -32_768
 """Steps of a coordinate across the window's width, and the number of a point that is not there."""
 
 
-def film_of(behaviour: Judged, domain: Domain, number: int) -> VectorFilm | None:
+def film_of(behaviour: TaskResult, domain: Domain, number: int) -> VectorFilm | None:
     """The film of an episode, or of a plan that was not executed; ``None`` where the domain draws none."""
     loop = domain.closed_loop
     if behaviour.rollout is not None and loop is not None:
@@ -40,7 +40,11 @@ def film_of(behaviour: Judged, domain: Domain, number: int) -> VectorFilm | None
 
 
 def write_films(
-    path: str | Path, domain: Domain, judged: Sequence[Judged], references: Mapping[str, Sequence[Judged]], rows: Sequence[Row]
+    path: str | Path,
+    domain: Domain,
+    judged: Sequence[TaskResult],
+    references: Mapping[str, Sequence[TaskResult]],
+    rows: Sequence[Row],
 ) -> int:
     """Write the films of an evaluation.
 
@@ -77,7 +81,7 @@ def write_films(
     return sum(len(task["films"]) for task in films)
 
 
-def _entry(behaviour: Judged, domain: Domain, number: int, shapes: dict[str, int]) -> dict[str, Any] | None:
+def _entry(behaviour: TaskResult, domain: Domain, number: int, shapes: dict[str, int]) -> dict[str, Any] | None:
     film = film_of(behaviour, domain, number)
     if film is None:
         return None
@@ -88,7 +92,7 @@ def _entry(behaviour: Judged, domain: Domain, number: int, shapes: dict[str, int
     }
 
 
-def _outcomes(behaviour: Judged, number: int) -> Iterator[tuple[str, bool | float]]:
+def _outcomes(behaviour: TaskResult, number: int) -> Iterator[tuple[str, bool | float]]:
     """How an episode ended in the domain's own environment, or what metrics say of a plan."""
     found: Mapping[str, Tensor] = behaviour.outcomes if behaviour.rollout is not None else behaviour.measured
     for name, values in found.items():

@@ -15,7 +15,7 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.evaluation.evaluable import Evaluable
-from ftl_lightning.evaluation.judged import Judged, executed
+from ftl_lightning.evaluation.judged import TaskResult, executed
 from ftl_lightning.evaluation.summary import OWN
 from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_range
 from ftl_lightning.seeding import EVALUATION_SEED, generator, task_key
@@ -97,7 +97,9 @@ def _composed(module: Evaluable, tasks: Iterable[EvaluationTask]) -> dict[Evalua
 
 
 @torch.no_grad()
-def generate(module: Evaluable, tasks: Sequence[EvaluationTask], generation: Generation, root: Path | None = None) -> list[Judged]:
+def generate(
+    module: Evaluable, tasks: Sequence[EvaluationTask], generation: Generation, root: Path | None = None
+) -> list[TaskResult]:
     """Generate and judge tasks, those with equally many samples in one batch of the network.
 
     Args:
@@ -116,7 +118,7 @@ def generate(module: Evaluable, tasks: Sequence[EvaluationTask], generation: Gen
     compositions = _composed(module, tasks)
     starts = {task: _starts(task, module, generation, root) for task in compositions}
     counts = {task: generation.samples if where is None else len(where) for task, where in starts.items()}
-    judged: dict[EvaluationTask, Judged] = {}
+    judged: dict[EvaluationTask, TaskResult] = {}
     for count in dict.fromkeys(counts.values()):
         batch = [task for task in compositions if counts[task] == count]
         noise = [generation.noise(task) for task in batch]
@@ -124,7 +126,7 @@ def generate(module: Evaluable, tasks: Sequence[EvaluationTask], generation: Gen
         together = [compositions[task] for task in batch]
         plans = model.sample(together, count, generation.sampling, noise, moved(observed, model.device)).cpu()
         for task, states in zip(batch, plans, strict=True):
-            judged[task] = Judged.of(task, states, starts[task], domain)
+            judged[task] = TaskResult.of(task, states, starts[task], domain)
     return [judged[task] for task in compositions]
 
 
@@ -144,7 +146,7 @@ def _starts(task: EvaluationTask, module: Evaluable, generation: Generation, roo
 
 
 @torch.no_grad()
-def execute(module: Evaluable, judged: Sequence[Judged], generation: Generation) -> list[Judged]:
+def execute(module: Evaluable, judged: Sequence[TaskResult], generation: Generation) -> list[TaskResult]:
     """The same tasks with their episodes, in which the model makes new plans on the way.
 
     Args:

@@ -18,7 +18,7 @@ WON, LOST = "won against ", "lost against "
 
 
 @dataclass(frozen=True)
-class Judged:
+class TaskResult:
     """Generated behaviour of one task.
 
     Attributes:
@@ -91,7 +91,7 @@ def share(values: Tensor) -> float:
     return float(metric.compute())
 
 
-def paired(generated: Judged, reference: Judged, policy: str, domain: Domain) -> dict[str, Tensor]:
+def paired(generated: TaskResult, reference: TaskResult, policy: str, domain: Domain) -> dict[str, Tensor]:
     """In which episodes ``(sample,)`` a method succeeds and a policy, from the same initial state, does not, and the reverse.
 
     Args:
@@ -119,7 +119,7 @@ def standard_error(values: Sequence[float]) -> float:
     return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
 
 
-def executed(judged: Sequence[Judged], policy: Policy, domain: Domain, environment: str = "") -> list[Judged]:
+def executed(judged: Sequence[TaskResult], policy: Policy, domain: Domain, environment: str = "") -> list[TaskResult]:
     """The same tasks with their episodes, which run all side by side; in the domain's own environment or one of its others.
 
     Raises:

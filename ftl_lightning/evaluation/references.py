@@ -10,7 +10,7 @@ from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.evaluable import demonstrations_of
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.tensor_file import bytes_hash
 
 _KNOWN: dict[tuple[Any, ...], Any] = {}
@@ -18,12 +18,12 @@ _KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
 def references(
-    judged: Sequence[Judged],
+    judged: Sequence[TaskResult],
     domain: Domain,
     demonstrated: Callable[[str], Demonstrations | None],
     seed: int,
     environments: Sequence[str] = (),
-) -> dict[str, list[Judged]]:
+) -> dict[str, list[TaskResult]]:
     """Each reference policy's behaviour by its name; executed where the method's was.
 
     Args:
@@ -42,7 +42,9 @@ def references(
     return by_policy
 
 
-def _planned(name: str, like: Judged, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]) -> Judged:
+def _planned(
+    name: str, like: TaskResult, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]
+) -> TaskResult:
     """A policy that makes its plan once, for the task and the initial states of a method's behaviour."""
     task, starts, (count, _, columns) = like.task, like.starts, like.states.shape
     key = (name, domain.name, task.goal, count, _hash(starts), seed)
@@ -51,7 +53,7 @@ def _planned(name: str, like: Judged, domain: Domain, loop: ClosedLoop | None, s
     plans = _KNOWN[key]
     if (expected := (count, domain.plans.horizon, columns)) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")
-    behaviour = Judged.of(task, plans, starts, domain)
+    behaviour = TaskResult.of(task, plans, starts, domain)
     if loop is None:
         return behaviour
     initial = expect_starts(starts)
@@ -65,13 +67,13 @@ def _planned(name: str, like: Judged, domain: Domain, loop: ClosedLoop | None, s
 
 def _acted(
     name: str,
-    like: Judged,
+    like: TaskResult,
     domain: Domain,
     loop: ClosedLoop,
     demonstrated: Callable[[str], Demonstrations | None],
     seed: int,
     environments: Sequence[str],
-) -> Judged | None:
+) -> TaskResult | None:
     """A policy that acts as it goes, from the initial states of a method's behaviour; ``None`` where it would take too long."""
     task, starts = like.task, expect_starts(like.starts)
     demonstrations, behaviour = demonstrations_of(task, demonstrated), like

@@ -8,7 +8,7 @@ import lightning.pytorch as pl
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.evaluable import Evaluable, demonstrations_of
-from ftl_lightning.evaluation.judged import Judged, paired, share
+from ftl_lightning.evaluation.judged import TaskResult, paired, share
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row
 from ftl_lightning.tensor_file import content_hash, file_hash
 from ftl_lightning.version import __version__
@@ -72,8 +72,8 @@ def config_hash(configured: Mapping[str, Any]) -> str:
 def rows(
     module: Evaluable,
     domain: Domain,
-    judged: Sequence[Judged],
-    references: Mapping[str, Sequence[Judged]],
+    judged: Sequence[TaskResult],
+    references: Mapping[str, Sequence[TaskResult]],
     configured: Mapping[str, Any],
     variant: str | None = None,
 ) -> list[Row]:
@@ -104,7 +104,7 @@ def rows(
 
     policies = domain.closed_loop.policies if domain.closed_loop else {}
 
-    def task_rows(behaviour: Judged, source: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
+    def task_rows(behaviour: TaskResult, source: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
         task = behaviour.task
         subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
         # Reference plans are drawn without demonstrations; policies are given them.

@@ -11,11 +11,11 @@ from ftl_lightning.demonstrations.check import check
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.demonstrations.finding import Finding
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.explained_by import relative_losses
 from ftl_lightning.learning.inversion import check_settings
 from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.learning.left_out import LeftOut, left_out
+from ftl_lightning.learning.leave_one_out import LeaveOneOut, leave_one_out
 from ftl_lightning.learning.longer import longer_than_plans
+from ftl_lightning.learning.relative_loss import relative_losses
 from ftl_lightning.learning.scale_check import scale_findings
 from ftl_lightning.progress import bar
 from ftl_lightning.representation import counted
@@ -75,7 +75,7 @@ class Check:
     demonstrations: Demonstrations
     findings: tuple[Finding, ...]
     known: Known | None = None
-    left_out: LeftOut | None = None
+    left_out: LeaveOneOut | None = None
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
@@ -152,9 +152,9 @@ def check_with(
     titled, total = f"{name}: training concepts", len(model.config.training_concepts)
     with bar(titled, total, lines=False) if progress else nothing as advance:
         known = known_as(model, demonstrations, settings, advance)
-    left: LeftOut | None = None
+    left: LeaveOneOut | None = None
     if steps and len(demonstrations) > 1:
         with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
-            left = left_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"))
+            left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"))
     ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
     return Check(name, demonstrations, ordered, known, left)

@@ -11,11 +11,11 @@ from ftl_lightning.concepts.concept import Choice, Concept
 from ftl_lightning.concepts.modes import Modes, even_stretch
 from ftl_lightning.demonstrations.container import Demonstrations
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.explained_by import relative_losses
 from ftl_lightning.learning.inversion import Watch, check_settings, invert, warn_of_loss
 from ftl_lightning.learning.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
-from ftl_lightning.learning.left_out import learned_from, quickly
+from ftl_lightning.learning.leave_one_out import learned_from, quickly
 from ftl_lightning.learning.quality import Quality, measured
+from ftl_lightning.learning.relative_loss import relative_losses
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120

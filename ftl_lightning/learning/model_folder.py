@@ -16,7 +16,7 @@ from ftl_lightning.learning.concept_model import KIND, ConceptModel
 from ftl_lightning.learning.model_config import CONFIG, VERSION, expect_domain, read_config
 from ftl_lightning.learning.model_weights import WEIGHTS, at_most, expect_weights
 from ftl_lightning.learning.prepared import blank
-from ftl_lightning.schema import built
+from ftl_lightning.schema import from_mapping
 from ftl_lightning.tensor_file import alone, expect_finite, file_hash, load_tensors, save_tensors, write_text
 
 M = TypeVar("M", bound=ConceptModel)
@@ -63,7 +63,7 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
             domain = domain_of_file(content["domain"])
         del content["format"]
         expected_hash = content.pop("hash")
-        config = built(kind.Config, content, "")
+        config = from_mapping(kind.Config, content, "")
     weights = Path(folder) / WEIGHTS
     tensors, _ = load_tensors(weights, KIND)
     if (found := file_hash(weights)) != expected_hash:

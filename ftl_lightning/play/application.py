@@ -21,7 +21,7 @@ from ftl_lightning.play.guard import Guard, body_of
 from ftl_lightning.play.page import POLICY, page
 from ftl_lightning.play.workspace import Stopped, Workspace
 from ftl_lightning.printing import line, say
-from ftl_lightning.schema import built, parse_json
+from ftl_lightning.schema import from_mapping, parse_json
 
 MOST_ASKED, MOST_OPENED = 4 * 2**20, 64 * 2**20
 """Bytes of a question, and of a file that is opened."""
@@ -183,7 +183,7 @@ def playing(desk: Desk) -> list[Route]:
         return JSONResponse(await desk.work(desk.state))
 
     async def opened(request: Request) -> Response:
-        asked = built(requests.Open, await _asked(request), "")
+        asked = from_mapping(requests.Open, await _asked(request), "")
         return JSONResponse(await desk.work(lambda _: desk.open(asked.model)))
 
     async def thumbnail(request: Request) -> Response:
@@ -201,17 +201,17 @@ def playing(desk: Desk) -> list[Route]:
         return JSONResponse(await desk.work(desk.state))
 
     async def forget(request: Request) -> Response:
-        asked = built(requests.Named, await _asked(request), "")
+        asked = from_mapping(requests.Named, await _asked(request), "")
         await desk.work(lambda workspace: workspace.forget(asked))
         return JSONResponse(await desk.work(desk.state))
 
     async def rename(request: Request) -> Response:
-        asked = built(requests.Renamed, await _asked(request), "")
+        asked = from_mapping(requests.Renamed, await _asked(request), "")
         await desk.work(lambda workspace: workspace.rename(asked))
         return JSONResponse(await desk.work(desk.state))
 
     async def learn(request: Request) -> Response:
-        asked = built(requests.Learn, await _asked(request), "")
+        asked = from_mapping(requests.Learn, await _asked(request), "")
         return StreamingResponse(_learned(desk, request, asked), media_type="application/x-ndjson")
 
     return [
@@ -233,7 +233,7 @@ def _answering(desk: Desk, name: str) -> Callable[[Request], Any]:
     kind, do = ANSWERS[name]
 
     async def answer(request: Request) -> Response:
-        asked = built(kind, await _asked(request), "")
+        asked = from_mapping(kind, await _asked(request), "")
         return JSONResponse(await desk.work(lambda workspace: do(workspace, asked)))
 
     return answer

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ftl_lightning.errors import UserError, shown
-from ftl_lightning.schema import built, read_json
+from ftl_lightning.schema import from_mapping, read_json
 
 T = TypeVar("T")
 
@@ -27,7 +27,7 @@ def read_listed(path: Path, key: str, kind: Callable[..., T], expected: str) -> 
         rows = content.get(key) if isinstance(content, dict) else None
         if not isinstance(rows, list):
             raise UserError(f"key {key!r}: expected a list, found {shown(rows)}")
-        return [built(kind, _told(row), f"{key}[{number}]") for number, row in enumerate(rows)]
+        return [from_mapping(kind, _told(row), f"{key}[{number}]") for number, row in enumerate(rows)]
     except UserError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise UserError(f"{path}: expected {expected}, found something else ({reason})") from error

@@ -30,7 +30,7 @@ from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.testing.strokes import strokes
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 SIZES = Sizes(horizon=8, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})
 ORIGIN = Origin("new", "own", "e", "p", "d", 5, "fixed", 0.15)
@@ -216,7 +216,7 @@ def model() -> GenerativeModel:
     ids=str,
 )
 def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeModel, options: dict[str, object]) -> None:
-    learner = FewShot(model, Tuned(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
+    learner = FewShot(model, ModelSettings(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
     before = {name: parameter.clone() for name, parameter in model.named_parameters()}
     demonstrations = learner.demonstrations(strokes("heart", 3, 0), name="heart")
     short, long = (learner.learn(demonstrations, name="heart", steps=steps, form="paper", **options) for steps in (1, 40))
@@ -235,7 +235,7 @@ def test_every_form_is_learned_lowers_the_loss_and_generates(model: GenerativeMo
 
 
 def test_what_is_learned_with_an_adapter_does_not_depend_on_what_is_learned_beside_it(model: GenerativeModel) -> None:
-    learner = FewShot(model, Tuned(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
+    learner = FewShot(model, ModelSettings(InversionSettings().changed(samples=8), 40, Sampling(steps=2), 1))
     one = learner.demonstrations(strokes("heart", 3, 0), name="heart")
     other = learner.demonstrations(strokes("square", 3, 0), name="square")
     settings = InversionSettings().changed(samples=8, adapter=2)

@@ -13,7 +13,7 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.references import references
 
 STATES = torch.zeros(5, 1, 21)
@@ -27,7 +27,7 @@ def with_metric(values: Any) -> Domain:
 def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> None:
     for wrong in (torch.zeros(5, 5), torch.zeros(3), [True] * 5, STATES.numpy()[:, 0, 0]):
         with pytest.raises(UserError, match=r"metric 'mine': expected a tensor of shape \(5,\) or \(\), found"):
-            Judged.of(EvaluationTask("s", GOAL), STATES, None, with_metric(wrong))
+            TaskResult.of(EvaluationTask("s", GOAL), STATES, None, with_metric(wrong))
     for values in (torch.ones(5), torch.tensor(0.5)):  # for each plan, or for all
         assert with_metric(values).measure(GOAL, STATES, None) == {"mine": values}
     rollout = Rollout(InitialStates({}, torch.zeros(2, 1)), {}, torch.zeros(2, dtype=torch.bool), [{}, {}])
@@ -40,7 +40,7 @@ def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> No
         with pytest.raises(UserError, match=expected):
             replace(DOMAIN, closed_loop=loop).judge(GOAL, rollout)
     domain = replace(DOMAIN, name="other", references={"mine": lambda goal, count, starts, seed: torch.zeros(count, 2, 21)})
-    one = Judged.of(EvaluationTask("s", GOAL), STATES, None, domain)
+    one = TaskResult.of(EvaluationTask("s", GOAL), STATES, None, domain)
     with pytest.raises(UserError, match=r"reference 'mine': expected plans \(5, 1, 21\), found \(5, 2, 21\)"):
         references([one], domain, lambda concept: None, 0)
 

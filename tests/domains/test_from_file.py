@@ -16,7 +16,7 @@ from ftl_lightning.domains.data import InversionData, OwnData
 from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning import InversionModule, PretrainingModule
@@ -289,7 +289,7 @@ def test_a_model_of_ones_own_data_keeps_what_it_is_judged_by(fitted: Path) -> No
     assert {path.name for path in Path("copy").iterdir()} == {"config.json", "demonstrations.safetensors", "model.safetensors"}
 
 
-def invert(pretrained: Path, steps: int, form: str) -> tuple[Judged, Any]:
+def invert(pretrained: Path, steps: int, form: str) -> tuple[TaskResult, Any]:
     """What is generated of a new concept that was learned, and its rows."""
     np.savez("between.npz", states=walks("go between", 4, 5), concepts="go between")
     data = InversionData("own", demonstrations="between.npz", steps=steps)

@@ -25,7 +25,7 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation import generation
 from ftl_lightning.evaluation.closed_loop import fixed_plans, reset, roll_out
-from ftl_lightning.evaluation.judged import Judged
+from ftl_lightning.evaluation.judged import TaskResult
 from tests.conftest import refused
 
 assert DOMAIN.closed_loop is not None
@@ -208,7 +208,7 @@ def test_an_evaluation_goes_on_whose_first_episode_breaks(monkeypatch: pytest.Mo
     plans = still({}, [0], 0)[:, None].repeat(3, 32, 1)
     monkeypatch.setattr(generation, "sampled_plans", lambda *_: fixed_plans(plans.repeat(2, 1, 1)))
     task = EvaluationTask("new concept", PUSH, (PUSH,))
-    judged: Any = [Judged(task, plans, {}, starts()), Judged(task, plans, {}, starts())]
+    judged: Any = [TaskResult(task, plans, {}, starts()), TaskResult(task, plans, {}, starts())]
     module: Any = SimpleNamespace(model=SimpleNamespace(view=None), domain=domain, composition=lambda task: task)
     broken, whole = generation.execute(module, judged, generation.Generation())
     assert broken.followed is None

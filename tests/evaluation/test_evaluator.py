@@ -27,7 +27,7 @@ from ftl_lightning.evaluation.drawing import picture
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.generation import Generation, execute, generate, tasks_of
-from ftl_lightning.evaluation.judged import Judged, share, standard_error
+from ftl_lightning.evaluation.judged import TaskResult, share, standard_error
 from ftl_lightning.evaluation.results import append_rows, read_rows
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import configuration
@@ -69,7 +69,7 @@ def test_accuracy_is_the_share_of_right_samples_and_its_error_is_over_tasks() ->
     source = domain.source(None)
     good = source.draw(task.goal, 3, 0).states
     bad = source.draw("square right of circle", 1, 0).states
-    assert Judged.of(task, torch.cat((good, bad)), None, domain).values == {"accuracy": pytest.approx(0.75)}
+    assert TaskResult.of(task, torch.cat((good, bad)), None, domain).values == {"accuracy": pytest.approx(0.75)}
     assert standard_error([0.1, 0.5, 0.6, 1.0]) == pytest.approx(float(np.std([0.1, 0.5, 0.6, 1.0], ddof=1)) / 2)
     assert standard_error([0.3]) == 0
 
@@ -87,7 +87,7 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
     domain = replace(base, metrics=metrics, headline="distance")
     task = base.concepts.suites["training"].tasks[0]
     states = base.source(None).draw(task.goal, 4, 0).states
-    one = Judged.of(task, states, None, domain)
+    one = TaskResult.of(task, states, None, domain)
     assert one.measured["spread"].shape == ()
     assert one.measured["distance"].shape == (4,)
     assert list(one.values) == ["spread", "distance", "accuracy"]
@@ -99,7 +99,7 @@ def test_a_metric_may_be_a_number_of_each_sample_or_of_the_whole_set_and_less_ma
     assert domain.main_metric == "spread"
     assert [domain.less_is_better(name) for name in domain.metrics] == [False, True, False]
     assert not domain.less_is_better("closed loop distance")  # there is no closed loop
-    assert Judged.of(task, states, None, replace(domain, metrics={"distance": Metric(distance, True)})).right is None
+    assert TaskResult.of(task, states, None, replace(domain, metrics={"distance": Metric(distance, True)})).right is None
     driving = load_domain("driving")
     assert driving.less_is_better("closed loop crash")
     assert driving.less_is_better("closed loop crash (step veto)")
@@ -116,7 +116,7 @@ def test_plans_of_which_a_metric_says_nothing_do_not_count_and_without_any_it_is
         "level": torch.tensor([math.nan, 1.0]),
         "turned": torch.tensor([math.nan] * 2),
     }
-    judged = Judged(EvaluationTask("s", "walk"), torch.zeros(2, 3, 1), measured)
+    judged = TaskResult(EvaluationTask("s", "walk"), torch.zeros(2, 3, 1), measured)
     assert judged.values == {"right": 0.5, "level": 1.0}
 
 
@@ -271,7 +271,7 @@ def test_demonstrations_are_drawn_above_the_samples_that_are_framed_by_outcome(t
         return domain.show.picture(states, right, title, None)
 
     watched = replace(domain, show=replace(domain.show, picture=drawn))
-    behaviour = Judged.of(EvaluationTask("new concept", task, (task,)), states, None, domain)
+    behaviour = TaskResult.of(EvaluationTask("new concept", task, (task,)), states, None, domain)
     figure = picture(behaviour, watched, lambda concept: source.draw(concept, 5, 1), 16)
     assert seen == [(5, None), (4, [True, True, True, False])]
     assert [text.get_text() for text in figure.texts] == [

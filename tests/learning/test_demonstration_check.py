@@ -15,8 +15,8 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.errors import UserError
 from ftl_lightning.few_shot import FewShot
 from ftl_lightning.learning.demonstration_check import Known, warnings_of
-from ftl_lightning.learning.explained_by import relative_losses
-from ftl_lightning.learning.left_out import LeftOut, left_out, odd_one, subsets
+from ftl_lightning.learning.leave_one_out import LeaveOneOut, leave_one_out, odd_one, subsets
+from ftl_lightning.learning.relative_loss import relative_losses
 from ftl_lightning.learning.scale_check import scale_findings
 from ftl_lightning.testing.strokes import strokes
 from tests.conftest import CONF, ROOT, refused, succeed
@@ -105,19 +105,19 @@ def test_the_odd_one_is_far_above_all_others() -> None:
 
 
 def test_words_follow_the_numbers() -> None:
-    suffice = LeftOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None, 0.1)
+    suffice = LeaveOneOut((0.4, 0.5, 0.96), (0.3, 0.3, 0.4), {1: 0.7, 2: 0.69}, None, 0.1)
     assert (suffice.covered, suffice.falling) == (2, False)
     told = " ".join(suffice.lines())
     assert "explains 2 of 3, not demonstration 3" in told
     assert "these suffice" in told
-    more = LeftOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2, 0.02)
+    more = LeaveOneOut((0.4, 0.5, 1.9), (0.3, 0.3, 0.4), {1: 0.9, 2: 0.7}, 2, 0.02)
     assert more.falling
     assert suffice.lines()[-1].startswith("distance: where it is learned from them, they have 3.3 times")
     assert more.far  # without the odd one
     assert more.lines()[-1].startswith("far: where it is learned from them, they have 15.0 times")
     assert "odd: demonstration 3, loss 1.90" in " ".join(more.lines())
     assert "more are likely to help" in " ".join(more.lines())
-    assert "look at samples" in LeftOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None, 0.2).lines()[-2]
+    assert "look at samples" in LeaveOneOut((1.0, 1.1, 1.0), (0.8, 0.8, 0.8), {1: 1.05, 2: 1.03}, None, 0.2).lines()[-2]
     assert not Known("a", (0.9, 0.9, 1.2, 0.9)).clear
 
 
@@ -127,10 +127,10 @@ def test_a_stroke_of_another_kind_is_odd() -> None:
     good = model.demonstrations(strokes("square", 5, 77))
     assert warnings_of(model.model, good) == ()
     mixed = model.demonstrations(np.concatenate([strokes("square", 4, 77), strokes("heart", 1, 77)]))
-    found = left_out(model.model, mixed, model.tuned.inversion, 60)
+    found = leave_one_out(model.model, mixed, model.tuned.inversion, 60)
     assert found.left_out[4] == max(found.left_out)
     assert found.left_out[4] > 1.5 * sorted(found.left_out)[-2]
-    fine = left_out(model.model, good, model.tuned.inversion, 60)
+    fine = leave_one_out(model.model, good, model.tuned.inversion, 60)
     assert fine.odd is None
     assert sum(fine.left_out) / 5 < 1
     assert not fine.far

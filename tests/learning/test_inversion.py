@@ -19,7 +19,7 @@ from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.learning import InversionModule
 from ftl_lightning.learning.inversion import Inversion, explained, invert
 from ftl_lightning.learning.inversion_settings import EXPLAINED, InversionSettings
-from ftl_lightning.learning.left_out import quickly
+from ftl_lightning.learning.leave_one_out import quickly
 from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel

@@ -22,7 +22,7 @@ from ftl_lightning.methods.ftl_igm import pretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING
 from ftl_lightning.option_groups import flat, groups_of, replaced
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 from tests.conftest import CONF, inversion_module
 
 OBJECTS = CONF / "object_rearrangement.yaml"
@@ -141,7 +141,7 @@ def test_null_of_an_option_that_is_in_no_group_leaves_the_others_beside_it() -> 
 def test_a_mistake_in_the_settings_of_a_learner_is_one_line(options: str, told: str) -> None:
     Path("own.yaml").write_text(f"model: {{init_args: {options}}}\n")
     with pytest.raises(UserError, match=told):
-        Tuned.read("own.yaml")
+        ModelSettings.read("own.yaml")
 
 
 def test_what_is_no_group_is_told_in_one_line() -> None:

@@ -26,7 +26,7 @@ from ftl_lightning.learning.model_folder import read_model
 from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.pretraining import Pretraining
 from ftl_lightning.trainer import Trainer
-from ftl_lightning.tuned import Tuned
+from ftl_lightning.tuned import ModelSettings
 
 MEMORY = f"{__name__}:remember"
 METHOD = Method("memory", kind="memory", model=f"{__name__}:Memory", learner=MEMORY)
@@ -98,7 +98,7 @@ def fitted() -> Path:
 
 
 def test_a_model_without_parameters_is_pretrained_written_and_used_from_python(fitted: Path) -> None:
-    model = FewShot(read_model(Memory, fitted), Tuned.read("conf/own.yaml"))
+    model = FewShot(read_model(Memory, fitted), ModelSettings.read("conf/own.yaml"))
     five = 3 * np.ones((5, 8, 2), dtype=np.float32)
     concept = model.learn(five)
     assert torch.allclose(model.sample(concept, 2).states, torch.full((2, 8, 2), 3.0), atol=1e-5)

@@ -100,7 +100,7 @@ def feet_amplitude(states: Tensor) -> Tensor:
 def feet_in_time(states: Tensor) -> Tensor:
     """Whether feet open and close in time with the hands: ``(sample,)`` of bool.
 
-    People open their feet while the hands rise; some, while they sink. Judged from :data:`SETTLED` on.
+    People open their feet while the hands rise; some, while they sink. TaskResult from :data:`SETTLED` on.
     """
     settled = states[:, SETTLED:]
     hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(settled), _feet(settled)))

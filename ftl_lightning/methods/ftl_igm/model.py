@@ -24,7 +24,7 @@ from ftl_lightning.learning.prepared import Prepared
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 from ftl_lightning.methods.ftl_igm import METHOD
 from ftl_lightning.ranges import expect_range
-from ftl_lightning.schema import built
+from ftl_lightning.schema import from_mapping
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     points = config.denoiser_args.get("initial_encoder") == "points"
     if points and config.image_dim and config.image_encoder.get("head") != "points":
         raise UserError("denoiser_args.initial_encoder: expected flat, found points: image_encoder.head reads no points")
-    denoiser = built(kind, config.denoiser_args, "denoiser_args", config)
+    denoiser = from_mapping(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
         return denoiser
     if config.state_columns and len(config.state_columns) != config.state_dim:

@@ -10,9 +10,9 @@ from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.demonstrations.container import Demonstrations, concatenate
 from ftl_lightning.demonstrations.finding import numbered
 from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.explained_by import generated_loss, relative_losses
 from ftl_lightning.learning.inversion import invert
 from ftl_lightning.learning.inversion_settings import PAPER, InversionSettings
+from ftl_lightning.learning.relative_loss import generated_loss, relative_losses
 
 MOST = 12
 """Demonstrations of which this is asked: of each, several concepts are learned."""
@@ -29,7 +29,7 @@ FALLING = 0.05
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeaveOneOut:
     """Losses of demonstrations relative to the empty concept's on the same noise; 1 is no better than nothing, less is better.
 
     Attributes:
@@ -37,7 +37,7 @@ class LeftOut:
         learned_from: of each, the mean under the concepts that were learned from it and all others but one ``(demo,)``.
         curve: the mean of those left out by the number of demonstrations that were learned from, without the odd one.
         odd: the demonstration that differs from the others, from 0; ``None`` where none does.
-        generated: of what the model generates itself, see :func:`~ftl_lightning.learning.explained_by.generated_loss`.
+        generated: of what the model generates itself, see :func:`~ftl_lightning.learning.relative_loss.generated_loss`.
     """
 
     left_out: tuple[float, ...]
@@ -138,13 +138,13 @@ def quickly(settings: InversionSettings) -> InversionSettings:
     )
 
 
-def left_out(
+def leave_one_out(
     model: ConceptModel,
     demonstrations: Demonstrations,
     settings: InversionSettings,
     steps: int,
     tell: Callable[[float], None] = lambda loss: None,
-) -> LeftOut:
+) -> LeaveOneOut:
     """Learn the concept from subsets, all in one batch, and measure each on what was left out.
 
     Args:
@@ -172,7 +172,7 @@ def left_out(
         for size in sorted(set(sizes.tolist()))
         if kept[sizes == size].any()
     }
-    return LeftOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, own, settings))
+    return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, own, settings))
 
 
 def odd_one(losses: Tensor) -> int | None:
