@@ -66,18 +66,18 @@ report: install # tables and figures of results/, and the table in the README
 	$(BIN)/python -m ftl_lightning report --readme README.md
 
 benchmark: install # every number of the page on speed, on a machine that does nothing else: half an hour
-	$(BIN)/python benchmarks/speed.py
-	$(BIN)/python benchmarks/peers.py
-	$(BIN)/python benchmarks/batching.py --again
-	$(BIN)/python benchmarks/batching.py --again --precision bf16-mixed --processes 2 --least 16
-	$(BIN)/python benchmarks/batching.py --again --domain driving --steps 60
-	$(BIN)/python benchmarks/batching.py --again --domain driving --steps 60 --precision bf16-mixed --processes 2 --least 16
-	$(BIN)/python benchmarks/product_rate.py
-	$(BIN)/python benchmarks/cost.py
-	$(BIN)/python benchmarks/distributed.py --parts throughput
-	$(BIN)/python benchmarks/fit_options.py
-	$(BIN)/python benchmarks/price.py
-	$(BIN)/python benchmarks/speed_table.py
+	$(BIN)/python benchmarks/speed/speed.py
+	$(BIN)/python benchmarks/speed/peers.py
+	$(BIN)/python benchmarks/speed/batching.py --again
+	$(BIN)/python benchmarks/speed/batching.py --again --precision bf16-mixed --processes 2 --least 16
+	$(BIN)/python benchmarks/speed/batching.py --again --domain driving --steps 60
+	$(BIN)/python benchmarks/speed/batching.py --again --domain driving --steps 60 --precision bf16-mixed --processes 2 --least 16
+	$(BIN)/python benchmarks/speed/product_rate.py
+	$(BIN)/python benchmarks/speed/cost.py
+	$(BIN)/python benchmarks/speed/distributed.py --parts throughput
+	$(BIN)/python benchmarks/speed/fit_options.py
+	$(BIN)/python benchmarks/speed/price.py
+	$(BIN)/python benchmarks/speed/speed_table.py
 
 docs: install # the documentation's pages, in docs/_build/html; a warning is an error
 	$(MAKE) --jobs 2 docs-sphinx docs-pages

@@ -1,4 +1,4 @@
-"""The verb ``ablate``: its options, and what it does. Its imports are inside, so that it starts at once."""
+"""The verb ``ablate`` and its options. Imports are deferred for a fast start."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -8,26 +8,26 @@ from ftl_lightning.printing import say
 from ftl_lightning.ranges import expect_count
 
 MOST_WORKERS = 1000
-"""Cells side by side."""
+"""Maximum number of parallel cells."""
 
 
 @dataclass(frozen=True)
 class AblateOptions:
-    """Run every cell of an ablation that the results do not hold yet.
+    """Run every cell of an ablation that is not in the results.
 
     Attributes:
         stages: verbs with grids of options, in order.
-        results: results file that rows are added to.
-        seeds: each stage runs once a seed.
-        shard: "3/8" for the third of eight parts; models that it needs and does not make itself must be there.
-        executor: "ray" (the extra "cluster") runs cells side by side on a Ray cluster, or on this machine's processors.
-        root: folder of recordings, of domains that read one: data.root of every cell.
-        address: of the Ray cluster's head, HOST:PORT; empty for RAY_ADDRESS, or else a cluster that runs on this machine.
+        results: results file to which rows are added.
+        seeds: each stage runs once per seed.
+        shard: "3/8" for the third of eight parts; models that it does not make itself must exist.
+        executor: "ray" (the extra "cluster") runs cells in parallel on a Ray cluster, or on this machine's processors.
+        root: folder of recordings, for domains that read one: data.root of every cell.
+        address: address of the Ray cluster's head, HOST:PORT; empty for RAY_ADDRESS, or else a cluster on this machine.
         only: numbers of the stages to run, from 1; empty for all.
-        estimate: run nothing; print how many cells are to be run, and for how many hours by those that were measured.
-        status: run nothing; print the table of what became of each cell, also while another process runs them.
+        estimate: run nothing; print the number of cells to run and the estimated hours.
+        status: run nothing; print the table of cells with their states, also while another process runs them.
         slurm: run nothing; write a script for Slurm's sbatch to this file, or several in order, whose jobs run shards.
-        workers: cells side by side, for the estimate; jobs of each of Slurm's arrays (0: one for each cell).
+        workers: parallel cells, for the estimate; jobs of each Slurm array (0: a job per cell).
         sbatch: more options of sbatch by name, such as {partition: long, time: "02:00:00"}.
     """
 
@@ -50,7 +50,7 @@ class AblateOptions:
 
 
 def ablate(options: AblateOptions) -> None:
-    """Run the cells, or tell or write what the options ask for in place of running them."""
+    """Run the cells, or print or write what the options ask for instead."""
     from ftl_lightning.ablation.run import planned, run_ablation, show_cells, show_estimate
 
     stages, seeds, results = options.stages, options.seeds, options.results

@@ -1,4 +1,4 @@
-"""What is given to the Python API: whole numbers, texts, devices, and settings by name, refused in the words of the caller."""
+"""Validation of arguments of the Python API: whole numbers, texts, devices, and settings by name."""
 
 import difflib
 import os
@@ -38,19 +38,19 @@ ELSEWHERE = {
     "k": "components",
     "rank": "adapter",
 }
-"""How other libraries call what is given here, with its name here."""
+"""Argument names of other libraries and their equivalents."""
 MOST_NAMES = 8
-"""Settings that are named to someone who gives another."""
+"""Maximum number of settings listed in an error message."""
 
 
 def expect_whole(key: str, value: object, least: int, most: int | None = LARGEST) -> int:
-    """A whole number of a range.
+    """Check and return a whole number.
 
     Args:
         key: name of the argument.
-        value: what was given.
-        least: the smallest number of the range.
-        most: the largest; ``None`` for any.
+        value: value of the argument.
+        least: minimum.
+        most: maximum; ``None`` for any.
 
     Raises:
         UserError: for anything else, ``True`` included.
@@ -65,20 +65,20 @@ def expect_whole(key: str, value: object, least: int, most: int | None = LARGEST
 
 
 def expect_text(key: str, value: object, example: str) -> None:
-    """Refuse what is no text.
+    """Refuse a value that is not a text.
 
     Raises:
-        UserError: with an example of one.
+        UserError: with an example.
     """
     if not isinstance(value, str):
         raise UserError(f"{key}: expected a text, such as {shown(example, 40)}, found {shown(value)}")
 
 
 def expect_path(key: str, value: object, what: str) -> None:
-    """Refuse what is no path.
+    """Refuse a value that is not a path.
 
     Raises:
-        UserError: saying what it is to be a path of.
+        UserError: with the expected kind of path.
     """
     if not isinstance(value, str | os.PathLike):
         raise UserError(f"{key}: expected {what}, found {shown(value)}")
@@ -87,27 +87,27 @@ def expect_path(key: str, value: object, what: str) -> None:
 def changed(
     call: str, settings: T, changes: Mapping[str, Any], beside: Sequence[str], places: Mapping[str, str] = MappingProxyType({})
 ) -> T:
-    """Settings of which some are changed.
+    """Copy of settings with changes.
 
     Args:
-        call: what they are given to, such as ``'sample'``.
-        settings: the others.
-        changes: by name.
-        beside: names of what else can be given to it.
-        places: of each option in a group of the settings where it is, ``'group.option'``, by its flat name.
+        call: name of the called method, such as ``'sample'``.
+        settings: current settings.
+        changes: changed settings by name.
+        beside: other arguments of the method.
+        places: grouped options ``'group.option'`` by flat name.
 
     Raises:
-        UserError: for a name that is none, with all that are, or a value of another type.
+        UserError: for an unknown name, with the known names, or a value of another type.
     """
     groups = groups_of(places)
     names = [*(field.name for field in fields(settings) if field.name not in (*beside, *groups)), *places]
     if unknown := [name for name in changes if name not in names]:
-        told = names if len(names) <= MOST_NAMES else [*names[:MOST_NAMES], "..."]
+        expected = names if len(names) <= MOST_NAMES else [*names[:MOST_NAMES], "..."]
         raise UserError(
-            f"{call}: expected {', '.join(told)} (or {', '.join(beside)}), found {short(str(unknown[0]), 30)!r}"
+            f"{call}: expected {', '.join(expected)} (or {', '.join(beside)}), found {short(str(unknown[0]), 30)!r}"
             f"; model.tuned shows all settings{_meant(str(unknown[0]), (*names, *beside))}"
         )
-    # NumPy's numbers are as good as Python's.
+    # NumPy's numbers are allowed.
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in changes.items()}
     hints = get_type_hints(type(settings))
     of_groups = {group: get_type_hints(hints[group]) for group in groups}
@@ -117,8 +117,8 @@ def changed(
     for name, value in plain.items():
         kinds = _kinds(hints[name])
         if not any(_is(value, kind) for kind in kinds):
-            told = [_WORDS[kind] if kind in _WORDS else repr(kind) for kind in kinds]
-            raise UserError(f"{call}: {name}: expected {' or '.join(told)}, found {shown(value)}")
+            expected = [_WORDS[kind] if kind in _WORDS else repr(kind) for kind in kinds]
+            raise UserError(f"{call}: {name}: expected {' or '.join(expected)}, found {shown(value)}")
     return replaced(settings, plain, places)
 
 
@@ -126,13 +126,13 @@ _WORDS: Mapping[object, str] = {int: "a whole number", float: "a number", str: "
 
 
 def _kinds(hint: Any) -> list[Any]:
-    """What an annotation allows: types, and texts of a choice."""
+    """Allowed types and literal texts of an annotation."""
     parts = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     return [kind for part in parts for kind in (get_args(part) if get_origin(part) is Literal else (part,))]
 
 
 def _is(value: object, kind: Any) -> bool:
-    """Whether a value is of a type, or a text of a choice; a text is left to the settings where they take texts at all."""
+    """Whether a value has a type; for a literal, whether it is a text, whose choice the settings check."""
     if isinstance(kind, str):
         return isinstance(value, str)
     if kind in (int, float) and isinstance(value, bool):
@@ -141,34 +141,34 @@ def _is(value: object, kind: Any) -> bool:
 
 
 def _meant(name: str, known: Sequence[str]) -> str:
-    """What a name was probably meant to be, at the end of a sentence; empty where nothing is near."""
-    own = ELSEWHERE.get(name.lower())
-    near = [own] if own in known else difflib.get_close_matches(name, known, n=1)
+    """Suggestion for an unknown name; empty without a similar name."""
+    translated = ELSEWHERE.get(name.lower())
+    near = [translated] if translated in known else difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def device_named(name: object) -> torch.device:
-    """A device that this machine can compute on.
+    """Check and return a device of this machine.
 
     Raises:
-        UserError: for another one, with those that there are; for one that is there and fails, with what it said.
+        UserError: for an unavailable device, with the available devices; for a failing device, with its error.
     """
-    told = f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}"
+    message = f"device: expected one that this machine has, {' or '.join(_devices())}, found {shown(name)}"
     if not isinstance(name, str | torch.device):
-        raise UserError(told)
+        raise UserError(message)
     try:
-        found = torch.device(name)
+        device = torch.device(name)
     except RuntimeError as error:
-        raise UserError(told) from error
+        raise UserError(message) from error
     try:
-        torch.ones(1, device=found).cpu()  # it may be named without being there
-    except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch has one for each kind of absence
-        # One that is there, and out of memory or broken, is not absent.
-        if str(found) in _devices() or (found.type == "cuda" and found.index is None and torch.cuda.is_available()):
+        torch.ones(1, device=device).cpu()  # a valid name may be unavailable
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # kinds of unavailability
+        # An available device may be out of memory or broken.
+        if str(device) in _devices() or (device.type == "cuda" and device.index is None and torch.cuda.is_available()):
             reason = short(next(iter(str(error).splitlines()), "") or type(error).__name__)
-            raise UserError(f"device: expected {found} to compute, found that it cannot: {reason}") from error
-        raise UserError(told) from error
-    return found
+            raise UserError(f"device: expected {device} to compute, found that it cannot: {reason}") from error
+        raise UserError(message) from error
+    return device
 
 
 def _devices() -> list[str]:

@@ -1,4 +1,4 @@
-"""Plans that are made some at a time, from the same noise as all at once."""
+"""Sampling of plans in batches, independent of the batch size."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,10 +21,10 @@ from ftl_lightning.seeding import generator
 
 @dataclass(frozen=True)
 class _Part(Sampling):
-    """How some of the plans are generated.
+    """Sampling of some of the plans.
 
     Attributes:
-        own: draws their noise; ``None`` for the noise that the model draws.
+        own: draws their noise; ``None`` for the model's noise.
         advance: called after each step.
     """
 
@@ -32,12 +32,12 @@ class _Part(Sampling):
     advance: Callable[[], None] = field(default=lambda: None)
 
     def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
-        def told(x: Tensor, t: Tensor) -> Tensor:
-            found = epsilon(x, t)
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            predicted = epsilon(x, t)
             self.advance()
-            return found
+            return predicted
 
-        return super().run(told, self.own or noise, alpha_bar)
+        return super().run(predict, self.own or noise, alpha_bar)
 
 
 def sampled(
@@ -50,19 +50,19 @@ def sampled(
     batch_size: int | None = None,
     progress: bool = False,
 ) -> Tensor:
-    """Plans of a concept ``(count, horizon, state)``.
+    """Sample plans of a concept ``(count, horizon, state)``.
 
-    Noise, and modes, are drawn for all plans by the seed alone, so that a plan does not depend on the size of a batch but for
-    rounding. Methods without a sampler need one pass of a small network and make all plans at once.
+    Noise and modes are drawn for all plans from the seed, so that plans do not depend on the batch size, up to rounding. Methods
+    without a sampler need one pass of a small network and ignore it.
 
     Args:
-        model: that makes them.
-        concept: of all of them.
-        count: of plans.
+        model: the model.
+        concept: concept of all plans.
+        count: number of plans.
         sampling: sampler, steps and temperature.
-        seed: of the noise.
+        seed: seed of the noise.
         observed: features ``(count, *shape)`` by name, on the model's device.
-        batch_size: plans that are made at once; ``None`` for all.
+        batch_size: maximum number of plans in a batch; ``None`` for all.
         progress: show a bar.
     """
     size = count if batch_size is None or model.max_steps is None else min(batch_size, count)
@@ -72,10 +72,10 @@ def sampled(
             parts = torch.arange(count).split(size)
             return torch.cat([_part(model, concept, count, sampling, seed, observed, rows, advance) for rows in parts])
         how = sampling if model.max_steps is None or not progress else _Part(**asdict(sampling), advance=advance)
-        found = model.sample([concept], count, how, [generator("cpu", seed)], observed)[0]
+        plans = model.sample([concept], count, how, [generator("cpu", seed)], observed)[0]
         if model.max_steps is None:
             advance()
-        return found
+        return plans
 
 
 def _part(
@@ -88,9 +88,9 @@ def _part(
     rows: Tensor,
     advance: Advance | Callable[..., None],
 ) -> Tensor:
-    """Some ``rows (n,)`` of the plans of :func:`sampled` ``(n, horizon, state)``: all noise is drawn, and theirs is taken."""
+    """Plans ``(n, horizon, state)`` of some ``rows (n,)`` in :func:`sampled`; noise is drawn for all rows and selected."""
     concept, draw = concept.uncomposed, generator("cpu", seed)
-    whole, own = concept.draw(count, draw)
+    whole, numbers = concept.draw(count, draw)
     shape = (count, model.config.horizon, model.config.state_dim)
 
     def noise() -> Tensor:
@@ -100,12 +100,12 @@ def _part(
     seen = take(observed, rows.to(model.device))
     if concept.modes is None:
         return model.sample([concept], len(rows), how, [draw], seen)[0]
-    each = [whole.row(number) for number in own[rows.to(own.device)].tolist()]
+    each = [whole.row(number) for number in numbers[rows.to(numbers.device)].tolist()]
     return model.sample(each, 1, how, [draw] * len(each), seen)[:, 0]
 
 
 def plans_of(domain: Domain, states: Tensor, starts: InitialStates | None, provenance: Mapping[str, Any]) -> Demonstrations:
-    """Generated plans ``(sample, horizon, state)`` as demonstrations, with where they start."""
+    """Generated plans ``(sample, horizon, state)`` as demonstrations, with their initial states."""
     return Demonstrations(
         states=states,
         lengths=torch.full((len(states),), states.shape[1]),

@@ -1,4 +1,4 @@
-"""The verb ``benchmark``: its options, and what it does. Its imports are inside, so that it starts at once."""
+"""The verb ``benchmark`` and its options. Imports are deferred for a fast start."""
 
 import re
 from dataclasses import dataclass
@@ -18,24 +18,24 @@ class BenchmarkOptions:
     """Run a method through the frozen suites, check a submission, make the leaderboard, or write the data.
 
     Attributes:
-        method: the name under which its package offers it, such as bc.
-        suites: names with commas between them; empty for all that can be run here.
-        skip: names of suites to leave out, with commas between them.
-        seeds: with commas between them; a submission needs 0,1,2.
-        out: the submission file; a run that was stopped goes on where it was. Models and logs go to a folder beside it.
-        model: folder of the pretrained models, in which {suite} and {seed} stand for these; "shipped" for the models that the
-            method's configurations name; empty to pretrain.
+        method: registered name of the method, such as bc.
+        suites: comma-separated names; empty for all that can be run here.
+        skip: comma-separated names of suites to leave out.
+        seeds: comma-separated seeds; a submission needs 0,1,2.
+        out: submission file; a stopped run is resumed. Models and logs go to a folder beside it.
+        model: folder of the pretrained models, with placeholders {suite} and {seed}; "shipped" for the models that the method's
+            configurations name; empty to pretrain.
         configurations: folder with SUITE.yaml for each suite, or suites.yaml for all; empty for those of the method's package, or
             the defaults of its classes.
-        root: folder of your own copy of recordings, for suites whose demonstrations do not ship.
-        list: print a table of the suites in place of running.
-        check: a submission file to check in place of running; with a method, a part of it is run again.
-        recompute: share of the rows that is run again.
-        salt: a word that decides with the file which part that is.
+        root: folder of your copy of recordings, for suites whose demonstrations do not ship.
+        list: print a table of the suites instead of running.
+        check: submission file to check instead of running; with a method, a part of it is run again.
+        recompute: share of rows that is run again.
+        salt: word that, with the file, selects these rows.
         leaderboard: Markdown file to write from the submissions.
-        submissions: folder of them.
+        submissions: folder of submissions.
         data: folder to write the suites' data to, with cards and hashes.
-        format: of the data: npz, safetensors, lerobot or minari.
+        format: format of the data: npz, safetensors, lerobot or minari.
     """
 
     method: str = ""
@@ -78,14 +78,14 @@ def _root(options: BenchmarkOptions) -> Path | None:
 
 
 def _entry(options: BenchmarkOptions, work: Path) -> "Entry":
-    """What is run, with models and logs in a folder."""
+    """The method to run, with a folder for models and logs."""
     from ftl_lightning.benchmark.run import Entry
 
     return Entry(options.method, options.model, options.configurations, _root(options), work)
 
 
 def benchmark(options: BenchmarkOptions) -> None:
-    """Do what the options say."""
+    """Run the verb."""
     if options.list:
         from ftl_lightning.benchmark.leaderboard import suite_table
 
@@ -97,9 +97,9 @@ def benchmark(options: BenchmarkOptions) -> None:
         from ftl_lightning.representation import counted
         from ftl_lightning.tensor_file import write_text
 
-        found = read_submissions(Path(options.submissions))
-        write_text(Path(options.leaderboard), leaderboard(found))
-        say(f"{options.leaderboard}: {counted(len(found), 'submission')}")
+        submissions = read_submissions(Path(options.submissions))
+        write_text(Path(options.leaderboard), leaderboard(submissions))
+        say(f"{options.leaderboard}: {counted(len(submissions), 'submission')}")
     elif options.data:
         from ftl_lightning.benchmark.data import write_data
         from ftl_lightning.benchmark.suite import load_suite
@@ -119,7 +119,7 @@ def _named(text: str, key: str) -> list[str]:
     """Names of suites.
 
     Raises:
-        UserError: for one that is none, or twice.
+        UserError: for an unknown or repeated name.
     """
     from ftl_lightning.benchmark.suite import suite_names
 
@@ -132,28 +132,28 @@ def _named(text: str, key: str) -> list[str]:
 
 
 def _chosen(options: BenchmarkOptions) -> list[str]:
-    """The suites that are asked for; of all of them those that the method can do here, and why it cannot do others is told.
+    """The named suites; without names all that the method can run here, with notes on the others.
 
     Raises:
-        UserError: for a suite that is asked for by name and cannot be run here.
+        UserError: for a named suite that cannot be run here.
     """
     from ftl_lightning.benchmark.run import missing_of
     from ftl_lightning.benchmark.suite import load_suite, suite_names
 
-    asked, skipped = _named(options.suites, "suites"), _named(options.skip, "skip")
-    found, root = [], _root(options)
-    for name in asked or suite_names():
+    requested, skipped = _named(options.suites, "suites"), _named(options.skip, "skip")
+    chosen, root = [], _root(options)
+    for name in requested or suite_names():
         if name in skipped:
             continue
         if not (missing := missing_of(load_suite(name), root, options.method)):
-            found.append(name)
-        elif asked:
+            chosen.append(name)
+        elif requested:
             raise UserError(missing)
         else:
             say(line(f"note: left out: {missing}"), error=True)
-    if not found:
+    if not chosen:
         raise UserError("suites: expected one or more, found none that can be run here")
-    return found
+    return chosen
 
 
 def _run(options: BenchmarkOptions) -> None:
@@ -183,21 +183,21 @@ def _run(options: BenchmarkOptions) -> None:
     elif work.exists():
         raise UserError(f"{work}: expected no models and logs of another run, found some; remove the folder or give another --out")
     entry = _entry(options, work)
-    for name in names:  # mistakes before any work
+    for name in names:  # report mistakes early
         entry.cells(load_suite(name), _numbers(options)[0])
     begun.save(out)
-    found = run_benchmark(entry, begun, names, out)
-    for name, score in found.scores.items():
+    submission = run_benchmark(entry, begun, names, out)
+    for name, score in submission.scores.items():
         error = f" ± {score.error:.2f}" if score.concepts > 1 else ""
         say(f"{name}: {load_suite(name).headline} {score.mean:.2f}{error}")
-    told = f"check it with: ftl-lightning benchmark {options.method} --check {options.out}"
+    hint = f"check it with: ftl-lightning benchmark {options.method} --check {options.out}"
     if tuple(_numbers(options)) != SEEDS:
-        told = f"a submission needs the seeds {','.join(map(str, SEEDS))}"
-    say(f"{options.out}: {counted(len(found.runs), 'run')}; {told}")
+        hint = f"a submission needs the seeds {','.join(map(str, SEEDS))}"
+    say(f"{options.out}: {counted(len(submission.runs), 'run')}; {hint}")
 
 
 def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission":
-    """A submission that goes on where a file ends.
+    """Resume a submission from its file.
 
     Raises:
         UserError: for a file of another method, code, version, machine or set of suites.
@@ -230,8 +230,8 @@ def _check(options: BenchmarkOptions) -> None:
         return
     if options.recompute == 0:
         return
-    found = recompute(_entry(options, Path()), submission, suites, options.recompute, options.salt)
-    for one in found:
-        say(line(f"differs: {one}"))
-    if found:
-        raise UserError(f"{path}: expected the submitted numbers, found {len(found)} that differ; see above")
+    differences = recompute(_entry(options, Path()), submission, suites, options.recompute, options.salt)
+    for difference in differences:
+        say(line(f"differs: {difference}"))
+    if differences:
+        raise UserError(f"{path}: expected the submitted numbers, found {len(differences)} that differ; see above")

@@ -1,4 +1,4 @@
-"""The TensorBoard log of a run, in an order that tells its story: what is learned first, single numbers last."""
+"""TensorBoard log of a run, with curves of learning first and single numbers last."""
 
 from collections.abc import Mapping
 
@@ -6,20 +6,20 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 PICTURES, FILMS, ROLLOUTS = "pictures", "plans in motion", "rollouts"
-"""Groups of pictures of plans, films of plans and films of episodes. TensorBoard shows groups by their names' order; these stand
-behind ``accuracy``, ``loss`` and ``optimizer``."""
+"""Groups of pictures of plans, films of plans and films of episodes. TensorBoard sorts groups by name; these follow ``accuracy``,
+``loss`` and ``optimizer``."""
 RESULTS = "test results"
-"""Group of a test's numbers, which are one point each."""
+"""Group of test results, a single point each."""
 
 
 def tag(name: str) -> str:
-    """Where a logged number stands: ``'train/loss'`` in ``'loss/train'``, ``'val/accuracy/SETTING'`` in ``'accuracy/SETTING'``.
+    """Tag of a logged number: ``'train/loss'`` becomes ``'loss/train'``, ``'val/accuracy/SETTING'`` ``'accuracy/SETTING'``.
 
-    TensorBoard makes a group of each first word. Sorted by what is measured, a quantity's curves stand side by side, and numbers of
-    a test, which are no curves, behind all of them in :data:`RESULTS`.
+    TensorBoard groups tags by the first word. Grouping by metric puts a metric's curves side by side, and test results, which are
+    not curves, last in :data:`RESULTS`.
 
     Args:
-        name: as callbacks know it: stage, metric and maybe setting; other names stay as they are.
+        name: name in callbacks: stage, metric and optionally setting; other names are unchanged.
     """
     stage, _, measured = name.partition("/")
     if stage == "test" and measured:
@@ -30,9 +30,9 @@ def tag(name: str) -> str:
 
 
 class Board(TensorBoardLogger):
-    """Lightning's logger, with tags as :func:`tag` says. The number of the epoch is left out: steps tell the time."""
+    """Lightning's logger with the tags of :func:`tag` and without the epoch."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Add a point to each number's chart."""
+        """Log a point of each metric."""
         super().log_metrics({tag(name): value for name, value in metrics.items() if name != "epoch"}, step)

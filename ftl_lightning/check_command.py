@@ -1,4 +1,4 @@
-"""The verb ``check``: its options, and what it does. Its imports are inside, so that it starts at once."""
+"""The verb ``check``, with local imports for a fast start."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +18,12 @@ class CheckOptions:
     """Say whether demonstrations of a concept suffice, and which of them is odd.
 
     Attributes:
-        file: of demonstrations (.npz or .safetensors), the folder of a LeRobot data set, or the name of a Minari data set; each of
-            its concepts is checked.
-        pretrained: folder of the pretrained model that is to learn from them, or the name of one that ships; empty to look for
-            faults alone.
+        file: file of demonstrations (.npz or .safetensors), folder of a LeRobot data set, or name of a Minari data set; each of its
+            concepts is checked.
+        pretrained: folder of the pretrained model to learn with, or the name of a shipped model; empty to check for faults alone.
         learn: also learn each concept from some of its demonstrations and measure the others; needs a model.
         figure: picture to write, .png, .svg or .pdf.
-        settings: configuration file of invert that says how to learn; empty for that of the domain.
+        settings: configuration file of invert with settings of learning; empty for that of the domain.
     """
 
     file: str
@@ -45,7 +44,7 @@ class CheckOptions:
 
 
 def check(options: CheckOptions) -> None:
-    """Check every concept of the file, print what was found, and draw it."""
+    """Check every concept of the file; print and draw the results."""
     from ftl_lightning.demonstrations.mended_file import read_mended
     from ftl_lightning.few_shot import FewShot
 
@@ -53,19 +52,19 @@ def check(options: CheckOptions) -> None:
     model = FewShot.from_pretrained(options.pretrained, options.settings or None) if options.pretrained else None
     if model is not None:
         demonstrations = _fitting(model, demonstrations, options.file)
-    found = []
+    checks = []
     for text in dict.fromkeys(demonstrations.concepts):
-        rows = [row for row, own in enumerate(demonstrations.concepts) if own == text]
-        faults = tuple(one.within(rows) for one in broken if set(one.rows) <= set(rows))
-        found.append(_checked(model, demonstrations.rows(rows), faults, options.learn))
-        for told in str(found[-1]).splitlines():
-            say(f"{told[: len(told) - len(told.lstrip())]}{line(told)}")
+        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
+        faults = tuple(fault.within(rows) for fault in broken if set(fault.rows) <= set(rows))
+        checks.append(_checked(model, demonstrations.rows(rows), faults, options.learn))
+        for text_line in str(checks[-1]).splitlines():
+            say(f"{text_line[: len(text_line) - len(text_line.lstrip())]}{line(text_line)}")
     if options.figure:
         from ftl_lightning.check_figure import picture
         from ftl_lightning.tensor_file import atomic
 
         with atomic(options.figure) as temporary:
-            picture(found).savefig(temporary, dpi=110)
+            picture(checks).savefig(temporary, dpi=110)
         say(options.figure)
 
 

@@ -1,4 +1,4 @@
-"""The picture of a check: the demonstrations, their distances, and what was learned from some of them."""
+"""Figure of a check: demonstrations, their distances, and leave-one-out losses."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST = 20
-"""Concepts that are drawn."""
+"""Maximum number of concepts in a figure."""
 GOOD, ODD = "#3f6fb5", "#d03a3a"
 
 
 def picture(checks: Sequence[Check]) -> "Figure":
-    """A row for each concept; demonstrations with a fault, and the odd one, are red.
+    """A row for each concept; odd or faulty demonstrations are red.
 
     Args:
-        checks: one for each concept; the first :data:`MOST` are drawn.
+        checks: checks of concepts; the first :data:`MOST` are drawn.
     """
     from matplotlib.figure import Figure
 
@@ -51,20 +51,20 @@ def picture(checks: Sequence[Check]) -> "Figure":
 
 
 def _behaviour(axes: "Axes", check: Check, odd: set[int]) -> None:
-    """Paths of the first two columns where a state has two or three, else the columns one after another, or over each other."""
-    own = check.demonstrations
-    scale = own.states.flatten(0, 1).std(dim=0).clamp(min=1e-12)
-    for number, (states, length) in enumerate(zip(own.states, own.lengths.tolist(), strict=True)):
+    """Paths of the first two columns for 2 or 3 columns; else distances from the start over time, or single states."""
+    demos = check.demonstrations
+    scale = demos.states.flatten(0, 1).std(dim=0).clamp(min=1e-12)
+    for number, (states, length) in enumerate(zip(demos.states, demos.lengths.tolist(), strict=True)):
         colour = ODD if number in odd else GOOD
         if states.shape[1] in (2, 3) and length > 1:
             axes.plot(*states[:length, :2].T.numpy(), color=colour, linewidth=1)
             where = states[length - 1, :2].tolist()
-        elif length > 1:  # how far each time is from the first, all columns on one scale
+        elif length > 1:  # distance from the first state, columns scaled
             moved = ((states[:length] - states[0]) / scale).square().mean(dim=1).sqrt()
             axes.plot(moved.numpy(), color=colour, linewidth=1)
             where = [length - 1, float(moved[-1])]
         else:
-            centred = (states[0] - own.states[:, 0].mean(dim=0)) / scale
+            centred = (states[0] - demos.states[:, 0].mean(dim=0)) / scale
             axes.plot(centred.numpy(), ".", color=colour)
             where = [len(centred) - 1, float(centred[-1])]
         axes.annotate(str(number + 1), (where[0], where[1]), fontsize=7, color=colour)

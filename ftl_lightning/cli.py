@@ -1,4 +1,4 @@
-"""The verbs of the command line. Imports are lazy, so that verbs without a trainer start at once."""
+"""Command line, with lazy imports for a fast start of verbs without a trainer."""
 
 import importlib
 import json
@@ -41,13 +41,13 @@ COMMANDS = {
     "encode": "make a domain's table of concept embeddings with a language model",
 }
 POSITIONAL = {"check", "concepts", "generate", "encode", "invert", "prepare", "study", "view"}
-"""Commands whose required arguments are given by position."""
+"""Commands with positional required arguments."""
 FIRST = {"play": "pretrained", "benchmark": "method"}
-"""Commands with an option that may also be given by position, at the front."""
+"""Option of a command that may also be its first positional argument."""
 SEVERAL = {"study-report": "answers"}
-"""Commands that take any number of files by position, with the option that a list of them is."""
+"""Option of a command that collects positional files."""
 REPEATED = {"concepts": "folder"}
-"""Commands with an option that may be given several times."""
+"""Option of a command that may be repeated."""
 MODULES = {
     "ablate": "ftl_lightning.ablate_command",
     "benchmark": "ftl_lightning.benchmark_command",
@@ -57,21 +57,21 @@ MODULES = {
     "sample": "ftl_lightning.sampling_command",
     "view": "ftl_lightning.play_command",
 }
-"""Commands with a module of their own."""
+"""Modules of commands that are not in ``commands``."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb.
 
     Args:
-        arguments: as on the command line, without the program's name.
+        arguments: command-line arguments without the program's name.
 
     Returns:
-        Exit code: 0; 2 for a mistake of the user's, or 130 where the user stopped it, told in one line on standard error.
+        Exit code: 0; 2 for a user's mistake, or 130 for an interruption, each with a line on standard error.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     any_terminal()
-    # Nothing is ever unpickled, whatever a library's default is.
+    # Never unpickle, whatever a library's default is.
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:
         with trust.person(arguments) as rest:
@@ -88,9 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _interrupted()
     except (OSError, MemoryError, RuntimeError, ValueError) as error:
-        if (told := mistake_of_machine(error)) is None:
+        if (message := mistake_of_machine(error)) is None:
             raise
-        say("error:", line(told), error=True)
+        say("error:", line(message), error=True)
         return 2
     except SystemExit as stop:  # after --help and --print_config
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning's way
@@ -116,16 +116,16 @@ def _dispatch(arguments: list[str]) -> None:
         inputs.check_inputs(verb, arguments[1:], inputs.command_checks(verb))
         from jsonargparse import auto_cli
 
-        trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs take no other class
+        trust.allow_classes(("ftl_lightning",))  # stages of an ablation; these verbs accept no other class
         commands = importlib.import_module(MODULES.get(verb, "ftl_lightning.commands"))
         name = verb.replace("-", "_")
         function, kind = getattr(commands, name), getattr(commands, f"{name.capitalize()}Options", None)
         options: dict[str, Any] = {"as_positional": verb in POSITIONAL, "prog": f"python -m ftl_lightning {verb}"}
         given = _gathered(arguments[1:], SEVERAL[verb]) if verb in SEVERAL else arguments[1:]
         given = _repeated(given, REPEATED[verb]) if verb in REPEATED else given
-        found = auto_cli(kind or function, args=expanded(given, verb), exit_on_error=False, **options)
-        if kind:  # options in a class of their own
-            function(found)
+        parsed = auto_cli(kind or function, args=expanded(given, verb), exit_on_error=False, **options)
+        if kind:  # an options class
+            function(parsed)
     elif verb in TRAINER_VERBS:
         inputs.check_inputs(verb, arguments[1:], inputs.TRAINER)
         imported("ftl_lightning.lightning_cli").run(arguments)
@@ -134,18 +134,18 @@ def _dispatch(arguments: list[str]) -> None:
 
 
 def _by_position(arguments: Sequence[str]) -> bool:
-    """Whether arguments of ``invert`` name a model and a file, for which it needs no trainer."""
+    """Whether ``invert`` has positional arguments (model and file), which needs no trainer."""
     return bool(arguments) and not arguments[0].startswith("-")
 
 
 def _gathered(arguments: list[str], option: str) -> list[str]:
-    """The arguments with those at the front that belong to no option as a list in one."""
+    """Collect leading positional arguments in a list for an option."""
     count = next((index for index, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
     return [f"--{option}={json.dumps(arguments[:count])}", *arguments[count:]] if count else arguments
 
 
 def _repeated(arguments: list[str], option: str) -> list[str]:
-    """The arguments with all values of an option as a list in one."""
+    """Collect the values of a repeated option in a list."""
     values, rest, left = [], [], iter(arguments)
     for argument in left:
         name, equals, value = argument.partition("=")

@@ -1,4 +1,4 @@
-"""The verbs that need no trainer: plain typed functions. Their imports are inside, so that each starts at once."""
+"""Verbs without a trainer: typed functions with local imports, for a fast start."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from ftl_lightning.printing import line, say
 from ftl_lightning.ranges import expect_count, expect_range
 
 MOST_DEMONSTRATIONS, MOST_WORKERS = 1_000_000, 1000
-"""Demonstrations that one command draws, and processes that draw them."""
+"""Maximum number of demonstrations drawn by a command, and of worker processes."""
 
 
 def generate(
@@ -25,9 +25,9 @@ def generate(
     Args:
         domain: name of a domain.
         task: in words, for example "circle right of square and triangle above square"; empty for every training concept.
-        count: demonstrations of the task, or of each training concept.
+        count: number of demonstrations of the task, or of each training concept.
         seed: the same seed gives the same bytes.
-        workers: processes, in domains whose expert takes long; a run that was stopped goes on where it was.
+        workers: number of processes, in domains with a slow expert; a stopped run is resumed.
         out: file to write (.safetensors or .npz), or "minari:NAME" for a Minari data set (the extra "minari"), such as
             "minari:strokes/test-v0", or "lerobot:FOLDER" for a LeRobot data set (the extra "lerobot").
         root: folder of your copy of the data, for domains whose demonstrations do not ship.
@@ -37,16 +37,16 @@ def generate(
     expect_count("count", count, 1, MOST_DEMONSTRATIONS)
     expect_range("seed", seed, 0)
     expect_count("workers", workers, 1, MOST_WORKERS)
-    found = load_domain(domain)
-    source = found.source(Path(root) if root else None)
+    loaded = load_domain(domain)
+    source = loaded.source(Path(root) if root else None)
     try:
         demonstrations = source.draw(task, count, seed, workers) if task else source.split("train", count, seed)
     except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
         if task:
-            found.expect_goal(task, "task")
+            loaded.expect_goal(task, "task")
         raise
     demonstrations.save(out)
-    say(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(found.concepts.training)} training concepts'}")
+    say(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(loaded.concepts.training)} training concepts'}")
 
 
 def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: str = "") -> None:
@@ -55,11 +55,11 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
     Args:
         domain: name of a domain.
         encoder: "minilm" (the extra), or the name or path of a T5 or BERT-like model.
-        revision: of a Hugging Face model.
+        revision: revision of a Hugging Face model.
         out: file to write; empty for the table that ships with the domain.
 
     Raises:
-        UserError: for a domain that names no table of its own, where no file is named.
+        UserError: without a file, for a domain without a table.
     """
     from ftl_lightning.concepts.encoder import load_encoder, write_table
     from ftl_lightning.domains.registry import load_domain
@@ -74,12 +74,12 @@ def encode(domain: str, encoder: str = "minilm", revision: str = "main", out: st
 
 
 def prepare(domain: str, root: str = "", out: str = "") -> None:
-    """Read your own copy of a domain's recordings, which do not ship, into the file that everything else reads.
+    """Convert your copy of a domain's recordings, which do not ship, to the file of the domain.
 
     Args:
         domain: name of a domain.
         root: folder of your copy; nothing is downloaded.
-        out: folder to write; empty for the same.
+        out: folder to write; empty for the same folder.
 
     Raises:
         UserError: for a domain whose demonstrations need no preparation.
@@ -87,20 +87,20 @@ def prepare(domain: str, root: str = "", out: str = "") -> None:
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.errors import UserError
 
-    found = load_domain(domain)
-    if found.prepare is None:
+    loaded = load_domain(domain)
+    if loaded.prepare is None:
         raise UserError(f"domain: expected one whose recordings are prepared, found {domain!r}, which needs nothing of the kind")
-    say(found.prepare(Path(root) if root else None, Path(out) if out else None))
+    say(loaded.prepare(Path(root) if root else None, Path(out) if out else None))
 
 
 def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> None:  # noqa: B006 (never changed)
-    """List the concepts of a model: training concepts, one in a line, then after an empty line a table of learned ones.
+    """List the concepts of a model: training concepts, one a line, then after an empty line a table of learned concepts.
 
-    The table holds the concepts of this model in its own folder and in your library, ~/.local/share/ftl-lightning/concepts. What
-    cannot be listed is told on standard error.
+    The table lists the model's concepts in its folder and in your library, ~/.local/share/ftl-lightning/concepts. Unlisted files
+    are reported on standard error.
 
     Args:
-        pretrained: folder of the pretrained model, or the name of one that ships.
+        pretrained: folder of the pretrained model, or the name of a shipped model.
         folder: more folders with learned concepts; may be given several times.
         plain: list the training concepts alone.
     """
@@ -116,24 +116,24 @@ def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> No
     if not plain:
         from ftl_lightning.learning.library import library, table
 
-        found = library(content["hash"], texts, place, folder)
+        known = library(content["hash"], texts, place, folder)
     for text in texts:
         say(line(text))
     if plain:
         return
-    if found.learned:
-        say(f"\n{table(found.learned)}")
-    for note in found.notes:
+    if known.learned:
+        say(f"\n{table(known.learned)}")
+    for note in known.notes:
         say(line(note), error=True)
 
 
 def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
-    """Say in words what a learned concept is made of: its nearest training concepts and their best non-negative combination.
+    """Explain a learned concept in words: its nearest training concepts and their best non-negative combination.
 
     Args:
         concept: file of a learned concept.
-        pretrained: folder of the model that it was learned with; empty to look for it in pretrained and logs.
-        nearest: how many of the nearest training concepts are told.
+        pretrained: folder of the concept's model; empty to search pretrained and logs.
+        nearest: number of nearest training concepts.
     """
     from ftl_lightning.concepts.concept import Concept
     from ftl_lightning.concepts.explanation import explain as explained
@@ -164,13 +164,13 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
 
 
 def report(results: str = "results", out: str = "results/report", readme: str = "", html: str = "") -> None:
-    """Tables and figures from results, beside the paper's numbers; or one page to watch.
+    """Make tables and figures from results, with the paper's numbers; or an HTML page.
 
     Args:
-        results: a results file, or a folder of them.
+        results: a results file, or a folder of results files.
         out: folder for Markdown, LaTeX and figures.
         readme: a Markdown file to update between its marks.
-        html: a file to write a page to, in place of all these: overview, films, concepts and curves, without a network.
+        html: HTML file to write instead: overview, films, concepts and curves, without a network.
     """
     if html:
         from ftl_lightning.reporting.html.page import write_page
@@ -188,16 +188,16 @@ class StudyOptions:
     """Make a web page in which people rate films of generated behaviour.
 
     Attributes:
-        domain: name of a domain whose plans are filmed.
-        films: folder with files METHOD/CONCEPT.safetensors that "sample --out" wrote, or with films.json, a list of
-            {"concept", "method", "file"} and, if wanted, "scenario", "setting" and "row".
-        out: folder for study.html, which goes to the raters, and key.json, which stays.
-        scenarios: of each concept, drawn from the samples that all methods' files have.
-        repeats: attention checks: questions that are asked twice.
-        still: attention checks: films that stand still and so depict no motion.
-        seed: deals out the films' numbers and draws what is shown and repeated.
-        title: of the page; empty for one that tells nothing.
-        consent: text file that raters agree to, in place of the page's own words.
+        domain: name of a domain with filmed plans.
+        films: folder with files METHOD/CONCEPT.safetensors of "sample --out", or with films.json, a list of
+            {"concept", "method", "file"} and optionally "scenario", "setting" and "row".
+        out: folder for study.html, for the raters, and key.json, which stays with you.
+        scenarios: number of scenarios for each concept, drawn from the samples in all methods' files.
+        repeats: attention checks: number of questions that are asked twice.
+        still: attention checks: number of films without motion.
+        seed: seed of the films' numbers and of the shown and repeated films.
+        title: title of the page; empty for a neutral title.
+        consent: text file that raters agree to, in place of the default text.
     """
 
     domain: str
@@ -217,7 +217,7 @@ class StudyOptions:
 
 
 def study(options: StudyOptions) -> None:
-    """Make the page and its key as the options say."""
+    """Make the page and its key from ``options``."""
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.limits import read_text
     from ftl_lightning.study.films import read_films
@@ -233,15 +233,15 @@ def study(options: StudyOptions) -> None:
 
 
 def study_report(answers: list[str] = [], key: str = "", all_raters: bool = False) -> None:  # noqa: B006 (never changed)
-    """The table of what raters answered in a study: study-report study/answers*.json.
+    """Print the table of a study's answers: study-report study/answers*.json.
 
     Args:
-        answers: files that raters saved, or folders of files answers*.json.
+        answers: files saved by raters, or folders of files answers*.json.
         key: the study's key; empty for key.json beside the first file.
         all_raters: also count raters who failed attention checks.
 
     Raises:
-        UserError: where no file is named, or one is no rater's.
+        UserError: without files, or for a file that is not a rater's.
     """
     from ftl_lightning.errors import UserError
     from ftl_lightning.evaluation.summary import show
@@ -251,8 +251,8 @@ def study_report(answers: list[str] = [], key: str = "", all_raters: bool = Fals
         raise UserError("answers: expected files that raters saved, found none; run: study-report study/answers*.json")
     first = Path(answers[0])
     beside = (first if first.is_dir() else first.parent) / "key.json"
-    found = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)
-    for told in (*(f"refused: {told}" for told in found.refused), *found.dropped):
-        say(told, error=True)
-    show(found.table())
+    result = study_table([Path(name) for name in answers], Path(key) if key else beside, all_raters)
+    for refusal in (*(f"refused: {refusal}" for refusal in result.refused), *result.dropped):
+        say(refusal, error=True)
+    show(result.table())
     say("\n".join(NOTES))

@@ -1,4 +1,4 @@
-"""Compositions in words, as the command line and ``FewShot.compose`` take them: ``'walk@legs:0.8 + learned.safetensors'``."""
+"""Text of compositions on the command line and in ``FewShot.compose``: ``'walk@legs:0.8 + learned.safetensors'``."""
 
 import math
 from typing import NamedTuple
@@ -8,12 +8,12 @@ from ftl_lightning.ranges import LARGEST_FACTOR
 
 
 class Part(NamedTuple):
-    """A part of a composition, as it is told in words.
+    """A part of a composition in text.
 
     Attributes:
-        concept: its text or file.
-        weight: omega.
-        groups: names of the groups of columns that its weight is on; all columns where empty.
+        concept: text or file of the concept.
+        weight: guidance weight omega.
+        groups: groups of columns that the weight applies to; empty for all columns.
     """
 
     concept: str
@@ -22,14 +22,15 @@ class Part(NamedTuple):
 
 
 def parse_composition(text: str) -> list[Part]:
-    """Concepts, weights and groups of columns from ``'circle right of square:1.2 + walk@legs,trunk:0.8'``; a missing weight is 1.
+    """Parse a composition such as ``'circle right of square:1.2 + walk@legs,trunk:0.8'``; the default weight is 1.
 
     Raises:
-        UserError: for a weight that is no number up to :data:`~ftl_lightning.ranges.LARGEST_FACTOR`, or an empty concept or group.
+        UserError: for a weight that is not a number up to :data:`~ftl_lightning.ranges.LARGEST_FACTOR`, or an empty concept or
+            group.
     """
     parts = []
-    for told in text.split(" + ") if text.strip() else ():
-        place, colon, weight = told.partition(":")
+    for term in text.split(" + ") if text.strip() else ():
+        place, colon, weight = term.partition(":")
         concept, at, groups = place.partition("@")
         try:
             omega = float(weight) if colon else 1.0
@@ -39,7 +40,7 @@ def parse_composition(text: str) -> list[Part]:
         if not (part.concept and abs(part.weight) <= LARGEST_FACTOR and all(part.groups)):
             raise UserError(
                 "compose: expected 'concept:weight + concept@group:weight', "
-                f"weights up to {LARGEST_FACTOR:g}, found {short(told)!r}"
+                f"weights up to {LARGEST_FACTOR:g}, found {short(term)!r}"
             )
         parts.append(part)
     return parts

@@ -1,8 +1,8 @@
-"""Configuration files that build on others, and that say what differs between verbs.
+"""Configuration files with defaults and a section for each verb.
 
-A file may have the key ``defaults``, a list of files that are merged in order before its own keys: mappings key by key, of
-everything else, lists too, the later value stands. So an experiment says only what differs. Its keys ``fit`` and ``invert`` are
-sections: what they hold counts for that verb alone and is merged after the file's other keys::
+The key ``defaults`` lists files that are merged in order before the file's keys: mappings key by key; for other values, lists
+included, the later value wins. The keys ``fit`` and ``invert`` are sections, which apply to that verb alone and are merged
+after the file's other keys::
 
     defaults: [verb.yaml, domain/agent.yaml, method/bc.yaml]
     trainer: {logger: {init_args: {name: bc_agent}}}
@@ -11,8 +11,8 @@ sections: what they hold counts for that verb alone and is merged after the file
     invert:
       model: {init_args: {pretrained: pretrained/baseline/bc/agent}}
 
-Each name is searched in the folder of the file, then in the folders above, at last among the files that ship with the package
-(:mod:`ftl_lightning.shipped`). Interpolations such as ``${seed_everything}`` are not resolved.
+Names are searched in the file's folder, then in its parent folders, then among shipped files (:mod:`ftl_lightning.shipped`).
+Interpolations such as ``${seed_everything}`` are not resolved.
 """
 
 import copy
@@ -32,29 +32,29 @@ from ftl_lightning.shipped import shipped
 
 DEFAULTS = "defaults"
 SECTIONS = ("fit", "invert")
-"""Keys of a file whose content counts for one verb alone."""
+"""Keys whose content applies to a single verb."""
 _OPTIONS = ("--config", "-c")
 
 
 def section_of(verb: str) -> str | None:
-    """The section that counts for a verb; ``None`` for one whose files have no sections."""
+    """Section of a verb; ``None`` for a verb without sections."""
     return {"fit": "fit", "invert": "invert", "validate": "fit", "test": "fit"}.get(verb)
 
 
 def find(path: str | Path) -> Path:
-    """A configuration file by its path from the current folder or, if there is none, among the shipped ones.
+    """Find a configuration file by its path from the current folder, or among shipped files.
 
     Raises:
-        UserError: if there is none, naming what is there instead.
+        UserError: if there is none, with nearby files.
     """
-    found = shipped(path)
-    if not found.is_file():
-        raise UserError(f"{path}: expected a configuration file, found {'a folder' if found.is_dir() else 'nothing'}{_near(path)}")
-    return found
+    file = shipped(path)
+    if not file.is_file():
+        raise UserError(f"{path}: expected a configuration file, found {'a folder' if file.is_dir() else 'nothing'}{_near(path)}")
+    return file
 
 
 def _near(path: str | Path) -> str:
-    """What the nearest folder holds, to help with a wrong name; nothing for the current folder."""
+    """Content of the nearest folder, as a hint for a wrong name; empty for the current folder."""
     parent = next((parent for parent in Path(path).parents if shipped(parent).is_dir()), Path())  # an empty name has none
     folder = shipped(parent)
     there = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() or entry.suffix == ".yaml")
@@ -62,26 +62,26 @@ def _near(path: str | Path) -> str:
 
 
 def load(path: str | Path, verb: str = "") -> dict[str, Any]:
-    """The keys of a configuration file and of all that it builds on.
+    """Load a configuration file and its defaults.
 
     Args:
-        path: of the file.
-        verb: whose sections count, for ``validate`` and ``test`` those of ``fit``; for another verb, or none, the keys ``fit`` and
-            ``invert`` are keys like others.
+        path: path of the file.
+        verb: verb whose sections apply; ``validate`` and ``test`` use those of ``fit``. For another verb, or none, ``fit`` and
+            ``invert`` are ordinary keys.
 
     Raises:
-        UserError: naming the file, for one that is missing, damaged or no mapping, or whose defaults are or go in a circle.
+        UserError: with the file, if it or a default is missing, damaged or no mapping, or defaults are circular.
     """
     try:
         merged = OmegaConf.merge(OmegaConf.create(), *(OmegaConf.create(keys) for _, keys in parts(path, verb)))
-        found = OmegaConf.to_container(merged, resolve=False)
-    except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # OmegaConf's own are not all
+        keys = OmegaConf.to_container(merged, resolve=False)
+    except (OmegaConfBaseException, RecursionError, TypeError, ValueError) as error:  # not only OmegaConf's errors
         raise UserError(f"{path}: expected keys that go together, found others ({short(str(error), 150)})") from error
-    return _plain(found)
+    return _plain(keys)
 
 
 def parts(path: str | Path, verb: str = "") -> list[tuple[Path, dict[str, Any]]]:
-    """What :func:`load` merges, in order: files, each with keys of its own as they stand in it; the last is the file itself.
+    """Parts merged by :func:`load`, in order: files with their raw keys; the last is the file itself.
 
     Raises:
         UserError: as :func:`load`.
@@ -96,8 +96,8 @@ def _plain(keys: object) -> dict[str, Any]:
 
 
 def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Every file with its keys, the section's after the others. ``above`` are the files that led here."""
-    if path.resolve() in (one.resolve() for one in above):
+    """Files with their keys, the section's after the others. ``above``: files that include this file."""
+    if path.resolve() in (parent.resolve() for parent in above):
         raise UserError(f"{above[-1]}: key '{DEFAULTS}': {path} builds on {above[-1]} itself; leave one of them out")
     keys = _read(path)
     names = keys.pop(DEFAULTS, None) or []
@@ -107,27 +107,27 @@ def _merged(path: Path, section: str | None, above: tuple[Path, ...]) -> Iterato
         yield from _merged(_beside(path, name), section, (*above, path))
     sections = {} if section is None else {name: keys.pop(name, None) for name in SECTIONS}
     yield path, keys
-    for name, own in sections.items():
-        if own is not None and not isinstance(own, dict):
-            raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(own))}")
-    if section and (own := sections[section]) is not None:
-        yield path, _plain(own)
+    for name, content in sections.items():
+        if content is not None and not isinstance(content, dict):
+            raise UserError(f"{path}: key '{name}': expected a mapping of keys, found {short(str(content))}")
+    if section and (content := sections[section]) is not None:
+        yield path, _plain(content)
 
 
 def _beside(path: Path, name: str) -> Path:
-    """The file that ``defaults`` of a file names."""
+    """Find a file named in ``defaults``."""
     try:
         for folder in path.absolute().parents:
             if (folder / name).is_file():
-                # As the user writes it: relative where the file is.
+                # Relative if the user's path is.
                 return folder / name if path.is_absolute() else _relative(folder / name)
         if (ours := shipped(name)).is_file():
             return ours
     except (OSError, ValueError) as error:  # a name that no file can have, or a folder that cannot be read
-        told = getattr(error, "strerror", None) or str(error)
-        raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({told})") from error
-    found = f"found no {short(name, 150)} beside it or in a folder above it"
-    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {found}")
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, found {short(name, 150)} ({reason})") from error
+    message = f"found no {short(name, 150)} beside it or in a folder above it"
+    raise UserError(f"{path}: key '{DEFAULTS}': expected configuration files, {message}")
 
 
 def _relative(path: Path) -> Path:
@@ -148,8 +148,8 @@ def _read(path: Path) -> dict[str, Any]:
         LookupError,
         AssertionError,
     ) as error:
-        told = short(str(error), 200) or "no mapping of keys"
-        raise UserError(f"{path}: expected a configuration file (YAML), found {told}") from error
+        reason = short(str(error), 200) or "no mapping of keys"
+        raise UserError(f"{path}: expected a configuration file (YAML), found {reason}") from error
     if not isinstance(keys, dict):
         raise UserError(f"{path}: expected a mapping of keys, found a list")
     return _plain(copy.deepcopy(keys))
@@ -157,21 +157,21 @@ def _read(path: Path) -> dict[str, Any]:
 
 @functools.lru_cache
 def _parsed(text: str) -> object:
-    """The content of a YAML file, parsed once for the several times that a command reads it."""
+    """Content of a YAML file, cached, as commands read it several times."""
     return OmegaConf.to_container(OmegaConf.load(io.StringIO(text)), resolve=False)
 
 
 LONGEST = 200_000
-"""Bytes of a configuration file; OmegaConf bounds what its aliases stand for."""
+"""Maximum size of a configuration file in bytes; OmegaConf bounds the expansion of aliases."""
 
 
 def configurations(arguments: Sequence[str]) -> list[str]:
-    """The configuration files that a command line names, in order."""
+    """Configuration files of a command line, in order."""
     return [value for _, _, value in _given(arguments)]
 
 
 def expanded(arguments: Sequence[str], verb: str = "") -> list[str]:
-    """A command line with the content of configuration files, as :func:`load` has it for a verb, in place of their names.
+    """Replace configuration files in a command line by their content from :func:`load`.
 
     Raises:
         UserError: as :func:`load`.
@@ -183,9 +183,9 @@ def expanded(arguments: Sequence[str], verb: str = "") -> list[str]:
 
 
 def _given(arguments: Sequence[str]) -> Iterator[tuple[int, str, str]]:
-    """For each configuration file the argument that holds its name, what stands before it there, and the name.
+    """Index of the argument, prefix and path for each configuration file.
 
-    A configuration that is itself the argument (``--config '{seed_everything: 1}'``) is left out.
+    Inline configurations (``--config '{seed_everything: 1}'``) are skipped.
     """
     for index, argument in enumerate(arguments):
         option, equals, value = argument.partition("=")

@@ -1,29 +1,29 @@
-"""The one kind of error that a user can cause and mend."""
+"""Errors that a user can cause and correct."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 LONGEST = 300
-"""Characters of a line that tells a mistake."""
+"""Maximum characters of an error message."""
 
 
 class UserError(Exception):
-    """A mistake in the input. The message is one line: file or key, expected, found, what to do.
+    """Mistake in the input. The message is a single line: file or key, expected, found, what to do.
 
     The command line prints it without a traceback and exits with code 2.
     """
 
 
 def short(text: str, most: int = 60) -> str:
-    """A text in one line of at most so many characters."""
+    """Shorten a text to a single line of at most ``most`` characters."""
     line = " ".join(text.split())
     half = (most - 5) // 2
     return line if len(line) <= most else f"{line[:half]} ... {line[-half:]}"
 
 
 def shown(value: object, most: int = 60) -> str:
-    """Anything as Python writes it, cut to a line's length."""
+    """``repr`` of any value, shortened to ``most`` characters."""
     try:
         return short(repr(value), most)
     except (ValueError, RecursionError):  # a number of thousands of digits, or lists too deep
@@ -32,35 +32,35 @@ def shown(value: object, most: int = 60) -> str:
 
 @contextmanager
 def about(where: str | Path) -> Iterator[None]:
-    """Name a file before a mistake that is found in what it holds.
+    """Put the name of a file before an error in its content.
 
     Raises:
-        UserError: the block's, in one line of at most :data:`LONGEST` characters unless the name is long.
+        UserError: the error of the block, in a line of at most :data:`LONGEST` characters unless the name is long.
     """
     try:
         yield
     except UserError as error:
-        told = str(error).removeprefix(f"{where}: ")
-        raise UserError(f"{where}: {short(told, max(LONGEST - len(str(where)) - 20, 150))}") from error.__cause__
+        message = str(error).removeprefix(f"{where}: ")
+        raise UserError(f"{where}: {short(message, max(LONGEST - len(str(where)) - 20, 150))}") from error.__cause__
 
 
 def mistake_behind(error: BaseException | None) -> UserError | None:
-    """The :class:`UserError` that an exception was raised from, if any; jsonargparse wraps what a constructor raises."""
+    """:class:`UserError` that caused an exception, if any; jsonargparse wraps what a constructor raises."""
     while error is not None and not isinstance(error, UserError):
         error = error.__cause__ or error.__context__
     return error
 
 
 def mistake_of_machine(error: BaseException) -> str | None:
-    """What a user can mend of a machine's refusal, in one line: a file that cannot be read or written, or memory that is not there.
+    """Message for an error of the machine that a user can correct: an inaccessible file, or too little memory.
 
     Returns:
-        ``None`` for any other exception.
+        A single line; ``None`` for any other exception.
     """
     if isinstance(error, OSError):
         where = short(str(error.filename or "a file"), 150)
-        told = error.strerror or short(str(error))
-        return f"{where}: expected a place that can be read and written, found another ({told}); choose another one"
+        reason = error.strerror or short(str(error))
+        return f"{where}: expected a place that can be read and written, found another ({reason}); choose another one"
     text = str(error)
     if isinstance(error, MemoryError) or any(words in text for words in _NO_MEMORY):
         return (
@@ -79,4 +79,4 @@ _NO_MEMORY = (
     "Unable to allocate",
     "Storage size calculation overflowed",
 )
-"""How torch and numpy say it."""
+"""Messages of torch and numpy."""

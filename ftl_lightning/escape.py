@@ -1,4 +1,4 @@
-"""Texts of strangers in what is written: every form has letters of its own that mean something, and here they mean themselves."""
+"""Escape untrusted texts for each output format."""
 
 import json
 import re
@@ -36,38 +36,38 @@ _MARKDOWN = re.compile(
     re.VERBOSE | re.IGNORECASE,
 )
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
-_SCRIPT = str.maketrans({one: f"\\u{ord(one):04x}" for one in "<>&\u2028\u2029"})
+_SCRIPT = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"})
 MOST_DRAWN = 120
-"""Letters of a name in a figure."""
+"""Maximum characters of a name in a figure."""
 
 
 def latex(text: str) -> str:
-    """One line of text for LaTeX, in which no command and no formula begins.
+    """Escape a text for LaTeX in one line, without commands and formulas.
 
-    A row of a table that begins with a bracket or an asterisk needs an empty group before it, see :func:`latex_row`.
+    A table row that begins with a bracket or an asterisk needs an empty group before it, see :func:`latex_row`.
     """
     return line(text).translate(_LATEX)
 
 
 def latex_row(cells: list[str]) -> str:
-    r"""Cells of a LaTeX table. Without the empty group ``\\`` of the row before would take a bracket for its own argument."""
+    r"""Cells of a LaTeX table row. Without the empty group, ``\\`` of the previous row would take a bracket as its argument."""
     row = " & ".join(map(latex, cells))
     return ("{}" if row.startswith(("[", "*")) else "") + row + r" \\"
 
 
 def markdown(text: str) -> str:
-    """One line of text for a cell or a caption of GitHub's Markdown: no HTML, link, picture, formula, code or other cell begins."""
-    return _MARKDOWN.sub(lambda found: _ENTITIES.get(found[0], f"\\{found[0]}"), line(text))
+    """Escape a text for a cell or caption in GitHub's Markdown: one line, no HTML, link, picture, formula, code or new cell."""
+    return _MARKDOWN.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), line(text))
 
 
 def script_json(content: Any) -> str:
-    """JSON within a ``script`` element of HTML: no word in it can end the element or begin a comment."""
+    """JSON for a ``script`` element of HTML, which can neither end the element nor begin a comment."""
     return json.dumps(content, ensure_ascii=False, separators=(",", ":")).translate(_SCRIPT)
 
 
 def figure_text(text: str) -> str:
-    """One line of text for a figure: matplotlib takes what stands between two dollars for a formula, and names with ``_`` first
-    for ones that a legend leaves out.
+    """Escape a text for a figure in one line: matplotlib reads text between dollars as a formula, and a legend omits names that
+    begin with ``_``.
     """
-    told = short(line(text), MOST_DRAWN).replace("$", r"\$")
-    return f" {told}" if told.startswith("_") else told
+    label = short(line(text), MOST_DRAWN).replace("$", r"\$")
+    return f" {label}" if label.startswith("_") else label

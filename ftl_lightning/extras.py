@@ -1,7 +1,7 @@
-"""Packages that come with an extra of this one: simulators, other programs' data sets, and what a few measures and figures need.
+"""Optional packages of extras: simulators, other programs' data sets, and requirements of a few measures and figures.
 
-Without them everything is imported, and learns and generates from data of one's own. What truly needs one asks here first and then
-imports it where it is used.
+Without extras, all modules import, and a user's data can be learned from. Code that needs an extra checks it here before a late
+import.
 """
 
 import importlib.util
@@ -19,15 +19,15 @@ EXTRAS: Mapping[str, Mapping[str, str]] = {
     "play": {"starlette": "starlette", "uvicorn": "uvicorn"},
     "tabletop": {"pybullet": "pybullet", "gymnasium": "gymnasium"},
 }
-"""Modules that are imported late, and the packages that they come with, by extra."""
+"""Late-imported modules and their packages, by extra."""
 
 
 def expect_extra(extra: str, user: str) -> None:
-    """Refuse to go on without an extra's packages; nothing is imported.
+    """Require an extra's packages; nothing is imported.
 
     Args:
         extra: a key of :data:`EXTRAS`.
-        user: what needs them, as the line begins that tells it.
+        user: subject of the error message: what needs the packages.
 
     Raises:
         UserError: with the command that installs them.

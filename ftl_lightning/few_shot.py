@@ -55,20 +55,20 @@ GIVEN = {
     "sample": ("count", "observed", "seed", "batch_size", "progress"),
     "execute": ("scenes", "goal", "replan", "environment", "seed"),
 }
-"""Arguments beside the settings of a sampler."""
+"""Arguments besides the sampler's settings."""
 
 
 class FewShot(Shown):
-    """A pretrained model with everything that is needed to learn a concept from a few demonstrations and to use it.
+    """Few-shot learner: a pretrained model that learns concepts from a few demonstrations and generates behaviour.
 
     Args:
-        model: frozen.
-        tuned: the settings that go with it, which every method takes unless it is told others.
+        model: the frozen model.
+        tuned: default settings of every method.
 
     Attributes:
-        settings: the configuration file that they were read from; empty if none was.
-        folder: that the model was read from; ``None`` if it was made in another way.
-        known_as: under which name others find the model: one that ships or ``'owner/name'`` on the Hub; empty where there is none.
+        settings: configuration file of the settings; empty without one.
+        folder: folder of the model; ``None`` if it was not read from one.
+        known_as: public name of the model: a shipped model or ``'owner/name'`` on the Hub; empty without one.
     """
 
     def __init__(self, model: ConceptModel, tuned: ModelSettings) -> None:
@@ -85,15 +85,15 @@ class FewShot(Shown):
         """Load a model.
 
         Args:
-            name: of a model that ships (``'agent'``, ``'driving'``, ``'object_rearrangement'``), a folder, or ``'owner/name'`` on
-                the Hugging Face Hub, which is the only case that needs a network.
-            settings: configuration file of ``invert`` to take settings from; ``None`` for that of the model's domain.
-            device: where to compute.
-            domain: of a model of your own, the domain or its name ``'package.module:DOMAIN'``, which is imported. A folder alone
-                never names code: without this, or ``settings`` that name it, its domain is one that an installed package offers.
+            name: a shipped model (``'agent'``, ``'driving'``, ``'object_rearrangement'``), a folder, or ``'owner/name'`` on the
+                Hugging Face Hub, which needs a network.
+            settings: configuration file of ``invert`` with the settings; ``None`` for that of the model's domain.
+            device: device to compute on.
+            domain: domain of your model, or its name ``'package.module:DOMAIN'``, which is imported. A folder alone never imports
+                code: without ``domain``, or ``settings`` that name it, the domain must be from an installed package.
 
         Raises:
-            UserError: naming the place, if there is no model, or one that asks for code.
+            UserError: with the place, if there is no model, or it requires untrusted code.
         """
         expect_path("name", name, f"the name of a model, such as {', '.join(shipped_models())}, or its folder")
         if settings is not None:
@@ -106,98 +106,98 @@ class FewShot(Shown):
             model = load_model(folder, domain).to(place)
         if settings is None:
             settings = settings_of(model.config.domain, model.method.configurations)
-        found = cls(model, ModelSettings.read(settings))
-        found.settings, found.folder, found.known_as = str(settings), folder, known_as or shipped_name(folder)
-        return found
+        loaded = cls(model, ModelSettings.read(settings))
+        loaded.settings, loaded.folder, loaded.known_as = str(settings), folder, known_as or shipped_name(folder)
+        return loaded
 
     def _words(self) -> Iterator[str]:
         return self.model._words()
 
     @property
     def device(self) -> torch.device:
-        """Where it computes."""
+        """The model's device."""
         return self.model.device
 
     def to(self, device: str | torch.device) -> Self:
-        """Compute on another device from now on; concepts that are there already go with it when they are used.
+        """Move the model to another device; existing concepts follow when they are used.
 
         Returns:
-            This same object.
+            The object itself.
 
         Raises:
-            UserError: for a device that this machine does not have.
+            UserError: for an unavailable device.
         """
         self.model.to(device_named(device))
         return self
 
     @functools.cached_property
     def _space(self) -> str:
-        """Which model's concepts those of this model are; a hash takes a while."""
+        """Identity of the model's concept space; cached, as hashing is slow."""
         return space_of(self.model.config.domain, self.model.hash)
 
     @property
     def domain(self) -> Domain:
-        """Whose behaviour the model generates."""
+        """The model's domain."""
         return self.model.domain
 
     @property
     def training_concepts(self) -> tuple[str, ...]:
-        """Texts that ``model[text]`` knows."""
+        """Texts that ``model[text]`` accepts."""
         return self.model.config.training_concepts
 
     def __getitem__(self, text: str) -> Composition:
         """A training concept, with weight 1.
 
         Raises:
-            UserError: for a text that is none.
+            UserError: for an unknown text.
         """
         return Composition(self.model.concept(text)[None, None], torch.ones(1, device=self.device), space=self._space)
 
     def library(self, *folders: str | Path) -> Library:
-        """The concepts of this model by name: training concepts, learned ones in its own folder, and saved ones.
+        """Library of the model's concepts: training concepts, learned concepts in its folder, and saved concepts.
 
         Args:
-            folders: with saved concepts, besides your own library (:func:`~ftl_lightning.learning.library.concepts_folder`).
+            folders: folders of saved concepts, besides your library (:func:`~ftl_lightning.learning.library.concepts_folder`).
 
         Raises:
-            UserError: for a folder that is none.
+            UserError: for a path that is not a folder.
         """
         for folder in folders:
             expect_path("folder", folder, "a folder of learned concepts")
         return library(self.model.hash, self.training_concepts, self.folder, folders)
 
     def load(self, path: str | Path) -> LearnedConcept:
-        """A learned concept from its file, a folder of ``save_pretrained``, or ``'owner/name'`` on the Hugging Face Hub.
+        """Load a learned concept from its file, a folder of ``save_pretrained``, or ``'owner/name'`` on the Hugging Face Hub.
 
-        Only ``concept.safetensors`` is read of a folder, as numbers and texts. The Hub is asked where nothing of the name is here,
-        and needs a network.
+        Only ``concept.safetensors`` of a folder is read, as numbers and texts. The Hub, which needs a network, is used if no local
+        path has this name.
 
         Args:
-            path: of the file or folder, or the name on the Hub.
+            path: file, folder, or name on the Hub.
 
         Raises:
-            UserError: naming the file, if it is none or belongs to another model.
+            UserError: with the file, if it is not a concept or belongs to another model.
         """
         expect_path("path", path, "the file of a learned concept, its folder or 'owner/name' on the Hub")
         name, file = str(path), Path(path)
         if not os.path.lexists(file) and is_repository(name) and not name.endswith(".safetensors"):
             file = download(name, CONCEPT_FILES, "a concept's file, its folder or one on the Hub")
-        whole = os.path.isdir(file)  # noqa: PTH112 (a name that is too long is none)
+        whole = os.path.isdir(file)  # noqa: PTH112 (False for a name that is too long)
         concept = read_folder(file, name, self._space) if whole else Concept.load(file)
         expect_concept(self.model, concept, path)
         return self._learned(concept)
 
     def compose(self, text: str) -> Composition:
-        """``'go to red object:1.2 + other.safetensors:0.9'``: training concepts and learned ones, with weights.
+        """Compose training and learned concepts with weights: ``'go to red object:1.2 + other.safetensors:0.9'``.
 
-        A learned concept is named by its file, or by its name in the :meth:`library`; training concepts go first. After an ``@``
-        the groups of columns that a concept is composed on: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
+        A learned concept is named by its file or its name in the :meth:`library`; training concepts take precedence. An ``@``
+        restricts a concept to groups of columns: ``'walk@legs + jumping_jacks.safetensors@arms,trunk'``.
 
         Args:
-            text: of the composition.
+            text: text of the composition.
 
         Raises:
-            UserError: for a part that is neither, a name of several concepts, or nothing at all.
+            UserError: for an unknown or ambiguous concept, or an empty text.
         """
         expect_text("compose", text, f"{self.training_concepts[0]}:1.2 + learned.safetensors")
         parts = [self._part(part) for part in parse_composition(text)]
@@ -206,11 +206,11 @@ class FewShot(Shown):
         return functools.reduce(operator.add, parts)
 
     def _part(self, part: Part) -> Composition:
-        found = part.weight * self._named(part.concept)
-        return found.on(self.domain.plans.grouped(part.groups), self.model.config.state_dim) if part.groups else found
+        composition = part.weight * self._named(part.concept)
+        return composition.on(self.domain.plans.grouped(part.groups), self.model.config.state_dim) if part.groups else composition
 
     def _named(self, name: str) -> Composition:
-        """A training concept by its text, or a learned one by its file or its name in the library."""
+        """A training concept by text, or a learned concept by file or name in the library."""
         if name in self.training_concepts:
             return self[name]
         if name.endswith(".safetensors"):
@@ -219,22 +219,22 @@ class FewShot(Shown):
         if (entry := known.learned_as(name)) is not None and entry.path is not None:
             return self.load(entry.path)
         if not known.learned:
-            return self[name]  # which tells the nearest
-        near = "; ".join(short(one, 40) for one in known.nearest(name))
+            return self[name]  # raises an error with the nearest
+        near = "; ".join(short(text, 40) for text in known.nearest(name))
         raise UserError(
             f"concept {shown(name)}: expected a training concept or one of the model's library: {near} are the nearest of "
             f"{len(known)}; list all: python -m ftl_lightning concepts MODEL"
         )
 
     def _learned(self, concept: Concept) -> LearnedConcept:
-        own = concept.composition.to(self.device)
-        parts = {field.name: getattr(own, field.name) for field in fields(Composition)}
+        composition = concept.composition.to(self.device)
+        parts = {field.name: getattr(composition, field.name) for field in fields(Composition)}
         return LearnedConcept(
             **parts | {"space": self._space}, concept=concept, model=self.model, tuned=self.tuned, known_as=self.known_as
         )
 
     def _own(self, call: str, concept: object) -> Composition:
-        """A concept of this model, on its device."""
+        """Check a concept and move it to the model's device."""
         return concept_of(self.model, self._space, call, concept)
 
     def demonstrations(
@@ -243,16 +243,16 @@ class FewShot(Shown):
         observed: Mapping[str, ArrayLike] | ArrayLike | None = None,
         name: str = "new concept",
     ) -> Demonstrations:
-        """Demonstrations of one concept from arrays.
+        """Make demonstrations of one concept from arrays.
 
         Args:
-            states: ``(demo, time, state)``, or one ``(time, state)`` for each demonstration, of any lengths.
-            observed: features by name, or the only one, observed at every time ``(demo, time, *shape)`` or at the first time alone
-                ``(demo, *shape)``; for demonstrations of different lengths, a list like the states'.
-            name: of the concept.
+            states: ``(demo, time, state)``, or a list of ``(time, state)`` of any lengths.
+            observed: features by name, or a single feature, at every time ``(demo, time, *shape)`` or at the first time
+                ``(demo, *shape)``; for different lengths, a list as for ``states``.
+            name: name of the concept.
 
         Raises:
-            UserError: where they do not fit the model.
+            UserError: if the arrays do not fit the model.
         """
         expect_text("name", name, "go to red bowl")
         return demonstrations_of(self.domain, states, observed, name)
@@ -269,59 +269,59 @@ class FewShot(Shown):
         watch: Callable[[Learning], None] | None = None,
         **changes: Any,
     ) -> LearnedConcept:
-        """Learn a concept from a few demonstrations, three to five or more: the same numbers as ``invert`` gives.
+        """Learn a concept from a few demonstrations, three to five or more; same numbers as ``invert``.
 
         Args:
             states, observed, name: see :meth:`demonstrations`.
-            steps: of gradient descent; ``None`` for the tuned number.
-            seed: decides starts, noise and timesteps.
+            steps: gradient steps; ``None`` for the tuned number.
+            seed: seed of starts, noise and timesteps.
             progress: show a bar.
-            watch: called after each step of what is learned first, in methods of gradient descent; it may sample the concept so
-                far, which changes nothing, or stop by an exception of its own.
-            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``form="paper"``; see there.
+            watch: called after each step of the first inversion, for methods with gradient descent; it may sample the concept so
+                far without side effects, or stop by raising an exception.
+            changes: options of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``form="paper"``.
 
         Warns:
-            UserWarning: where demonstrations are longer than the model's plans, or likely have a fault (see :meth:`check`).
+            UserWarning: if demonstrations are longer than the model's plans, or likely have a fault (see :meth:`check`).
 
         Raises:
-            UserError: where demonstrations or settings do not fit the model.
+            UserError: if demonstrations or settings do not fit the model.
         """
-        own = of_one_concept(self.demonstrations(states, observed, name))
-        (learned,) = self._learn(own, "learn", steps, seed, progress, watch, changes)
+        fitted = of_one_concept(self.demonstrations(states, observed, name))
+        (learned,) = self._learn(fitted, "learn", steps, seed, progress, watch, changes)
         return learned
 
     def learn_all(
         self, demonstrations: Demonstrations, *, steps: int | None = None, seed: int = 0, progress: bool = False, **changes: Any
     ) -> dict[str, LearnedConcept]:
-        """Learn every concept of some demonstrations, all together: the same numbers as ``invert`` gives, and up to rounding those
-        of :meth:`learn` for each alone, in much less time than one after another.
+        """Learn every concept of the demonstrations in one batch: same numbers as ``invert``, and up to rounding as :meth:`learn`
+        for each concept, in much less time.
 
         Args:
-            demonstrations: with a text for each, which name the concepts, ``(demo, time, state)``.
+            demonstrations: demonstrations ``(demo, time, state)`` whose texts name the concepts.
             steps, seed, progress: see :meth:`learn`.
-            changes: of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``form="paper"``; see there.
+            changes: options of :class:`~ftl_lightning.learning.inversion_settings.InversionSettings`, such as ``form="paper"``.
 
         Returns:
-            The concepts by name, in the order of the demonstrations.
+            Concepts by name, in the order of the demonstrations.
 
         Warns:
             UserWarning: as :meth:`learn`, with the concept's name.
 
         Raises:
-            UserError: where demonstrations or settings do not fit the model, or a demonstration has no text.
+            UserError: if demonstrations or settings do not fit the model, or a demonstration has no text.
         """
         if not isinstance(demonstrations, Demonstrations):
             raise UserError(f"learn_all: expected Demonstrations, such as of Demonstrations.load, found {shown(demonstrations)}")
         expect_of_domain("demonstrations", demonstrations, self.domain)
         if not demonstrations.concepts or not all(demonstrations.concepts):
             raise UserError("demonstrations: expected a text for each, which names its concept, found none; use learn, with name")
-        own = demonstrations.fitted(self.domain.observed)
-        learned = self._learn(own, "learn_all", steps, seed, progress, None, changes)
-        return {one.concept.origin.name: one for one in learned}
+        fitted = demonstrations.fitted(self.domain.observed)
+        learned = self._learn(fitted, "learn_all", steps, seed, progress, None, changes)
+        return {concept.concept.origin.name: concept for concept in learned}
 
     def _learn(
         self,
-        own: Demonstrations,
+        fitted: Demonstrations,
         call: str,
         steps: int | None,
         seed: int,
@@ -329,28 +329,28 @@ class FewShot(Shown):
         watch: Callable[[Learning], None] | None,
         changes: Mapping[str, Any],
     ) -> list[LearnedConcept]:
-        """The concepts of demonstrations that fit, in their order, for one of the methods above, which is called by its user."""
-        names = tuple(dict.fromkeys(own.concepts))
+        """Learn the concepts of fitted demonstrations, in order, for a public method called by the user (``stacklevel`` 3)."""
+        names = tuple(dict.fromkeys(fitted.concepts))
         title = f"learning {names[0]!r}" if len(names) == 1 else f"learning {len(names)} concepts"
         expect_whole("seed", seed, 0, None)
         chosen = changed(call, self.tuned.inversion, changes, ("steps", "seed", "progress", "watch"), INVERSION)
         settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()) and not {"modes", "adapter"} & {*changes})
         self.model.method.expect_settings(changes if watch is None else {**changes, "watch": watch})
         total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
-        if told := longer_than_plans(own, self.model):
-            warnings.warn(told, stacklevel=3)
+        if note := longer_than_plans(fitted, self.model):
+            warnings.warn(note, stacklevel=3)
         for name in names:
-            for told in warnings_of(self.model, own.select(name)):
-                warnings.warn(told if len(names) == 1 else f"{name}: {told}", stacklevel=3)
+            for note in warnings_of(self.model, fitted.select(name)):
+                warnings.warn(note if len(names) == 1 else f"{name}: {note}", stacklevel=3)
         with bar(title, total) if progress else nullcontext(lambda *_: None) as advance:
             learn: Learner = self.model.method.learn()
             watched = {} if watch is None else {"watch": self._watched(names[0], watch)}
-            learned = learn(self.model, own, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), **watched)
+            learned = learn(self.model, fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), **watched)
         for name in names:
             expect_sizes(self.model, learned[name])
-            self._examples.append(own.select(name))
+            self._examples.append(fitted.select(name))
         judging = self.judging
-        return [replace(self._learned(learned[name]), demonstrations=own.select(name), judging=judging) for name in names]
+        return [replace(self._learned(learned[name]), demonstrations=fitted.select(name), judging=judging) for name in names]
 
     def _watched(self, name: str, watch: Callable[[Learning], None]) -> Watch:
         return lambda step, loss, concepts: watch(Learning(step, loss, lambda: self._learned(concepts()[name])))
@@ -364,27 +364,27 @@ class FewShot(Shown):
         learn: bool = False,
         progress: bool = False,
     ) -> Check:
-        """Whether demonstrations of a concept suffice, and which of them is odd; ``print`` it.
+        """Check whether demonstrations of a concept suffice, and find an odd demonstration; ``print`` the result.
 
         Args:
-            states, observed, name: see :meth:`demonstrations`; states may lack numbers (NaN).
-            learn: also learn the concept from some of them and measure the others.
+            states, observed, name: see :meth:`demonstrations`; states may be missing (NaN).
+            learn: also compute leave-one-out losses.
             progress: show a bar.
 
         Raises:
-            UserError: where they do not fit the model, or no concepts are learned through it.
+            UserError: if demonstrations do not fit the model, or the model has no inversion.
         """
-        whole, found = mended_states(states)
-        own = of_one_concept(self.demonstrations(whole, observed, name))
-        return check_with(self.model, own, self.tuned.inversion, self.tuned.learning_steps if learn else 0, found, progress)
+        whole, findings = mended_states(states)
+        fitted = of_one_concept(self.demonstrations(whole, observed, name))
+        return check_with(self.model, fitted, self.tuned.inversion, self.tuned.learning_steps if learn else 0, findings, progress)
 
     def starts(self, goal: str, count: int = 10, seed: int = 0) -> InitialStates:
-        """New initial states of a task, with scenes where there is an environment.
+        """Draw new initial states of a task, with scenes in domains with an environment.
 
         Args:
             goal: the task.
-            count: of initial states.
-            seed: decides them.
+            count: number of initial states.
+            seed: seed of the initial states.
 
         Raises:
             UserError: in domains without initial states.
@@ -392,13 +392,13 @@ class FewShot(Shown):
         expect_text("goal", goal, self.training_concepts[0])
         count, seed = expect_whole("count", count, 1), expect_whole("seed", seed, 0, None)
         try:
-            found = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
+            states = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
         except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
             self.judging.expect_goal(goal)
             raise
-        if found is None:
+        if states is None:
             raise UserError(f"starts: expected a domain with initial states, found {self.domain.name}")
-        return found
+        return states
 
     def sample(
         self,
@@ -411,19 +411,19 @@ class FewShot(Shown):
         progress: bool = False,
         **changes: Any,
     ) -> Demonstrations:
-        """Generate behaviour.
+        """Sample behaviour.
 
         Args:
-            concept: a learned or training concept, or a sum of such with weights.
-            count: of plans; where they start from initial states, one for each.
-            observed: where they start, in domains with observed features.
-            seed: of the noise.
-            batch_size: plans that are made at once, where memory is short; ``None`` for all. They are the same but for rounding.
+            concept: a learned or training concept, or a weighted sum of concepts.
+            count: number of plans; with initial states, a plan for each.
+            observed: initial states, in domains with observed features.
+            seed: seed of the noise.
+            batch_size: maximum number of plans in a batch, to save memory; ``None`` for all. Plans are equal up to rounding.
             progress: show a bar.
-            changes: of :class:`~ftl_lightning.diffusion.samplers.Sampling`: ``sampler``, ``steps``, ``temperature``.
+            changes: options of :class:`~ftl_lightning.diffusion.samplers.Sampling`: ``sampler``, ``steps``, ``temperature``.
 
         Returns:
-            Plans ``(sample, horizon, state)`` as demonstrations, with where they start.
+            Plans ``(sample, horizon, state)`` as demonstrations, with their initial states.
 
         Raises:
             UserError: for a concept of another model, or a start that does not fit the model.
@@ -439,27 +439,27 @@ class FewShot(Shown):
         return plans_of(self.domain, states, starts, provenance)
 
     def _sampling(self, call: str, changes: Mapping[str, Any]) -> Sampling:
-        found = changed(call, self.tuned.sampling, changes, GIVEN[call])
-        if self.model.max_steps is not None and found.steps > self.model.max_steps:
-            raise UserError(f"steps: expected 1 to {self.model.max_steps} (the model's T), found {found.steps}")
-        return found
+        sampling = changed(call, self.tuned.sampling, changes, GIVEN[call])
+        if self.model.max_steps is not None and sampling.steps > self.model.max_steps:
+            raise UserError(f"steps: expected 1 to {self.model.max_steps} (the model's T), found {sampling.steps}")
+        return sampling
 
     def evaluate(self, plans: Demonstrations, goal: str) -> dict[str, float]:
-        """What the domain's metrics say of plans: shares of right ones, or means, by name.
+        """Evaluate plans by the domain's metrics: success rates or means by name.
 
         Raises:
-            UserError: for plans of another domain, a goal that the domain cannot judge by, or a domain that judges no plans.
+            UserError: for plans of another domain, a goal that the domain cannot judge, or a domain without metrics.
         """
         expect_of_domain("evaluate", plans, self.domain)
         return judged(self.judging, plans, goal)
 
     @property
     def judging(self) -> Domain:
-        """The domain that judges what the model generates: its own, of a user's own data with what concepts were learned from."""
+        """Domain that judges generated behaviour: the model's; for a user's data, including demonstrations of learned concepts."""
         return judging_domain(self.model, self._examples)
 
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
-        """A picture of plans; with a goal, right ones are framed green and wrong ones red."""
+        """Draw plans; with a goal, right plans are framed green and wrong plans red."""
         expect_of_domain("render", plans, self.domain)
         return picture(self.judging, plans, goal)
 
@@ -478,15 +478,15 @@ class FewShot(Shown):
 
         Args:
             concept: as in :meth:`sample`.
-            scenes: that episodes start from ``(episode, scene)``, or initial states with scenes, such as :meth:`starts` draws.
-            goal: what episodes are judged by; empty for nothing.
-            replan: steps that a plan is followed before a new one is made; ``None`` for the tuned number.
-            environment: another of the domain's, such as driving's ``'step veto'``; empty for its own.
-            seed: of the noise.
+            scenes: initial scenes ``(episode, scene)``, or initial states with scenes, such as from :meth:`starts`.
+            goal: task that episodes are judged by; empty for none.
+            replan: steps between plans; ``None`` for the tuned number.
+            environment: another environment of the domain, such as driving's ``'step veto'``; empty for the default.
+            seed: seed of the noise.
             changes: as in :meth:`sample`.
 
         Raises:
-            UserError: for a concept of another model; in a domain without an environment, or without one of this name.
+            UserError: for a concept of another model, or in a domain without this environment.
         """
         loop = closed_loop_of(self.domain)
         if environment and environment not in loop.others:
@@ -502,36 +502,36 @@ class FewShot(Shown):
         return Execution(self.domain, goal, rollout, followed)
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Write ``config.json``, ``model.safetensors`` and, if there is none yet, a ``README.md`` to a folder."""
+        """Write ``config.json`` and ``model.safetensors`` to a folder, and a ``README.md`` unless it exists."""
         save_with_card(self.model, Path(folder))
 
     def push_to_hub(self, repository: str, private: bool = False) -> str:
         """Upload the model to the Hugging Face Hub as ``owner/name``; needs a network and a login.
 
         Args:
-            repository: its name.
-            private: whether only you see it, if it is new.
+            repository: name of the repository.
+            private: whether a new repository is private.
 
         Returns:
-            Where it is.
+            The address.
 
         Raises:
-            UserError: for a name that is none, or a place that cannot be written to.
+            UserError: for an invalid name or a failed upload.
         """
         return upload(self.save_pretrained, repository, private)
 
     def publish(self, concept: LearnedConcept, repository: str, private: bool = False, demonstrations: bool = False) -> str:
-        """Upload a concept that was learned with this model, see :meth:`LearnedConcept.push_to_hub`; :meth:`load` takes its name.
+        """Upload a learned concept of this model, see :meth:`LearnedConcept.push_to_hub`; :meth:`load` accepts its name.
 
         Args:
-            concept: to upload.
-            repository, private, demonstrations: see there.
+            concept: learned concept.
+            repository, private, demonstrations: see :meth:`LearnedConcept.push_to_hub`.
 
         Returns:
-            Where it is.
+            The address.
 
         Raises:
-            UserError: for what is no learned concept of this model, a name that is none, or a place that cannot be written to.
+            UserError: for another object or model's concept, an invalid name, or a failed upload.
         """
         self._own("publish", concept)
         if not isinstance(concept, LearnedConcept):

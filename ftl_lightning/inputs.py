@@ -1,4 +1,4 @@
-"""Files that a command line names, looked at before anything slow is imported: what is read is there, what is written no device."""
+"""Early checks of files in a command line, before slow imports: inputs exist, and outputs are writable."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from ftl_lightning.shipped import missing_model, pretrained_folder, shipped
 from ftl_lightning.targets import expect_new_folder, expect_writable_file, expect_writable_folder
 
 Check = Callable[[str], None]
-"""Raises a :class:`UserError` for a path where nothing is that could be meant."""
+"""Raises a :class:`UserError` for an invalid path."""
 
 
 def _model(path: str) -> None:
@@ -71,7 +71,7 @@ def _table(path: str) -> None:
 
 
 def _added(key: str) -> Check:
-    """Of results, which rows are added to."""
+    """Check of a results file that rows are appended to."""
 
     def check(path: str) -> None:
         _written(key)(path)
@@ -89,7 +89,7 @@ TRAINER: Mapping[str, Check] = {
     "evaluation.results": _added("evaluation.results"),
     "evaluation.films": _written("evaluation.films"),
 }
-"""Of the verbs that need a trainer. ``init_args`` is left out of the keys, as on the command line."""
+"""Checks of verbs with a trainer, by option without ``init_args``, as on the command line."""
 _COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _concept, "initial": _demonstrations}
 _OUT: Mapping[str, Check] = {"out": _written_demonstrations}
 _FOLDER: Mapping[str, Check] = {"out": _written("out", expect_writable_folder)}
@@ -114,20 +114,20 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
 
 
 def command_checks(verb: str) -> Mapping[str, Check]:
-    """Those of a verb that needs no trainer."""
+    """Checks of a verb without a trainer."""
     return {**_COMMANDS, **_WRITTEN.get(verb, {})}
 
 
 def check_inputs(verb: str, arguments: Sequence[str], checks: Mapping[str, Check]) -> None:
-    """Refuse a command line, its configuration files included, that names input files that are not there or outputs that are none.
+    """Refuse a command line, configuration files included, with missing input files or invalid outputs.
 
     Args:
-        verb: whose sections of configuration files count.
-        arguments: those of the verb, without it.
-        checks: by option.
+        verb: verb whose sections of configuration files apply.
+        arguments: arguments after the verb.
+        checks: checks by option.
 
     Raises:
-        UserError: for the first one, or for a configuration file that cannot be read.
+        UserError: for the first such file, or an unreadable configuration file.
     """
     values: dict[str, Any] = {}
     for path in configurations(arguments):
@@ -142,7 +142,7 @@ def check_inputs(verb: str, arguments: Sequence[str], checks: Mapping[str, Check
 
 
 def _flat(keys: Mapping[str, Any], above: str) -> Iterator[tuple[str, Any]]:
-    """Every value with its keys joined by dots, without ``init_args``."""
+    """Values with their keys joined by dots, without ``init_args``."""
     for key, value in keys.items():
         if isinstance(value, Mapping):
             yield from _flat(value, above if key == "init_args" else f"{above}{key}.")
@@ -151,7 +151,7 @@ def _flat(keys: Mapping[str, Any], above: str) -> Iterator[tuple[str, Any]]:
 
 
 def options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Every option with its value, given as ``--option=value`` or ``--option value``."""
+    """Options with their values, given as ``--option=value`` or ``--option value``."""
     for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
         if argument.startswith("--"):
             option, equals, value = argument[2:].partition("=")

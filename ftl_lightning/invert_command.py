@@ -1,4 +1,4 @@
-"""The verb ``invert`` with a model and a file: its options, and what it does without a trainer. Its imports are inside."""
+"""The verb ``invert`` with a model and a file, without a trainer; local imports for a fast start."""
 
 import warnings
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 class InvertOptions:
     """Learn the concepts of a file of demonstrations through a pretrained model, without a trainer.
 
-    The concepts are those that "invert --config" learns from the same file, with the settings of the model's domain. Nothing is
-    logged, evaluated or resumed.
+    The concepts equal those of "invert --config" for the same file, with the settings of the model's domain. Nothing is logged,
+    evaluated or resumed.
 
     Attributes:
-        pretrained: folder of the pretrained model, or the name of one that ships.
-        demonstrations: file of demonstrations (.npz or .safetensors), the folder of a LeRobot data set, or the name of a Minari
-            data set; each of its concepts is learned, and those without a text are one concept named after the file.
+        pretrained: folder of the pretrained model, or the name of a shipped model.
+        demonstrations: file of demonstrations (.npz or .safetensors), folder of a LeRobot data set, or name of a Minari data set;
+            each of its concepts is learned; demonstrations without a text are one concept named after the file.
         out: folder to write, a file for each concept.
-        steps: of gradient descent; 0 for what the settings name.
-        seed: decides starts, noise and timesteps.
-        form: of the concepts, such as "paper" or "modes"; empty for the one that the demonstrations ask for.
-        settings: configuration file of invert that says how to learn; empty for that of the domain.
+        steps: gradient steps; 0 for those of the settings.
+        seed: seed of starts, noise and timesteps.
+        form: form of the concepts, such as "paper" or "modes"; empty to select it by leave-one-out error.
+        settings: configuration file of invert with settings of learning; empty for that of the domain.
     """
 
     pretrained: str
@@ -52,20 +52,20 @@ def invert(options: InvertOptions) -> None:
     from ftl_lightning.targets import expect_writable_file
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
-    found = read_own(options.demonstrations)
+    demos = read_own(options.demonstrations)
     with about(options.demonstrations):
-        found = model.demonstrations(found)
-    names = tuple(dict.fromkeys(found.concepts))
+        demos = model.demonstrations(demos)
+    names = tuple(dict.fromkeys(demos.concepts))
     paths = [Path(options.out) / f"{file_name(name)}.safetensors" for name in names]
     if len(set(paths)) < len(paths):
         raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(names), 150)}")
     for path in paths:
         expect_writable_file(path, "out")
     changes = {"form": options.form} if options.form else {}
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always", UserWarning)
-        learned = model.learn_all(found, steps=options.steps or None, seed=options.seed, progress=True, **changes)
-    for note in told:
+        learned = model.learn_all(demos, steps=options.steps or None, seed=options.seed, progress=True, **changes)
+    for note in notes:
         say("note:", line(str(note.message)), error=True)
     for path, concept in zip(paths, learned.values(), strict=True):
         concept.save(path)

@@ -1,4 +1,4 @@
-"""Plans judged and drawn, for the Python API."""
+"""Evaluation and pictures of plans, for the Python API."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> Domain:
-    """A model's domain; of a user's own data, with the demonstrations that concepts were learned from."""
+    """A model's domain; for a user's data, including demonstrations of learned concepts."""
     if model.examples is None:
         return model.domain
     config = model.config
@@ -24,10 +24,10 @@ def judging_domain(model: ConceptModel, examples: Sequence[Demonstrations]) -> D
 
 
 def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]:
-    """What the domain's metrics say of plans: shares of right ones, or means, by name.
+    """Evaluate plans by the domain's metrics: success rates or means by name.
 
     Raises:
-        UserError: for a goal that the domain cannot judge by, or a domain that judges no plans.
+        UserError: for a goal that the domain cannot judge, or a domain without metrics.
     """
     if not domain.metrics:
         raise UserError(f"evaluate: expected a domain that judges plans, found {domain.name}; execute them")
@@ -37,10 +37,10 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]
 
 
 def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
-    """A picture of plans; with a goal, right ones are framed green and wrong ones red.
+    """Draw plans; with a goal, right plans are framed green and wrong plans red.
 
     Raises:
-        UserError: for a goal that the domain cannot judge by.
+        UserError: for a goal that the domain cannot judge.
     """
     starts, right = plans.initial_states, None
     if goal:

@@ -1,4 +1,4 @@
-"""A learned concept as a user of the Python API holds it."""
+"""Learned concepts of the Python API."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -22,12 +22,12 @@ from ftl_lightning.tuned import ModelSettings
 
 @dataclass(frozen=True)
 class Learning:
-    """A concept while it is learned.
+    """State of learning, for callbacks.
 
     Attributes:
-        step: how many were made.
-        loss: mean of the last one.
-        so_far: gives the concept as it is now, of one set of embeddings, whatever form it is to have.
+        step: number of completed steps.
+        loss: mean loss of the last step.
+        so_far: returns the current concept, of one set of embeddings whatever the final form.
     """
 
     step: int
@@ -37,15 +37,15 @@ class Learning:
 
 @dataclass(frozen=True, repr=False)
 class LearnedConcept(Composition):
-    """A learned concept; it composes with others like any composition.
+    """A learned concept, which composes like any composition.
 
     Attributes:
-        concept: embeddings, weights and where they come from.
-        model: it was learned through.
-        tuned: settings that go with the model, which its film is sampled with.
-        known_as: under which name others find the model: one that ships or ``'owner/name'`` on the Hub; empty where there is none.
-        demonstrations: that it was learned from, where this happened here.
-        judging: the domain that judges its samples, then.
+        concept: embeddings, weights and origin.
+        model: the concept's model.
+        tuned: the model's settings, for sampling its film.
+        known_as: public name of the model: a shipped model or ``'owner/name'`` on the Hub; empty without one.
+        demonstrations: its demonstrations, if it was learned in this process.
+        judging: domain that judges its samples, if it was learned in this process.
     """
 
     concept: Concept
@@ -60,20 +60,20 @@ class LearnedConcept(Composition):
 
     @functools.cached_property
     def quality(self) -> Inspection:
-        """What samples of it are like beside the demonstrations: recognised, spread, novelty, roughness, and both to look at.
+        """Quality of samples relative to the demonstrations: success rate, spread, novelty, roughness, and a figure.
 
         Raises:
-            UserError: for a concept that was not learned here from two demonstrations or more.
+            UserError: for a concept that was not learned in this process from two demonstrations or more.
         """
         if self.demonstrations is None or self.judging is None or len(self.demonstrations) < 2:
             raise UserError("quality: expected a concept that was learned here from two demonstrations or more, found another")
         return inspected(self.model, self.judging, self.demonstrations, self.concept, 0)
 
     def explain(self, nearest: int = 3) -> Explanation:
-        """What its weighted sum is made of, in words of the training concepts; of several knots, their mean.
+        """Explain the weighted sum, averaged over knots, by training concepts.
 
         Args:
-            nearest: how many of the nearest training concepts are told, 1 or more.
+            nearest: number of nearest training concepts, 1 or more.
 
         Raises:
             UserError: for another number.
@@ -83,26 +83,25 @@ class LearnedConcept(Composition):
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
 
     def save(self, path: str | Path, quality: bool = False) -> None:
-        """Write it to a file that every command reads.
+        """Write the concept to a file that every command reads.
 
         Args:
-            path: of the file.
-            quality: also write what :attr:`quality` measures, with the share of right samples, so that a library can tell it. It is
-                one more key of the file's header: versions that do not know it read the file all the same, and without it a file
-                has the bytes that ``invert`` writes.
+            path: path of the file.
+            quality: also write :attr:`quality`, with the success rate, for libraries. It is an additional key of the file's header,
+                which older versions ignore; without it the file has the bytes that ``invert`` writes.
 
         Raises:
-            UserError: where ``quality`` is asked for and cannot be measured.
+            UserError: if ``quality`` is requested and cannot be measured.
         """
         (replace(self.concept, quality=self.quality.record) if quality else self.concept).save(path)
 
     def keep(self) -> Path:
-        """Write it to your own library, with its quality where that can be measured, so that compositions know it by its name.
+        """Save the concept to your library, with its quality if measurable, so that compositions find it by name.
 
-        A concept of the same name and model that was kept before is replaced.
+        An earlier concept of the same name and model is replaced.
 
         Returns:
-            Its file.
+            The file.
         """
         path = kept_file(self.model.hash, self.concept.origin.name)
         self._judged.save(path)
@@ -110,20 +109,20 @@ class LearnedConcept(Composition):
 
     @property
     def _judged(self) -> Concept:
-        """With its quality, where it can be measured here."""
+        """The concept with its quality, if measurable."""
         measurable = self.demonstrations is not None and self.judging is not None and len(self.demonstrations) > 1
         return replace(self.concept, quality=self.quality.record) if measurable else self.concept
 
     def save_pretrained(self, folder: str | Path, demonstrations: bool = False) -> None:
-        """Write a folder that others can load: ``concept.safetensors`` with its quality, a film or picture of new samples, and, if
-        there is none yet, a ``README.md``.
+        """Write a folder to share: ``concept.safetensors`` with its quality, a film or picture of new samples, and a
+        ``README.md`` unless it exists.
 
         Args:
-            folder: to write.
-            demonstrations: also write what it was learned from, ``demonstrations.safetensors``; otherwise nothing shows them.
+            folder: folder to write.
+            demonstrations: also write ``demonstrations.safetensors``; otherwise demonstrations stay private.
 
         Raises:
-            UserError: where demonstrations are asked for of a concept that was not learned here.
+            UserError: if demonstrations are requested for a concept that was not learned in this process.
         """
         if demonstrations and self.demonstrations is None:
             raise UserError("demonstrations: expected a concept that was learned here, found one from a file; leave them out")
@@ -134,30 +133,30 @@ class LearnedConcept(Composition):
         """Upload the folder of :meth:`save_pretrained` to the Hugging Face Hub as ``owner/name``; needs a network and a login.
 
         Args:
-            repository: its name.
-            private: whether only you see it, if it is new.
-            demonstrations: also upload what it was learned from.
+            repository: name of the repository.
+            private: whether a new repository is private.
+            demonstrations: also upload the demonstrations.
 
         Returns:
-            Where it is.
+            The address.
 
         Raises:
-            UserError: for a name that is none, or a place that cannot be written to.
+            UserError: for an invalid name or a failed upload.
         """
         return upload(lambda folder: self.save_pretrained(folder, demonstrations), repository, private)
 
 
 def concept_of(model: ConceptModel, space: str, call: str, concept: object) -> Composition:
-    """A concept of a model, on the model's device.
+    """Check a concept and move it to the model's device.
 
     Args:
-        model: that is to use it.
-        space: whose concepts the model's are, see :func:`~ftl_lightning.concepts.composition.space_of`.
-        call: what it is given to, such as ``'sample'``.
-        concept: what was given.
+        model: the model.
+        space: concept space of the model, see :func:`~ftl_lightning.concepts.composition.space_of`.
+        call: name of the called method, such as ``'sample'``.
+        concept: argument of the method.
 
     Raises:
-        UserError: for one of another model, or what is no concept.
+        UserError: for another model's concept, or another object.
     """
     if not isinstance(concept, Composition):
         text = short(model.config.training_concepts[0], 40)

@@ -1,4 +1,4 @@
-"""The learning rate as a curve, of whatever learns."""
+"""Callback that logs the learning rate."""
 
 import re
 from typing import Any
@@ -10,23 +10,23 @@ TAG = "optimizer/learning rate"
 
 
 class LearningRate(pl.Callback):
-    """Logs the rate of each step that is taken.
+    """Logs the learning rate of each step.
 
-    An optimiser with several groups of parameters has a curve for each name of a group's first parameter, without numbers: adapters
-    have a group for every factor.
+    An optimiser with several parameter groups has a curve for each name of a group's first parameter, without numbers, since
+    adapters have a group for every factor.
     """
 
     def on_before_optimizer_step(self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: Optimizer) -> None:
-        """Log the rates of the step that follows."""
+        """Log the rates of the next step."""
         pl_module.log_dict(rates(pl_module, optimizer), on_step=True, on_epoch=False)
 
 
 def rates(module: pl.LightningModule, optimizer: Optimizer) -> dict[str, float]:
-    """The learning rates by tag.
+    """Learning rates by tag.
 
     Args:
-        module: whose parameters they are of.
-        optimizer: what learns them.
+        module: module with the parameters.
+        optimizer: optimiser of the parameters.
     """
     groups: list[dict[str, Any]] = optimizer.param_groups
     if len(groups) == 1:

@@ -1,4 +1,4 @@
-"""The verbs that need a trainer: Lightning's command line with ``invert`` added."""
+"""Verbs with a trainer: Lightning's command line and ``invert``."""
 
 import logging
 import sys
@@ -32,24 +32,24 @@ from ftl_lightning.training_bar import TrainingBar, accuracies
 
 
 class CommandLine(LightningCLI):
-    """Lightning's command line; see its documentation for everything but ``invert``."""
+    """Lightning's command line with the verb ``invert``."""
 
     def __init__(self, model: type, data: type, args: list[str], **options: Any) -> None:
         self._asked = args[0] if args else ""
         super().__init__(model, data, args=args, **options)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
-        """The verb that is asked for, with the arguments that are no options; a parser of every verb takes a third of the start."""
+        """The requested verb and its non-option arguments; parsers of all verbs would take a third of the start-up time."""
         verbs = LightningCLI.subcommands() | {"invert": {"model", "datamodule"}}
-        return {verb: names for verb, names in verbs.items() if verb == self._asked}  # none where nothing is run
+        return {verb: names for verb, names in verbs.items() if verb == self._asked}  # none if nothing is run
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """One seed for everything, unless a configuration says otherwise, and the evaluator's options."""
+        """Add a common default seed and the evaluator's options."""
         parser.add_lightning_class_args(Evaluator, "evaluation")
         parser.set_defaults({"seed_everything": 0, "trainer.enable_model_summary": False})
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse them, and refuse a seed that numpy does not take."""
+        """Parse arguments, and refuse a seed that numpy does not accept."""
         super().parse_arguments(parser, args)
         verb = self.config.get("subcommand")
         self._expect_keys(self.config[verb] if verb else self.config, args)
@@ -61,10 +61,10 @@ class CommandLine(LightningCLI):
 
     @staticmethod
     def _expect_keys(known: Namespace, arguments: Sequence[str]) -> None:
-        """Refuse what jsonargparse overlooks: an unknown key of a configuration without anything below it.
+        """Refuse an unknown key without subkeys in a configuration, which jsonargparse accepts.
 
         Raises:
-            ArgumentError: naming the key.
+            ArgumentError: with the key.
         """
         for option, text in options(arguments):
             keys = OmegaConf.to_container(OmegaConf.create(text)) if option == "config" and ":" in text else {}
@@ -73,22 +73,22 @@ class CommandLine(LightningCLI):
                     raise ArgumentError(None, f"Group 'configuration' does not accept option '{short(str(key))}'")
 
     def instantiate_classes(self) -> None:
-        """Build everything; Lightning logs the seeds of model and data as one."""
+        """Build everything; model and data must have the same seed, as Lightning logs a single seed."""
         with trust.vouching(self._domains()):
             try:
                 super().instantiate_classes()
             except (ValueError, MisconfigurationException) as error:
-                told = _behind(error)
-                raise mistake_behind(error) or UserError(f"configuration: {short(told, 230)}; see --help") from error
-        model, data = (getattr(one, "hparams", {}).get("seed") for one in (self.model, self.datamodule))
+                message = _behind(error)
+                raise mistake_behind(error) or UserError(f"configuration: {short(message, 230)}; see --help") from error
+        model, data = (getattr(module, "hparams", {}).get("seed") for module in (self.model, self.datamodule))
         if model is not None and data is not None and model != data:
             raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
 
     def _domains(self) -> list[str]:
-        """The domain that the configuration names, if it does: a pretrained model's folder may ask for the same.
+        """The domain in the configuration, if any, which a pretrained model's folder may then use.
 
         Raises:
-            UserError: for one of a module that neither is installed nor a person vouches for.
+            UserError: for a module that is neither installed nor trusted by the user.
         """
         options = (self._get(self.config, "data") or {}).get("init_args") or {}
         domain = options.get("domain")
@@ -98,20 +98,19 @@ class CommandLine(LightningCLI):
         return [domain]
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
-        """The trainer, with our progress bar in place of Lightning's."""
+        """The trainer, with this package's progress bar."""
         configured = self._get(self.config_init, "trainer")
         callbacks = list(configured["callbacks"] or [])
-        if configured["enable_progress_bar"] is not False and not any(isinstance(one, ProgressBar) for one in callbacks):
+        if configured["enable_progress_bar"] is not False and not any(isinstance(callback, ProgressBar) for callback in callbacks):
             callbacks.append(TrainingBar())
         return super().instantiate_trainer(**kwargs, callbacks=callbacks)
 
     def before_instantiate_classes(self) -> None:
-        """Whoever learns gets a log folder that no other run has: an inversion a new one, ``invert``, then ``invert_1`` and so on.
+        """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on.
 
-        A pretraining takes that of an earlier one, unless it goes on at the same time. Whatever goes on from a checkpoint takes the
-        folder that is named.
+        A pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
         """
-        if getattr(rank_zero_only, "rank", 0):  # of several processes of one run the first has the folder
+        if getattr(rank_zero_only, "rank", 0):  # the first process of a run claims the folder
             return
         logger = self._get(self.config, "trainer").get("logger")
         options = logger.get("init_args") if isinstance(logger, Namespace) else None
@@ -128,22 +127,22 @@ class CommandLine(LightningCLI):
         return self.subcommand or ""
 
     def after_fit(self) -> None:
-        """Say where the model is."""
+        """Print the folder of the model."""
         folder = self.model.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
         say(", ".join((f"pretrained model: {folder}", *accuracies(self.trainer))))
 
     def after_invert(self) -> None:
-        """Say where the run was logged."""
+        """Print the log folder."""
         say(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
 
     def before_fit(self) -> None:
-        """Find the last checkpoint, if it is asked for."""
+        """Find the last checkpoint, if requested."""
         self._find_last()
 
     before_invert = before_fit
 
     def before_validate(self) -> None:
-        """A checkpoint is needed; Lightning would evaluate random weights."""
+        """Require a checkpoint; Lightning would evaluate random weights."""
         self._find_last()
         if not self.config_init[self._verb].get("ckpt_path"):
             raise UserError(f"ckpt_path: {self._verb} expected a checkpoint file, found none; give --ckpt_path FILE")
@@ -151,7 +150,7 @@ class CommandLine(LightningCLI):
     before_test = before_validate
 
     def _find_last(self) -> None:
-        """Put the path of the last checkpoint in place of its name; a run that has none yet starts anew and says so."""
+        """Resolve ``last`` to the path of the last checkpoint; without any, the run starts anew with a note."""
         options = self.config_init[self._verb]
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)
@@ -159,31 +158,30 @@ class CommandLine(LightningCLI):
                 say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
 
     def _parse_ckpt_path(self) -> None:
-        # Lightning would let the checkpoint's hyper-parameters, class included, override configuration and command line.
-        # Here the configuration rules, and a checkpoint of another class is refused.
+        # Lightning would override configuration and command line by the checkpoint's hyper-parameters, class included.
+        # Here the configuration takes precedence, and a checkpoint of another class is refused.
         path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
         if path and path != "last":
             read_checkpoint(path)
 
 
-def _expect_values(key: str, found: Namespace | None, given: Sequence[str]) -> None:
-    """Refuse what jsonargparse takes for a value that was not given, null where the class takes no ``None``, and the beginning of
-    a name in a group of options for the name.
+def _expect_values(key: str, values: Namespace | None, given: Sequence[str]) -> None:
+    """Refuse values that jsonargparse accepts: null for an argument without ``None``, and abbreviated names in option groups.
 
     Args:
         key: ``model`` or ``data``.
-        found: what it came to.
+        values: parsed values.
         given: names of options on the command line.
 
     Raises:
-        ArgumentError: naming the key.
+        ArgumentError: with the key.
     """
-    if found is None or "class_path" not in found:
+    if values is None or "class_path" not in values:
         return
-    module, _, name = found["class_path"].rpartition(".")
+    module, _, name = values["class_path"].rpartition(".")
     hints: dict[str, Any] = {}
     for base in reversed(getattr(sys.modules.get(module), name, object).__mro__):
-        with suppress(Exception):  # annotations of others may name what is not there
+        with suppress(Exception):  # foreign annotations may not resolve
             hints |= get_type_hints(vars(base)["__init__"])
     groups = {name: get_type_hints(hint) for name, hint in hints.items() if is_dataclass(hint)}
     in_groups = {f"{name}.{option}": hint for name, options in groups.items() for option, hint in options.items()}
@@ -191,7 +189,7 @@ def _expect_values(key: str, found: Namespace | None, given: Sequence[str]) -> N
         name = option.removeprefix(f"{key}.init_args.").removeprefix(f"{key}.")
         if option.startswith(f"{key}.") and name.partition(".")[0] in groups and name not in groups and name not in in_groups:
             raise ArgumentError(None, f"Option '{key}.{name}' is not accepted")
-    for name, value in (found.get("init_args") or Namespace()).items(branches=True):
+    for name, value in (values.get("init_args") or Namespace()).items(branches=True):
         hint = (hints | in_groups).get(name)
         if value is None and hint in (int, float, str, bool):
             raise ArgumentError(None, f'Key "{key}.{name}": Expected a {hint}. Got value: null')
@@ -202,11 +200,11 @@ def _expect_values(key: str, found: Namespace | None, given: Sequence[str]) -> N
 
 
 GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")
-"""Groups of options of the modules that ship."""
+"""Option groups of shipped modules."""
 
 
 def _null_in_groups(arguments: Sequence[str]) -> list[str]:
-    """Arguments with ``--model.GROUP.OPTION null`` as ``--model.GROUP={"OPTION": null}``; the parser reads the former as a text."""
+    """Rewrite ``--model.GROUP.OPTION null`` as ``--model.GROUP={"OPTION": null}``; the parser reads the former as a text."""
     result, rest = [], list(arguments)
     while rest:
         argument = rest.pop(0)
@@ -222,26 +220,26 @@ def _null_in_groups(arguments: Sequence[str]) -> list[str]:
 
 
 def _behind(error: BaseException) -> str:
-    """What the first of the exceptions says that led to this one."""
+    """Message of the root cause of an exception."""
     while behind := error.__cause__ or error.__context__:
         error = behind
     return str(error)
 
 
 class _Inversion(CommandLine):
-    """The same for building an inversion without running it."""
+    """Build an inversion without running it."""
 
     _verb = "invert"
 
 
 class _Fit(CommandLine):
-    """The same for a pretraining."""
+    """Build a pretraining without running it."""
 
     _verb = "fit"
 
 
 class _Parser(CommandLine):
-    """The same without building anything."""
+    """Parse without building anything."""
 
     def before_instantiate_classes(self) -> None:
         """Nothing."""
@@ -259,29 +257,29 @@ def run(arguments: list[str]) -> None:
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
     line = _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
-    process_group.expect_alone(line.trainer, "what another program runs")  # whose whole command line other processes would repeat
+    process_group.expect_alone(line.trainer, "what another program runs")  # other processes would repeat its command line
     return line
 
 
 def parse(verb: str, options: list[str]) -> dict[str, Any]:
-    """What the options of a verb come to, by key; nothing is built."""
-    found: dict[str, Any] = _command_line(_Parser, verb, options, run=False).config.as_dict()
-    return found
+    """Parse the options of a verb to values by key; nothing is built."""
+    config: dict[str, Any] = _command_line(_Parser, verb, options, run=False).config.as_dict()
+    return config
 
 
 PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning", "torch", "torchmetrics")
-"""Whose classes configurations name."""
+"""Packages with classes that configurations may name."""
 
 
 def _expect_trusted(verb: str, arguments: list[str]) -> None:
-    """Let a configuration ask for classes of installed packages alone, and of those that a person vouches for.
+    """Allow a configuration only classes of packages that are installed or trusted by the user.
 
     Raises:
-        UserError: naming file, key and module of another one.
+        UserError: with file, key and module of another class.
     """
     packages = set(PACKAGES)
-    asked = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
-    for where, keys in (*asked, ("options", dict(options(arguments)))):
+    sources = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
+    for where, keys in (*sources, ("options", dict(options(arguments)))):
         trust.expect_classes(keys, where)
         packages |= trust.allowed(keys)
     trust.allow_classes(packages)

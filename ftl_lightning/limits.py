@@ -1,7 +1,7 @@
-"""What a file may hold, looked at before it is read: a regular file of a bounded size.
+"""Limits of files, checked before they are read: a regular file of a bounded size.
 
-The limits are far above what an honest file of this kind has, and far below what would hang a laptop. Who has larger files raises
-them by an environment variable (:data:`VARIABLE`, in bytes), for files of tensors and for what is compressed in them.
+The limits are far above the sizes of honest files, and far below what would hang a laptop. An environment variable
+(:data:`VARIABLE`, in bytes) raises them for files of tensors and their compressed content.
 """
 
 import os
@@ -12,23 +12,23 @@ from ftl_lightning.errors import UserError, short
 
 VARIABLE = "FTL_LIGHTNING_MOST_BYTES"
 MOST_BYTES = 2 * 2**30
-"""Of a file of tensors: a model, a checkpoint, demonstrations."""
+"""Maximum bytes of a file of tensors: a model, a checkpoint, demonstrations."""
 MOST_TEXT = 32 * 2**20
-"""Bytes of a text: JSON, CSV, Markdown."""
+"""Maximum bytes of a text: JSON, CSV, Markdown."""
 MOST_HEADER = 8 * 2**20
-"""Bytes of the header of a safetensors file, which holds a text for each demonstration; in larger files the more."""
+"""Maximum bytes of a safetensors header, which holds a text for each demonstration; scaled by :func:`raised`."""
 MOST_TENSORS = 20_000
-"""Tensors in a file."""
+"""Maximum number of tensors in a file."""
 MOST_UNPACKED = 128 * 2**20
-"""Bytes that compressed arrays may come to, where that is more than :data:`MOST_RATIO` times those of the file."""
+"""Maximum bytes of unpacked arrays, or :data:`MOST_RATIO` times the bytes of the file if that is more."""
 MOST_RATIO = 100
 
 
 def most_bytes() -> int:
-    """:data:`MOST_BYTES`, or what the environment says in its place.
+    """:data:`MOST_BYTES`, or the value of the environment variable.
 
     Raises:
-        UserError: if that is no number of bytes.
+        UserError: if the value is no number of bytes.
     """
     text = os.environ.get(VARIABLE, "")
     if text and not (text.isdecimal() and len(text) < 20):
@@ -37,45 +37,45 @@ def most_bytes() -> int:
 
 
 def raised(most: int) -> int:
-    """A limit, as many times as high as the user has raised that of files."""
+    """Scale a limit by the user's file-size factor."""
     return int(most * max(1, most_bytes() / MOST_BYTES))
 
 
 def expect_readable(path: str | Path, kind: str, most: int | None = None) -> int:
-    """Refuse what is no regular file, or too large a one. Nothing is opened: a pipe would wait for ever.
+    """Refuse anything but a regular file of bounded size. The file is not opened: a pipe would wait for ever.
 
     Args:
-        path: of the file.
-        kind: what it is expected to be, for messages.
-        most: bytes; ``None`` for those of a file of tensors.
+        path: path of the file.
+        kind: expected kind, for messages.
+        most: maximum bytes; ``None`` for the limit of a file of tensors.
 
     Returns:
-        Its size in bytes.
+        Size in bytes.
 
     Raises:
         UserError: naming the file.
     """
     try:
-        found = Path(path).stat()
+        status = Path(path).stat()
     except (OSError, ValueError) as error:
-        told = "nothing" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or str(error)
-        raise UserError(f"{short(str(path), 150)}: expected a {kind} file, found {told}") from error
-    if not stat.S_ISREG(found.st_mode):
-        told = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, pipe or socket"
-        raise UserError(f"{path}: expected a {kind} file, found {told}")
-    if found.st_size > (limit := most_bytes() if most is None else most):
+        actual = "nothing" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or str(error)
+        raise UserError(f"{short(str(path), 150)}: expected a {kind} file, found {actual}") from error
+    if not stat.S_ISREG(status.st_mode):
+        actual = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, pipe or socket"
+        raise UserError(f"{path}: expected a {kind} file, found {actual}")
+    if status.st_size > (limit := most_bytes() if most is None else most):
         mend = f"; if it is honest, set {VARIABLE} to more" if most is None else ""
-        raise UserError(f"{path}: expected a {kind} file of at most {limit} bytes, found {found.st_size}{mend}")
-    return found.st_size
+        raise UserError(f"{path}: expected a {kind} file of at most {limit} bytes, found {status.st_size}{mend}")
+    return status.st_size
 
 
 def expect_unpacked(size: int, packed: int, what: str) -> None:
-    """Refuse compressed content that would come to far more than honest content does.
+    """Refuse compressed content that unpacks to far more than honest content does.
 
     Args:
-        size: bytes that it would come to.
-        packed: bytes that it has.
-        what: it is, for messages.
+        size: unpacked bytes.
+        packed: packed bytes.
+        what: name of the content, for messages.
 
     Raises:
         UserError: naming both sizes.
@@ -85,7 +85,7 @@ def expect_unpacked(size: int, packed: int, what: str) -> None:
 
 
 def read_text(path: str | Path, kind: str, most: int = MOST_TEXT, encoding: str = "utf-8") -> str:
-    """A text file.
+    """Read a text file.
 
     Raises:
         UserError: naming the file, as :func:`expect_readable`, or if it cannot be read or is in another encoding.

@@ -1,4 +1,4 @@
-"""The log folder of a run, which no other run has at the same time, in whatever process or however close they start."""
+"""Log folders of runs, never shared by two runs, in whatever processes and however close they start."""
 
 import contextvars
 import fcntl
@@ -14,14 +14,14 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.targets import expect_writable_folder
 
 LOCK = ".running"
-"""File in the folder of a run that goes on, locked by it."""
+"""File in the folder of an active run, which locks it."""
 
 
 @dataclass
 class _Run:
-    """What a run holds, and whether it has begun to learn."""
+    """Folders of a run, and whether it has begun to learn."""
 
-    held: ExitStack = field(default_factory=ExitStack)
+    folders: ExitStack = field(default_factory=ExitStack)
     learns: bool = False
 
 
@@ -30,46 +30,45 @@ _run: contextvars.ContextVar[_Run | None] = contextvars.ContextVar("run", defaul
 
 @contextmanager
 def run() -> Iterator[None]:
-    """Within the block, folders that are claimed stay the run's own.
+    """Hold folders that are claimed within the block.
 
-    At its end those are removed that were made for it and that nothing was written to; all of them, if it was refused before it
-    learned anything.
+    At its end, empty folders made for the run are removed; all of them, if it was refused before it learned anything.
     """
-    own = _Run()
-    token = _run.set(own)
-    with own.held:
+    current = _Run()
+    token = _run.set(current)
+    with current.folders:
         try:
             yield
-            own.learns = True
+            current.learns = True
         finally:
             _run.reset(token)
 
 
 def keep() -> None:
-    """What this run writes is worth keeping, however it ends: it learns."""
-    if (own := _run.get()) is not None:
-        own.learns = True
+    """Keep the files of this run however it ends, since it learns."""
+    if (current := _run.get()) is not None:
+        current.learns = True
 
 
 def claim(parent: Path, name: str, new: bool) -> str:
     """Make a folder and hold it until the end of the run.
 
     Args:
-        parent: folder of the folder.
-        name: of it.
-        new: whether one that is there is taken, even if no run holds it.
+        parent: parent folder.
+        name: name of the folder.
+        new: whether an existing folder counts as taken, even if no run holds it.
 
     Returns:
-        The name, or with the smallest number after it that is free: ``invert``, ``invert_1``, ``invert_2``.
+        The name, or the name with the smallest free number: ``invert``, ``invert_1``, ``invert_2``.
 
     Raises:
-        UserError: where no folder can be made.
+        UserError: if no folder can be made.
     """
-    return next(found for found in _numbered(name) if _claimed(parent / found, new))
+    return next(candidate for candidate in _numbered(name) if _claimed(parent / candidate, new))
 
 
 def hold(folder: Path) -> None:
-    """Hold a folder that a run goes on in.
+    """Hold the folder of a run that is continued.
 
     Raises:
         UserError: if another run holds it.
@@ -85,39 +84,39 @@ def _numbered(name: str) -> Iterator[str]:
 
 
 def _claimed(folder: Path, new: bool) -> bool:
-    """Whether the folder is this run's from now on."""
-    own, lock = _run.get(), folder / LOCK
+    """Claim a folder for this run; return whether it was free."""
+    current, lock = _run.get(), folder / LOCK
     expect_writable_folder(folder)
     while True:
-        missing = [one for one in (folder, *folder.parents) if not one.exists()]
+        missing = [path for path in (folder, *folder.parents) if not path.exists()]
         try:
             try:
                 folder.mkdir(parents=True)
-            except FileExistsError:  # a folder, which was looked at above; whoever made it, this run did not and never removes it
+            except FileExistsError:  # a folder, as checked above, which this run never removes
                 if new:
                     return False
                 missing = []
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileNotFoundError:  # a run that ended has just removed a folder above it
+        except FileNotFoundError:  # a run that ended has just removed a parent folder
             continue
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
             return False
-        if not os.fstat(handle).st_nlink:  # of a run that has just ended
+        if not os.fstat(handle).st_nlink:  # removed by a run that has just ended
             os.close(handle)
             continue
-        if own is None:  # nobody says when the run ends
+        if current is None:  # outside of a run, nothing marks its end
             _end(_Run(learns=True), lock, handle, [])
         else:
-            own.held.callback(_end, own, lock, handle, missing)
+            current.folders.callback(_end, current, lock, handle, missing)
         return True
 
 
-def _end(own: _Run, lock: Path, handle: int, made: list[Path]) -> None:
-    """Let go of a folder. Of those that were made for it, the innermost first, the empty ones are removed."""
-    if lock.parent in made and not own.learns:
+def _end(ended: _Run, lock: Path, handle: int, made: list[Path]) -> None:
+    """Release a folder, and remove the empty folders that were made for it, innermost first."""
+    if lock.parent in made and not ended.learns:
         shutil.rmtree(lock.parent, ignore_errors=True)
     lock.unlink(missing_ok=True)
     os.close(handle)

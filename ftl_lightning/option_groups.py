@@ -1,4 +1,4 @@
-"""Options in groups, and the flat names under which results, checkpoints, models' records and the Python API know them."""
+"""Grouped options and their flat names in results, checkpoints, models' records and the Python API."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,23 +15,23 @@ else:
 
 
 def groups_of(places: Mapping[str, str]) -> list[str]:
-    """Names of the groups, each once.
+    """Unique names of the groups.
 
     Args:
-        places: of each flat name where its option is, ``'group.option'``.
+        places: grouped options ``'group.option'`` by flat name.
     """
     return list(dict.fromkeys(place.partition(".")[0] for place in places.values()))
 
 
 def flat(groups: Mapping[str, object], places: Mapping[str, str]) -> dict[str, Any]:
-    """The options of some groups by their flat names.
+    """Flatten groups to options by flat name.
 
     Args:
-        groups: by name.
-        places: of each flat name where its option is, ``'group.option'``.
+        groups: groups by name.
+        places: grouped options ``'group.option'`` by flat name.
 
     Raises:
-        UserError: for what is no group.
+        UserError: for an object that is not a group.
     """
     options = {}
     for name, place in places.items():
@@ -43,12 +43,12 @@ def flat(groups: Mapping[str, object], places: Mapping[str, str]) -> dict[str, A
 
 
 def replaced(settings: S, options: Mapping[str, Any], places: Mapping[str, str]) -> S:
-    """Settings of which some options are others.
+    """Copy of settings with other options.
 
     Args:
-        settings: whose fields are options or groups of such.
-        options: by flat names.
-        places: of each flat name of an option in a group where it is, ``'group.option'``.
+        settings: dataclass of options or groups of options.
+        options: new options by flat name.
+        places: grouped options ``'group.option'`` by flat name.
     """
     changes = {name: value for name, value in options.items() if name not in places}
     in_groups: dict[str, dict[str, Any]] = {}

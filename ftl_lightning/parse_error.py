@@ -1,4 +1,4 @@
-"""What jsonargparse tells of a mistake in many lines, in one, with the file and line that the mistaken key stands in."""
+"""One-line messages for jsonargparse errors, with file and line of the wrong key."""
 
 import re
 from collections.abc import Iterator, Sequence, Set
@@ -21,7 +21,7 @@ _NOISE = (
     "a class path (str)",
     "a dict with",
 )
-"""How lines begin that say nothing to whoever wrote the key."""
+"""Prefixes of lines that do not help the user."""
 _PLAIN = (
     (re.compile(r"""(?:Parser )?[Kk]ey "([\w.]+)": """), r"key '\1': "),
     (re.compile(r"Problem with given class_path '[\w.]*?(\w+)': "), r"\1: "),
@@ -41,22 +41,22 @@ _KEY = re.compile(r"""(?:[Kk]ey|[Oo]ption) ['"]([\w.]+)['"]""")
 
 
 def one_line(message: str, arguments: Sequence[str]) -> str:
-    """The mistake in one line.
+    """Message in one line.
 
     Args:
-        message: of jsonargparse.
-        arguments: of the command line, whose configuration files are searched for the key unless an option names it.
+        message: message of jsonargparse.
+        arguments: command line; its configuration files are searched for the key unless an option names it.
 
     Returns:
-        File and line, if the key is found in one of them; then what is wrong.
+        File and line, if a file has the key; then the mistake.
     """
     lines = [line.strip(" -") for line in message.splitlines()]
-    told = " ".join(line for line in lines if line and not line.startswith(_NOISE))
-    plain = told
+    relevant = " ".join(line for line in lines if line and not line.startswith(_NOISE))
+    plain = relevant
     for pattern, text in _PLAIN:
         plain = pattern.sub(text, plain)
     given = {key for option, _ in options(arguments) for key in option.split(".")}
-    keys = [key.split(".") for key in _KEY.findall(told)]
+    keys = [key.split(".") for key in _KEY.findall(relevant)]
     if keys and keys[-1][-1] not in given:
         verb = arguments[0]
         for path in (part for name in configurations(arguments) for part, _ in reversed(parts(name, verb))):
@@ -67,17 +67,17 @@ def one_line(message: str, arguments: Sequence[str]) -> str:
 
 
 def _line(path: Path, key: Sequence[str], out: Set[str]) -> int | None:
-    """The line of a key, of which at least the end is known, in a YAML file outside of some sections; ``None`` without one."""
+    """Line of a key, which may be a suffix, in a YAML file without the sections ``out``; ``None`` if it is missing."""
     try:
         root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except (OSError, ValueError, yaml.YAMLError):  # told where it is read
+    except (OSError, ValueError, yaml.YAMLError):  # reported where it is read
         return None
-    found = ((names, line) for names, line in _keys(root, ()) if names[0] not in out)
-    return next((line for names, line in found if names[-1] == key[-1] and set(key) <= set(names)), None)
+    matches = ((names, line) for names, line in _keys(root, ()) if names[0] not in out)
+    return next((line for names, line in matches if names[-1] == key[-1] and set(key) <= set(names)), None)
 
 
 def _keys(node: yaml.Node | None, above: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Every key with those above it, and its line from 1."""
+    """Every key with its parent keys, and its line from 1."""
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             names = (*above, str(key.value))

@@ -1,4 +1,4 @@
-"""The verb ``play``: its options, and what it does. Its imports are inside, so that it starts at once."""
+"""The verbs ``play`` and ``view``. Imports are local, so that the program starts at once."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,15 +17,15 @@ class PlayOptions:
     """Show behaviour five times on a page, see it learned, and mix it with other concepts.
 
     Attributes:
-        pretrained: the model that is opened first: the name of one that ships, or a folder.
-        demonstrations: file of demonstrations that are there at first.
+        pretrained: model to open first: the name of a shipped model, or a folder.
+        demonstrations: file of initial demonstrations.
         root: folder of your copy of recordings, for domains whose demonstrations do not ship.
-        static: folder to write a page to that needs no program, in place of serving one: the demonstrations, what is learned from
+        static: folder for a page that needs no program, in place of serving a page: the demonstrations, the concept learned from
             them, and samples for a grid of weights.
-        pairs: of concepts that such a page mixes, such as ["walk + jumping_jacks", "walk + run"]; empty for some.
-        host: address to listen at. With "0.0.0.0" a phone in the same network can open the page, and everybody else there who
-            knows its address.
-        port: of the address; 0 for 8765, or any other if another program has that.
+        pairs: pairs of concepts mixed on such a page, such as ["walk + jumping_jacks", "walk + run"]; empty for a default choice.
+        host: address to listen on. With "0.0.0.0" a phone in the same network can open the page, and so can everybody there who
+            knows the address.
+        port: port of the address; 0 for 8765, or any free port if that is in use.
         browser: open the page in a browser.
     """
 
@@ -60,15 +60,15 @@ def play(options: PlayOptions) -> None:
     def workspace(model: str) -> "Workspace":
         from ftl_lightning.play.workspace import Workspace
 
-        own = model == options.pretrained
-        found = Workspace(model, Path(options.root) if options.root and own else None)
-        if options.demonstrations and own:
-            found.upload(options.demonstrations, Path(options.demonstrations).read_bytes())
-        return found
+        initial = model == options.pretrained
+        opened = Workspace(model, Path(options.root) if options.root and initial else None)
+        if options.demonstrations and initial:
+            opened.upload(options.demonstrations, Path(options.demonstrations).read_bytes())
+        return opened
 
     if options.static:
         path = Path(options.static) / f"{Path(options.pretrained).name}.html"
-        pairs = [(one, other) for one, other in (pair.split(" + ") for pair in options.pairs)]
+        pairs = [(first, second) for first, second in (pair.split(" + ") for pair in options.pairs)]
         _write_static(workspace(options.pretrained), path, pairs)
         return
     desk = Desk(list(dict.fromkeys((options.pretrained, *shipped_models()))), workspace)
@@ -83,7 +83,7 @@ def _write_static(workspace: "Workspace", path: Path, pairs: "list[tuple[str, st
     from ftl_lightning.progress import bar
 
     if workspace.work()["demonstrations"]:
-        workspace.learn(Learn(workspace.suggestion), lambda told: None, lambda: False)
+        workspace.learn(Learn(workspace.suggestion), lambda progress: None, lambda: False)
     with bar(f"{path.name}: mixes", (len(pairs) or PAIRS) * len(WEIGHTS) ** 2) as advance:
         size = write_offline(workspace, path, pairs, lambda: advance(1, ""))
     say(f"{path}: {size / 1e6:.1f} MB")
@@ -94,11 +94,11 @@ class ViewOptions:
     """Watch a file on a page: demonstrations, samples, a learned concept, or results.
 
     Attributes:
-        file: of demonstrations or samples (.npz, .safetensors, a Minari or LeRobot data set), of a learned concept, or of results
-            (.csv, or a folder of such).
-        pretrained: model of a learned concept; empty to look for it in pretrained and logs.
-        host: address to listen at, see play.
-        port: of the address, see play.
+        file: demonstrations or samples (.npz, .safetensors, a Minari or LeRobot data set), a learned concept, or results (.csv, or
+            a folder of such files).
+        pretrained: model of a learned concept; empty to search for it in pretrained and logs.
+        host: address to listen on, see play.
+        port: port of the address, see play.
         browser: open the page in a browser.
     """
 

@@ -1,7 +1,7 @@
-"""What is printed: text without what moves a terminal's cursor, changes its colours or turns writing round.
+"""Print text without characters that move a terminal's cursor, change its colours or reverse writing.
 
-Names come from files, which others may have written. Everything that is printed goes through :func:`say`, everything that is put
-into one line of a table, a figure or a message through :func:`line`.
+Names come from files, which others may have written. All printed text goes through :func:`say`, all text in a line of a table, a
+figure or a message through :func:`line`.
 """
 
 import io
@@ -11,12 +11,12 @@ from unicodedata import category
 
 
 def plain(text: str) -> str:
-    """A text of any number of lines with a question mark for everything that is not printable, and wide spaces as plain ones."""
-    return "".join(one if one.isprintable() or one in "\n\t" else " " if category(one) == "Zs" else "?" for one in text)
+    """Replace unprintable characters by question marks, but for line breaks and tabs, and wide spaces by plain ones."""
+    return "".join(char if char.isprintable() or char in "\n\t" else " " if category(char) == "Zs" else "?" for char in text)
 
 
 def line(text: str) -> str:
-    """The same in one line, with single spaces."""
+    """:func:`plain` in a single line, with single spaces."""
     return plain(" ".join(text.split()))
 
 
@@ -29,22 +29,22 @@ _VOICE = _Voice()
 
 
 def silence() -> None:
-    """Print nothing from now on: of several processes of one run the first one speaks."""
+    """Print nothing from now on: of several processes of a run only the first prints."""
     _VOICE.silent = True
 
 
 def say(*parts: object, error: bool = False) -> None:
-    """Print, as :func:`plain` has it, at once.
+    """Print a text by :func:`plain`, at once.
 
     Args:
-        parts: printed with a space between two of them.
-        error: whether it goes to standard error.
+        parts: values, separated by spaces.
+        error: whether to print to standard error.
     """
     if not _VOICE.silent:
         print(*(plain(str(part)) for part in parts), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def any_terminal() -> None:
-    """Let standard output take every letter: one that its encoding does not have, such as ± in ASCII, becomes a question mark."""
+    """Let standard output replace characters that its encoding lacks, such as ± in ASCII, by question marks."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # not a notebook's
         sys.stdout.reconfigure(errors="replace")

@@ -1,4 +1,4 @@
-"""Several processes of one run: the first alone speaks, and all end when one of them does, with one line that says why."""
+"""Several processes of one run: only the first prints, and all end when any of them fails, with a one-line reason."""
 
 import os
 import signal
@@ -23,18 +23,18 @@ from ftl_lightning.printing import line, say, silence
 from ftl_lightning.tensor_file import write_text
 
 NOTES = "FTL_LIGHTNING_NOTES"
-"""Variable of the environment of processes that the first one starts: the folder in which they write why they end."""
+"""Environment variable of started processes: the folder to which they write why they end."""
 LOOK = 0.3
-"""Seconds between two looks at whether the others are there."""
+"""Seconds between checks whether the other processes still run."""
 PATIENCE = 5.0
-"""Seconds in which a process that lost another one notices it by itself."""
+"""Seconds in which a process notices by itself that another process ended."""
 _LOST = ("gloo", "NCCL", "Connection closed", "Connection reset", "Broken pipe", "TCPStore", "store->get")
-"""What torch says to a process that waits for another one that is gone."""
+"""Fragments of torch's messages to a process that waits for a process that ended."""
 
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Within the block, a process that another one started is silent, writes its mistake down for it, and ends with it."""
+    """Within the block, silence a process that another process started, write its error down, and end it with its parent."""
     if NOTES not in os.environ:
         yield
         return
@@ -44,11 +44,11 @@ def one_voice() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        told = mistake_behind(error) or mistake_of_machine(error)
-        if told is None and not _is_loss(error):
+        mistake = mistake_behind(error) or mistake_of_machine(error)
+        if mistake is None and not _is_loss(error):
             raise
-        if told is not None:
-            write_text(Path(os.environ[NOTES]) / str(os.getpid()), line(str(told)))
+        if mistake is not None:
+            write_text(Path(os.environ[NOTES]) / str(os.getpid()), line(str(mistake)))
         raise SystemExit(2) from None
 
 
@@ -63,21 +63,21 @@ def _is_loss(error: BaseException) -> bool:
 
 
 def _grouped(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """What a function returns; after it there is no group, and so nothing for which others would have to be there."""
-    found = function(*arguments, **options)
+    """Result of a function; the process group is destroyed, so nothing later can wait for other processes."""
+    result = function(*arguments, **options)
     if distributed.is_initialized():
         distributed.destroy_process_group()
-    return found
+    return result
 
 
 class Launcher(_SubprocessScriptLauncher):
-    """Starts the other processes. Lightning's own kills the first one within seconds of another one's end, without a word."""
+    """Starts the other processes. Lightning's launcher kills the first process seconds after another ends, without a message."""
 
     def launch(self, function: Callable[..., Any], *args: Any, trainer: "pl.Trainer | None" = None, **kwargs: Any) -> Any:
         """Run a function in all processes.
 
         Raises:
-            UserError: in the first process, if another one ends before its time.
+            UserError: in the first process, if another process ends early.
         """
         self.cluster_environment.validate_settings(num_devices=self.num_processes, num_nodes=self.num_nodes)
         if self.cluster_environment.creates_processes_externally:
@@ -91,44 +91,44 @@ class Launcher(_SubprocessScriptLauncher):
             ended = threading.Event()
             threading.Thread(target=self._watch, args=(ended, Path(notes)), daemon=True).start()
             try:
-                found = _grouped(function, *args, **kwargs)
+                result = _grouped(function, *args, **kwargs)
                 self._wait()
             except RuntimeError as error:
                 if not _is_loss(error):
                     raise
                 self._wait()
-                raise UserError(self._told(Path(notes))) from error
+                raise UserError(self._reason(Path(notes))) from error
             finally:
                 ended.set()
                 self.kill(signal.SIGKILL)
-            return found
+            return result
 
     def _wait(self) -> None:
-        """Wait for the ends of the others, which are near."""
+        """Wait for the other processes, which are about to end."""
         end = time.monotonic() + PATIENCE
-        while any(one.poll() is None for one in self.procs) and time.monotonic() < end:
+        while any(process.poll() is None for process in self.procs) and time.monotonic() < end:
             time.sleep(0.02)
 
     def _watch(self, ended: threading.Event, notes: Path) -> None:
-        """End this process where it does not notice by itself that another one is gone, such as within NCCL."""
+        """End this process if it does not notice by itself that another process ended, such as within NCCL."""
         while not ended.wait(LOOK):
-            if any(one.poll() for one in self.procs):
+            if any(process.poll() for process in self.procs):
                 if not ended.wait(PATIENCE):
                     self._end(notes)
                 return
 
     def _end(self, notes: Path) -> NoReturn:
-        say("error:", self._told(notes), error=True)
+        say("error:", self._reason(notes), error=True)
         self.kill(signal.SIGKILL)
         os._exit(2)
 
-    def _told(self, notes: Path) -> str:
-        """Why the others ended, in one line."""
+    def _reason(self, notes: Path) -> str:
+        """Why the other processes ended, in one line."""
         if written := sorted(path for path in notes.iterdir() if path.name.isdecimal()):
             return written[0].read_text("utf-8")
-        rank, gone = next(((rank, one) for rank, one in enumerate(self.procs, 1) if one.poll()), (0, None))
-        told = "the connection to one was lost" if gone is None else f"process {rank} ended {_how(gone)}"
-        return f"trainer.devices: expected {self.num_processes} processes to the end, {told}; go on with --ckpt_path last"
+        rank, gone = next(((rank, process) for rank, process in enumerate(self.procs, 1) if process.poll()), (0, None))
+        reason = "the connection to one was lost" if gone is None else f"process {rank} ended {_how(gone)}"
+        return f"trainer.devices: expected {self.num_processes} processes to the end, {reason}; go on with --ckpt_path last"
 
 
 def _how(process: "subprocess.Popen[bytes]") -> str:
@@ -137,28 +137,28 @@ def _how(process: "subprocess.Popen[bytes]") -> str:
 
 
 def take_over(trainer: pl.Trainer) -> None:
-    """Let a trainer of several processes start them by a :class:`Launcher`, and exchange gradients where they lie."""
+    """Let a trainer start its processes with a :class:`Launcher`, and exchange gradients in place."""
     launcher = trainer.strategy.launcher
     if type(launcher) is _SubprocessScriptLauncher:
-        own = Launcher(launcher.cluster_environment, launcher.num_processes, launcher.num_nodes)
-        trainer.strategy._launcher = own
-    if isinstance(trainer.strategy, DDPStrategy):  # gradients are not copied before and after they are exchanged
+        replacement = Launcher(launcher.cluster_environment, launcher.num_processes, launcher.num_nodes)
+        trainer.strategy._launcher = replacement
+    if isinstance(trainer.strategy, DDPStrategy):  # avoids copies of gradients before and after the exchange
         trainer.strategy._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
 
 
 def expect_alone(trainer: pl.Trainer, verb: str) -> None:
-    """Refuse several processes where one does the work.
+    """Refuse several processes for a verb that runs in one process.
 
     Raises:
         UserError: naming the verb.
     """
-    if (found := trainer.num_devices * trainer.num_nodes) > 1:
+    if (processes := trainer.num_devices * trainer.num_nodes) > 1:
         instead = "use trainer.processes" if verb == "invert" else "`fit` alone runs on several"
-        raise UserError(f"trainer.devices: expected 1 for {verb}, found {found}; {instead}")
+        raise UserError(f"trainer.devices: expected 1 for {verb}, found {processes}; {instead}")
 
 
 def expect_exact(trainer: pl.Trainer) -> None:
-    """Refuse several processes that are not started one by one, each with all weights.
+    """Refuse several processes unless each is started separately and holds all weights.
 
     Raises:
         UserError: naming the strategy.

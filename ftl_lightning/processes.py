@@ -1,7 +1,7 @@
-"""One batch over several processes: each has its rows, and of all that is random, the rows' part of what one process would draw.
+"""A batch split over several processes, with the random numbers of a single process.
 
-Process r of n has rows r, r + n, r + 2n and so on, so that it does not matter whether rows were repeated before. Outside of
-:func:`rows_of` there is one process.
+Process r of n has rows r, r + n, r + 2n and so on, so that earlier repetition of rows does not matter. Outside of :func:`rows_of`
+there is a single process.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,23 +14,23 @@ from torch.nn import functional
 
 @dataclass
 class _Rows:
-    """Whose rows are computed: of process ``rank`` of ``world``."""
+    """Rows of process ``rank`` of ``world``."""
 
     rank: int = 0
     world: int = 1
 
 
 _ROWS = _Rows()
-"""Not a context variable, which networks that are compiled cannot read."""
+"""Not a context variable, which compiled networks cannot read."""
 
 
 @contextmanager
 def rows_of(rank: int, world: int) -> Iterator[None]:
-    """Within the block, what is drawn and averaged is that of the batch of all processes.
+    """Draw and average over the batch of all processes within the block.
 
     Args:
-        rank: of this process.
-        world: processes.
+        rank: rank of this process.
+        world: number of processes.
     """
     before = _ROWS.rank, _ROWS.world
     _ROWS.rank, _ROWS.world = rank, world
@@ -41,11 +41,11 @@ def rows_of(rank: int, world: int) -> Iterator[None]:
 
 
 def drawn(count: int, draw: Callable[[int], Tensor]) -> Tensor:
-    """Random numbers of some rows of a batch ``(count, ...)``.
+    """Random numbers of this process's rows ``(count, ...)``.
 
     Args:
-        count: of this process's rows.
-        draw: called with the number of all processes' rows; what it returns has as many.
+        count: number of this process's rows.
+        draw: called with the total number of rows; returns as many.
     """
     if _ROWS.world == 1:
         return draw(count)
@@ -53,7 +53,7 @@ def drawn(count: int, draw: Callable[[int], Tensor]) -> Tensor:
 
 
 def mean(value: Tensor) -> Tensor:
-    """The mean over all processes of each one's number, without a gradient; with one process the number itself."""
+    """Mean over all processes, without a gradient; with a single process the value itself."""
     if _ROWS.world == 1:
         return value
     total = value.detach().clone()
@@ -62,10 +62,10 @@ def mean(value: Tensor) -> Tensor:
 
 
 class Dropout(nn.Dropout):
-    """Dropout whose mask is that of the batch of all processes."""
+    """Dropout with the mask of the batch of all processes."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """``(batch, ...)`` to the same shape."""
+        """Apply dropout to ``(batch, ...)``."""
         if _ROWS.world == 1 or not self.training:
             return super().forward(input)
         return input * drawn(len(input), lambda count: functional.dropout(input.new_ones(count, *input.shape[1:]), self.p))

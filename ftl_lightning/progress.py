@@ -1,4 +1,4 @@
-"""Progress of what takes long: one bar that moves in a terminal, a few plain lines elsewhere. Both go to standard error."""
+"""Progress of long work: one moving bar in a terminal, a few plain lines elsewhere. Both go to standard error."""
 
 import sys
 import time
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 LINES = 10
-"""Lines from start to end where there is no terminal."""
+"""Number of lines of a bar without a terminal."""
 
 
 class Advance(Protocol):
-    """Tells a bar that work was done."""
+    """Move a bar."""
 
     def __call__(self, steps: int = 1, told: str = "") -> None:
-        """Move on by some steps; ``told`` stands beside the bar, such as a loss, and stays until it is told anew."""
+        """Move on by some steps; the text ``told`` beside the bar, such as a loss, stays until it is replaced."""
 
 
 @dataclass
 class _Screen:
-    """What all bars share: in a terminal one display, whose last bar is the innermost; and how many bars there are."""
+    """State of all bars: the number of open bars, and in a terminal their display, whose last bar is the innermost."""
 
     depth: int = 0
     display: "Progress | None" = None
@@ -36,39 +36,39 @@ _SCREEN = _Screen()
 
 @contextmanager
 def bar(title: str, total: int | None, done: int = 0, lines: bool = True) -> Iterator[Advance]:
-    """Show how far something is, alone or inside of another bar, which goes on moving.
+    """Show the progress of work, alone or inside another bar, which keeps moving.
 
-    In a terminal the bar disappears at the end, and an outermost one leaves a line. Elsewhere an outermost bar writes lines: at
-    the start, after each tenth, and at the end; what runs inside of it writes none.
+    In a terminal the bar disappears at the end, and an outermost bar leaves a line. Elsewhere an outermost bar writes lines: at the
+    start, after each tenth, and at the end; inner bars write none.
 
     Args:
-        title: what is done.
-        total: steps that it takes; ``None`` where nobody knows.
-        done: steps that were done before.
-        lines: whether there are lines; without them the bar is seen in a terminal alone.
+        title: name of the work.
+        total: number of steps; ``None`` if unknown.
+        done: number of steps done before.
+        lines: whether to write lines; otherwise the bar is visible only in a terminal.
 
     Yields:
-        What to call after each step.
+        Function to call after each step.
     """
-    own = _Bar(plain(title), total, done, lines and _SCREEN.depth == 0)
+    current = _Bar(plain(title), total, done, lines and _SCREEN.depth == 0)
     opened = _SCREEN.display is None and sys.stderr.isatty()
     if opened:
         _SCREEN.display = _display()
         _SCREEN.display.start()
     _SCREEN.depth += 1
-    own.show()
+    current.show()
     ended = False
     try:
-        yield own.advance
+        yield current.advance
         ended = True
     finally:
         _SCREEN.depth -= 1
-        own.hide()
+        current.hide()
         if opened and _SCREEN.display is not None:
             _SCREEN.display.stop()
             _SCREEN.display = None
         if ended:
-            own.end()
+            current.end()
 
 
 def _display() -> "Progress":
@@ -82,22 +82,22 @@ def _display() -> "Progress":
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[told]}", markup=False),
-        console=Console(stderr=True, soft_wrap=True),  # paths that are printed stay in one line
+        console=Console(stderr=True, soft_wrap=True),  # printed paths stay in one line
         transient=True,
-        # Standard output may be a file, where what is printed has to go, not to the terminal.
+        # If standard output is a file, printed text must go there, not to the terminal.
         redirect_stdout=sys.stdout.isatty(),
     )
 
 
 @dataclass
 class _Bar:
-    """One bar, or the lines in its place."""
+    """A bar, or the lines in its place."""
 
     title: str
     total: int | None
     done: int
     lines: bool
-    told: str = ""
+    note: str = ""
     start: float = field(default_factory=time.monotonic)
     first: int = 0
     task: int | None = None
@@ -111,11 +111,11 @@ class _Bar:
 
     def advance(self, steps: int = 1, told: str = "") -> None:
         before, self.done = self.done, self.done + steps
-        self.told = plain(told) or self.told
+        self.note = plain(told) or self.note
         if _SCREEN.display is not None and self.task is not None:
-            _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), told=self.told)  # type: ignore[arg-type]
+            _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), told=self.note)  # type: ignore[arg-type]
         elif self.lines and self.total and LINES * before // self.total < LINES * self.done // self.total < LINES:
-            self._write(f"{self.title}: {self._steps()}, {self._time()}{self._told()}")
+            self._write(f"{self.title}: {self._steps()}, {self._time()}{self._suffix()}")
 
     def hide(self) -> None:
         if _SCREEN.display is not None and self.task is not None:
@@ -124,7 +124,7 @@ class _Bar:
     def end(self) -> None:
         if self.lines:
             steps = f"{self.done - self.first} steps, " if self.total else ""
-            self._write(f"{self.title}: {steps}{self._time()}{self._told()}")
+            self._write(f"{self.title}: {steps}{self._time()}{self._suffix()}")
 
     def _steps(self) -> str:
         return f"{self.done}/{self.total}" if self.total else ""
@@ -133,8 +133,8 @@ class _Bar:
         seconds = round(time.monotonic() - self.start)
         return f"{seconds // 60}:{seconds % 60:02d}"
 
-    def _told(self) -> str:
-        return f", {self.told}" if self.told else ""
+    def _suffix(self) -> str:
+        return f", {self.note}" if self.note else ""
 
     @staticmethod
     def _write(line: str) -> None:

@@ -1,32 +1,32 @@
-"""Numbers that a user gives, in their ranges."""
+"""Range checks of user-given numbers."""
 
 import math
 
 from ftl_lightning.errors import UserError, shown
 
 LARGEST = 1_000_000
-"""Of a whole number that a user gives: a size or a number of things."""
+"""Maximum of a user-given size or count."""
 MOST_TOGETHER = 100_000
-"""Things that a network works on in one batch, or that are learned together."""
+"""Maximum size of a batch, or number of runs learned together."""
 LARGEST_STEP = 10**9
-"""Of the steps of a run."""
+"""Maximum number of steps of a run."""
 LARGEST_RATE = 1e30
-"""Of a rate of learning: float32 ends soon after."""
+"""Maximum learning rate, near the limit of float32."""
 LARGEST_FACTOR = 1e6
-"""Of weights, temperatures and powers: more says no more, and float32 runs out of digits."""
+"""Maximum of weights, temperatures and powers; larger values exhaust the precision of float32."""
 
 
 def expect_range(key: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
-    """Refuse a number that is out of its range or not finite.
+    """Refuse a number that is out of range or not finite.
 
     Args:
-        key: option that names it.
-        value: what was found.
-        least: the smallest number of the range.
-        most: the largest.
+        key: name of the option.
+        value: given value.
+        least: minimum.
+        most: maximum.
 
     Raises:
-        UserError: naming key, range and what was found.
+        UserError: with key, range and value.
     """
     if -math.inf < value < math.inf and least <= value <= most:
         return
@@ -38,12 +38,12 @@ def expect_range(key: str, value: float, least: float = -math.inf, most: float =
 
 
 def expect_count(key: str, value: int, least: int, most: int = LARGEST) -> None:
-    """The same of a number of things, whose largest is told to those alone who ask for more."""
+    """Check a count; report the upper bound only when it is exceeded."""
     expect_range(key, value, least)
     expect_range(key, value, least, most)
 
 
 def expect_factor(key: str, value: float, least: float = -LARGEST_FACTOR, most: float = LARGEST_FACTOR) -> None:
-    """The same of a weight, a temperature or another factor."""
+    """Check a weight, a temperature or another factor."""
     expect_range(key, value, -math.inf if least == -LARGEST_FACTOR else least)
     expect_range(key, value, least, most)

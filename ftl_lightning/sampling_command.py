@@ -1,4 +1,4 @@
-"""The verb ``sample``: its options, and what it does. Its imports are inside, so that it starts at once."""
+"""The verb ``sample``, with local imports for a fast start."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.domain import Domain
 
 MOST_SAMPLES, MOST_DRAWN = 10_000, 1000
-"""Samples of one command, which are made in one batch, and those that one figure shows."""
+"""Maximum number of samples of a command, which are one batch, and of samples in a figure."""
 
 
 @dataclass(frozen=True)
@@ -20,30 +20,29 @@ class SampleOptions:
     """Generate behaviour from a learned concept, composed with training concepts.
 
     Attributes:
-        pretrained: folder of the pretrained model, or the name of one that ships.
+        pretrained: folder of the pretrained model, or the name of a shipped model.
         concept: file of a learned concept; empty for training concepts alone.
-        compose: what is composed with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9". Training
-            concepts, or learned ones, whose own weights are multiplied, by their files or by their names in what the verb concepts
-            lists. A weight may be left out and is 1 then. With "walk@legs:1" a concept is composed on some groups of a state's
-            columns alone, in domains that name such.
-        count: samples.
-        seed: of the samples.
-        sampler: see ftl_lightning.diffusion.samplers; empty for the one that the settings name.
-        steps: of the sampler; 0 for what the settings name.
-        temperature: the paper's alpha; lower is less diverse and more accurate; null for what the settings
-            name.
+        compose: concepts to compose with it, with guidance weights: "circle right of square:1.2 + other.safetensors:0.9".
+            Training concepts, or learned concepts, whose weights are multiplied, by file or by name in the list of the verb
+            concepts. The default weight is 1. "walk@legs:1" restricts a concept to groups of a state's columns, in domains with
+            groups.
+        count: number of samples.
+        seed: seed of the samples.
+        sampler: see ftl_lightning.diffusion.samplers; empty for that of the settings.
+        steps: sampler steps; 0 for those of the settings.
+        temperature: the paper's alpha; lower is less diverse and more accurate; null for that of the settings.
         goal: judge the samples by this task and print their accuracy. In domains with initial states, new ones of this task are
-            drawn from the seed; without a goal, those of the task that the concept was learned from, or of the first composed text.
-        initial: demonstrations file whose initial states are used instead; one sample of each.
-        out: demonstrations file to write, as generate does.
+            drawn from the seed; without a goal, those of the concept's task, or of the first composed text.
+        initial: demonstrations file with initial states to use instead; one sample for each.
+        out: demonstrations file to write, as for generate.
         figure: picture to write, .png or .svg.
-        execute: also execute the concept in closed loop from the same initial states, in domains that can, and say how the
-            episodes ended.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1; 0 for what the settings name.
-        settings: configuration file of invert that says how to sample and how often to plan anew; empty for that of the domain.
-        animation: .gif to write of the first executed episode, or, where plans are motion, of the first plan.
-        export: file to write each sample to for other programs, in domains that can: .bvh of human motion, for Blender. Of several
-            samples each has its own file, with its number: "walk.bvh" becomes walk_0.bvh, walk_1.bvh and so on.
+        execute: also execute the concept in closed loop from the same initial states, in domains with an environment, and print
+            outcomes.
+        replan: steps between plans; 1 in the paper; 0 for that of the settings.
+        settings: configuration file of invert with settings of sampling and replanning; empty for that of the domain.
+        animation: .gif to write of the first executed episode, or of the first plan, if plans are motion.
+        export: file to write each sample to for other programs, in domains with exports: .bvh of human motion, for Blender. Files
+            of several samples are numbered: "walk.bvh" becomes walk_0.bvh, walk_1.bvh and so on.
     """
 
     pretrained: str
@@ -77,7 +76,7 @@ class SampleOptions:
 
 
 def sample(options: SampleOptions) -> None:
-    """Generate behaviour as the options say; write, judge, draw and execute it."""
+    """Generate behaviour; write, judge, draw and execute it."""
     from dataclasses import replace
 
     from ftl_lightning.evaluation.animation import captioned, gif
@@ -86,17 +85,17 @@ def sample(options: SampleOptions) -> None:
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     text = " + ".join(part for part in (options.compose, options.concept) if part)
-    known = model.compose(text) if text else None  # what is unknown is told before what is missing
+    known = model.compose(text) if text else None  # unknown concepts are reported before missing ones
     _check_sample(options, model.domain)
     composition = model.compose(text) if known is None else known
     goal, film = options.goal, model.domain.show.film
     starts = _sample_starts(options, model.domain)
     exported = _export_files(options.export, options.count if starts is None else len(starts))
     plans = model.sample(composition, options.count, starts, seed=options.seed, **_sampling(options))
-    told = {**plans.provenance, "concept": options.concept, "compose": options.compose}
-    plans = replace(plans, concepts=(goal,) * len(plans), provenance=told)
+    provenance = {**plans.provenance, "concept": options.concept, "compose": options.compose}
+    plans = replace(plans, concepts=(goal,) * len(plans), provenance=provenance)
     plans.save(options.out)
-    # Where a domain has no configuration of its own, what invert was told must be told again.
+    # Without a configuration of the domain, the settings of invert must be given again.
     say(f"{options.out}: {len(plans)} samples; settings of {model.settings}")
     for name, value in (model.evaluate(plans, goal) if goal and model.domain.metrics else {}).items():
         say(f"{name} on '{goal}': {value:.2f}")
@@ -122,14 +121,14 @@ def sample(options: SampleOptions) -> None:
 
 
 def _sampling(options: SampleOptions) -> dict[str, Any]:
-    """What differs from the configured way of sampling."""
+    """Changes to the configured sampling."""
     changes: dict[str, Any] = {"sampler": options.sampler} if options.sampler else {}
     changes |= {"steps": options.steps} if options.steps else {}
     return changes | ({} if options.temperature is None else {"temperature": options.temperature})
 
 
 def _check_sample(options: SampleOptions, domain: "Domain") -> None:
-    """Refuse what a domain cannot do, before anything is generated."""
+    """Refuse options that the domain does not support, before sampling."""
     from ftl_lightning.errors import UserError
 
     if options.goal:
@@ -138,8 +137,8 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
         raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
     if options.export and Path(options.export).suffix not in domain.show.exports:
         known = " or ".join(domain.show.exports)
-        told = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"
-        raise UserError(f"export: expected {told}, found {options.export!r}")
+        message = f"a name that ends in {known}" if known else f"none, as nothing else reads plans of {domain.name}"
+        raise UserError(f"export: expected {message}, found {options.export!r}")
     if options.execute and domain.closed_loop is None:
         raise UserError(f"execute: expected a domain with an environment, found {domain.name}, which has none")
     if options.execute and domain.closed_loop is not None:
@@ -153,10 +152,10 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
 
 
 def _export_files(export: str, count: int) -> list[Path]:
-    """One for each sample, numbered where there are several.
+    """A file for each sample, numbered if there are several.
 
     Raises:
-        UserError: before anything is generated, where one of them is there and no file.
+        UserError: before sampling, if an existing path is not a file.
     """
     from ftl_lightning.targets import expect_file
 
@@ -164,13 +163,13 @@ def _export_files(export: str, count: int) -> list[Path]:
         return []
     path, digits = Path(export), len(str(count - 1))
     files = [path.with_stem(f"{path.stem}_{number:0{digits}}") for number in range(count)] if count > 1 else [path]
-    for one in files:
-        expect_file(one, "export")
+    for file in files:
+        expect_file(file, "export")
     return files
 
 
 def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates | None":
-    """Initial states of a file's demonstrations or of the goal; ``None`` where behaviour has none."""
+    """Initial states of a file's demonstrations or of the goal; ``None`` without observations."""
     if options.initial:
         from ftl_lightning.domains.from_file import read_demonstrations
 
@@ -180,7 +179,7 @@ def _sample_starts(options: SampleOptions, domain: "Domain") -> "InitialStates |
 
 
 def _start_task(options: SampleOptions, domain: "Domain") -> str:
-    """The task whose initial states are drawn; empty where nothing names one that the domain reads."""
+    """Task of the initial states; empty without a task that the domain can read."""
     from ftl_lightning.composition_text import parse_composition
     from ftl_lightning.concepts.concept import Concept
 

@@ -1,4 +1,4 @@
-"""What a file or a configuration says, held against the annotations of what is made of it: types and ranges in one place."""
+"""Check contents of files and configurations against the annotations of the objects built from them: types and ranges."""
 
 import collections
 import collections.abc
@@ -17,9 +17,9 @@ from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.ranges import LARGEST
 
 FLOAT32 = 3.4e38
-"""Of a number with a point."""
+"""Maximum magnitude of a float."""
 DEEPEST = 40
-"""Lists and mappings within one another."""
+"""Maximum nesting of lists and mappings."""
 _WORDS: Mapping[object, str] = {str: "a text", bool: "true or false", float: "a finite number (float32)"}
 _LISTS = (tuple, list, collections.abc.Sequence)
 
@@ -27,10 +27,10 @@ T = TypeVar("T")
 
 
 def read_json(path: Path, kind: str = "JSON") -> Any:
-    """What a JSON file says.
+    """Read a JSON file.
 
     Raises:
-        UserError: naming it, as :func:`parse_json`; also where there is none, or a device, a pipe, or a file that is too long.
+        UserError: naming the file, as :func:`parse_json`; also if it is missing, too long, a device or a pipe.
         OSError: if it cannot be read.
     """
     expect_readable(path, kind.removeprefix("a ").removesuffix(" file"), MOST_TEXT)
@@ -39,34 +39,34 @@ def read_json(path: Path, kind: str = "JSON") -> Any:
 
 
 def parse_json(text: str | bytes, kind: str = "JSON") -> Any:
-    """What a JSON text says.
+    """Parse a JSON text.
 
     Args:
-        text: of it.
-        kind: what it is expected to be, for messages.
+        text: the text.
+        kind: expected kind, for messages.
 
     Raises:
-        UserError: for damaged text, keys that stand there twice, numbers that are not finite, texts that are no Unicode, or lists
-            and mappings deeper than :data:`DEEPEST`.
+        UserError: for damaged text, repeated keys, numbers that are not finite, invalid Unicode, or nesting deeper than
+            :data:`DEEPEST`.
     """
     try:
-        found = json.loads(text.decode() if isinstance(text, bytes) else text, object_pairs_hook=_once)
+        content = json.loads(text.decode() if isinstance(text, bytes) else text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise UserError(f"expected {kind}, found damaged text or too deep a nesting ({short(str(error))})") from error
-    _expect_plain(found, DEEPEST)
-    return found
+    _expect_plain(content, DEEPEST)
+    return content
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         ((twice, _),) = collections.Counter(key for key, _ in pairs).most_common(1)
         raise UserError(f"key {short(twice)!r}: expected it once, found it several times")
-    return found
+    return mapping
 
 
 def _expect_plain(value: object, left: int) -> None:
-    """Refuse what JSON can say and no other program reads."""
+    """Refuse JSON that other programs cannot read."""
     if isinstance(value, str):
         try:
             value.encode()
@@ -77,20 +77,20 @@ def _expect_plain(value: object, left: int) -> None:
     elif isinstance(value, dict | list):
         if not left:
             raise UserError(f"expected lists and mappings at most {DEEPEST} deep, found deeper ones")
-        for one in (*value, *value.values()) if isinstance(value, dict) else value:
-            _expect_plain(one, left - 1)
+        for item in (*value, *value.values()) if isinstance(value, dict) else value:
+            _expect_plain(item, left - 1)
 
 
 def from_mapping(kind: Callable[..., T], content: object, key: str, *given: object) -> T:
-    """Call a class with arguments that a file or configuration names, each of the type that the class says.
+    """Call a class with named arguments of a file or configuration, checked against its annotations.
 
-    Whole numbers are from 0 to :data:`LARGEST`; narrower ranges are the class's own matter.
+    Whole numbers are from 0 to :data:`LARGEST`; the class checks narrower ranges.
 
     Args:
-        kind: a dataclass, or a class whose ``__init__`` is annotated.
-        content: the arguments by name.
-        key: where they stand, for messages; empty for the top.
-        given: arguments before them, which no file names.
+        kind: a dataclass, or a class with an annotated ``__init__``.
+        content: arguments by name.
+        key: location of the arguments, for messages; empty for the top.
+        given: leading arguments, which no file names.
 
     Raises:
         UserError: naming the key of an argument that is missing, unknown or of another type.
@@ -110,7 +110,7 @@ def from_mapping(kind: Callable[..., T], content: object, key: str, *given: obje
 
 @functools.cache
 def _arguments(kind: Callable[..., Any]) -> tuple[dict[str, Any], frozenset[str]]:
-    """The arguments of a class with their annotations, and those that it cannot do without."""
+    """Annotations of a class's arguments, and the names of required arguments."""
     hints = get_type_hints(kind if dataclasses.is_dataclass(kind) else kind.__init__)
     parameters = inspect.signature(kind).parameters
     needed = (name for name, parameter in parameters.items() if parameter.default is inspect.Parameter.empty)
@@ -118,7 +118,7 @@ def _arguments(kind: Callable[..., Any]) -> tuple[dict[str, Any], frozenset[str]
 
 
 def expect_type(value: Any, kind: Any, key: str) -> Any:
-    """A value that JSON or YAML gave, as the annotation has it: lists become tuples, mappings dataclasses.
+    """Convert a value of JSON or YAML to its annotation: lists to tuples, mappings to dataclasses.
 
     Raises:
         UserError: naming the key, for a value of another type.
@@ -129,23 +129,23 @@ def expect_type(value: Any, kind: Any, key: str) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        for one in (one for one in arguments if one is not type(None)):
+        for option in (option for option in arguments if option is not type(None)):
             try:
-                return expect_type(value, one, key)
+                return expect_type(value, option, key)
             except UserError as error:
                 mistake = error
         raise mistake
     if origin is Literal:
-        if not any(type(value) is type(one) and value == one for one in arguments):
+        if not any(type(value) is type(option) and value == option for option in arguments):
             raise _mistake(key, f"one of {', '.join(map(repr, arguments))}", value)
     elif origin in (dict, collections.abc.Mapping):
         if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
             raise _mistake(key, "a mapping", value)
-        return {name: expect_type(one, arguments[1], _joined(key, name)) for name, one in value.items()}
+        return {name: expect_type(item, arguments[1], _joined(key, name)) for name, item in value.items()}
     elif origin in _LISTS:
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise _mistake(key, "a list", value)
-        every = (expect_type(one, arguments[0], f"{key}[{index}]") for index, one in enumerate(value))
+        every = (expect_type(item, arguments[0], f"{key}[{index}]") for index, item in enumerate(value))
         return tuple(every) if origin is tuple else list(every)
     elif kind is int:
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:
@@ -166,5 +166,5 @@ def _named(key: str) -> str:
     return f"key {key!r}" if key else "content"
 
 
-def _mistake(key: str, expected: str, found: object) -> UserError:
-    return UserError(f"{_named(key)}: expected {expected}, found {shown(found)}")
+def _mistake(key: str, expected: str, value: object) -> UserError:
+    return UserError(f"{_named(key)}: expected {expected}, found {shown(value)}")

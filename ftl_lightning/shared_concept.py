@@ -1,7 +1,7 @@
-"""The folder in which a learned concept is shared: its file, a card, and a film or picture of what it generates.
+"""Folder of a shared concept: its file, a card, and a film or picture of samples.
 
-Whoever reads such a folder reads the concept's file alone, as numbers and texts. The card is for people; of a concept that belongs
-to another model, the name that its card gives this model is told as text.
+Only the concept's file is read, as numbers and texts. The card is for people; if a concept belongs to another model, the card's
+name of that model is shown as text.
 """
 
 import io
@@ -35,11 +35,11 @@ from ftl_lightning.tuned import ModelSettings
 
 CARD, FILM, PICTURE, DEMONSTRATIONS = "README.md", "film.gif", "picture.png", "demonstrations.safetensors"
 MOST_BYTES = 1_000_000
-"""Of a film or picture."""
+"""Maximum size of a film or picture in bytes."""
 MOST_CARD = 64 * 2**10
-"""Bytes of a card that is looked at for the model's name."""
+"""Maximum size of a card in bytes."""
 SAMPLES = 8
-"""That a picture shows."""
+"""Number of samples in a picture."""
 _MODEL = re.compile(r'^  model: "([^"\n]{1,200})"$', re.MULTILINE)
 
 
@@ -51,15 +51,15 @@ def write_folder(
     known_as: str = "",
     demonstrations: Demonstrations | None = None,
 ) -> None:
-    """Write the folder of a concept; a card that is there already stays.
+    """Write the folder of a concept; an existing card is kept.
 
     Args:
-        folder: to write.
-        model: that the concept belongs to.
-        concept: the learned one.
-        tuned: settings to sample with.
-        known_as: under which name others find the model; empty where there is none.
-        demonstrations: to write too; ``None`` for none.
+        folder: folder to write.
+        model: the concept's model.
+        concept: learned concept.
+        tuned: settings of sampling.
+        known_as: public name of the model; empty without one.
+        demonstrations: demonstrations to include; ``None`` for none.
     """
     concept.save(folder / CONCEPT)
     shown = _film(model, concept, tuned)
@@ -74,60 +74,60 @@ def write_folder(
 
 
 def read_folder(folder: Path, name: str, space: str) -> Concept:
-    """The concept of such a folder.
+    """Read the concept of a shared folder.
 
     Args:
-        folder: here, or downloaded.
-        name: that a person gave, for messages.
-        space: whose concepts the model's are that is to use it, see :func:`~ftl_lightning.concepts.composition.space_of`.
+        folder: local or downloaded folder.
+        name: name given by the user, for messages.
+        space: concept space of the model, see :func:`~ftl_lightning.concepts.composition.space_of`.
 
     Raises:
-        UserError: if there is none, or it belongs to another model, which is named.
+        UserError: without a concept, or for another model's concept, with that model.
     """
     concept = Concept.load(folder / CONCEPT)
-    if (found := space_of(concept.origin.domain, concept.origin.pretrained)) != space:
+    if (owner := space_of(concept.origin.domain, concept.origin.pretrained)) != space:
         called = _model_of(folder / CARD)
-        told = f", which its card calls {called!r}" if called else ""
+        label = f", which its card calls {called!r}" if called else ""
         raise UserError(
-            f"{short(name, 80)}: expected a concept of this model, {space}, found one of {short(found, 60)}{told}; load that model"
+            f"{short(name, 80)}: expected a concept of this model, {space}, found one of {short(owner, 60)}{label}; load that model"
         )
     return concept
 
 
 def _model_of(path: Path) -> str:
-    """What a card calls the concept's model, as text; empty where it is no honest card."""
+    """A card's name of the concept's model; empty for an invalid card."""
     try:
-        found = _MODEL.search(read_text(path, "Markdown", MOST_CARD).partition("\n---")[0])
+        match = _MODEL.search(read_text(path, "Markdown", MOST_CARD).partition("\n---")[0])
     except UserError:
         return ""
-    return "" if found is None else short(line(found[1]), 60)
+    return "" if match is None else short(line(match[1]), 60)
 
 
 def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> str:
-    """A short card with the Hub's metadata.
+    """Card with the Hub's metadata.
 
     Args:
-        path: of the concept's file.
-        known_as: under which name others find its model; empty where there is none.
-        shown: name of the film or picture beside it; empty for none.
-        with_demonstrations: whether the demonstrations are beside it.
+        path: the concept's file.
+        known_as: public name of the model; empty without one.
+        shown: file name of the film or picture; empty for none.
+        with_demonstrations: whether the folder includes demonstrations.
 
     Raises:
-        UserError: for a file that is no concept.
+        UserError: for a file that is not a concept.
     """
-    told = summary(path)
-    if told is None:
+    content = summary(path)
+    if content is None:
         raise UserError(f"{path}: expected a concept file, found another one")
-    origin, quality, model = told.origin, told.quality, known_as or "FOLDER OR NAME OF THE MODEL"
+    origin, quality, model = content.origin, content.quality, known_as or "FOLDER OR NAME OF THE MODEL"
     keys = {"concept": origin.name, **({"model": known_as} if known_as else {}), "hash": origin.pretrained, "domain": origin.domain}
-    # JSON's texts are YAML's, too; what is not printable, which YAML refuses, is a question mark by then.
-    told_keys = {key: json.dumps(line(value), ensure_ascii=False) for key, value in keys.items()}
-    metadata = "".join(f"  {key}: {value}\n" for key, value in told_keys.items())
-    base = f"base_model: {told_keys['model']}\n" if known_as.count("/") == 1 else ""  # on the Hub, which refuses other names
+    # JSON strings are valid YAML; ``line`` has replaced unprintable characters, which YAML refuses.
+    quoted = {key: json.dumps(line(value), ensure_ascii=False) for key, value in keys.items()}
+    metadata = "".join(f"  {key}: {value}\n" for key, value in quoted.items())
+    base = f"base_model: {quoted['model']}\n" if known_as.count("/") == 1 else ""  # on the Hub, which refuses other names
     rows = {
         "model": f"{f'{known_as}, ' if known_as else ''}domain {origin.domain}, hash {origin.pretrained}; it works with no other",
         "learned from": f"{counted(origin.count, 'demonstration')} (hash {origin.demonstrations})",
-        "form": f"{told.form}; {origin.weights} guidance weights; loss {origin.loss:.4f}",
+        "form": f"{content.form}; {origin.weights} guidance weights; loss {origin.loss:.4f}",
         "quality": "not measured",
     }
     if quality is not None:
@@ -151,18 +151,18 @@ def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> st
 
 
 def _film(model: ConceptModel, concept: Concept, tuned: ModelSettings) -> tuple[str, bytes] | None:
-    """A film of what a concept generates, or a picture, with the name of its file; ``None`` where nothing can be sampled from.
+    """File name and content of a film or picture of samples; ``None`` without initial states.
 
-    It starts from new initial states of the task, so that it shows no demonstration.
+    Initial states are new, so that no demonstration is shown.
     """
     domain, name = model.domain, concept.origin.name
     starts = _starts(domain, name, SAMPLES)
     if domain.observed and starts is None:
         return None
-    own = concept.composition.to(model.device)
-    if (frames := _frames(model, own, tuned, starts)) and (content := small(captioned(frames, name))):
+    composition = concept.composition.to(model.device)
+    if (frames := _frames(model, composition, tuned, starts)) and (content := small(captioned(frames, name))):
         return FILM, content
-    plans = _plans(model, own, tuned, starts, SAMPLES)
+    plans = _plans(model, composition, tuned, starts, SAMPLES)
     figure = domain.show.picture(plans, None, name, starts if domain.observed else None)
     for dpi in (110, 80, 50):
         file = io.BytesIO()
@@ -172,39 +172,43 @@ def _film(model: ConceptModel, concept: Concept, tuned: ModelSettings) -> tuple[
     return None
 
 
-def _frames(model: ConceptModel, own: Composition, tuned: ModelSettings, starts: InitialStates | None) -> list[NDArray[np.uint8]]:
-    """Of a plan, or of an episode where only those are filmed; empty where neither is or the simulator is not installed."""
+def _frames(
+    model: ConceptModel, concept: Composition, tuned: ModelSettings, starts: InitialStates | None
+) -> list[NDArray[np.uint8]]:
+    """Frames of a plan, or else of an episode; empty without films or the simulator."""
     domain, loop = model.domain, model.domain.closed_loop
     if domain.show.film is not None:
-        return domain.show.film(_plans(model, own, tuned, starts, 1)[0])
+        return domain.show.film(_plans(model, concept, tuned, starts, 1)[0])
     if loop is None or loop.film is None or starts is None or starts.scenes is None:
         return []
     try:
         loop.expect()
-        rollout, followed = episodes(model, loop, own, starts.take([0]), tuned.sampling, tuned.replan, 0)
+        rollout, followed = episodes(model, loop, concept, starts.take([0]), tuned.sampling, tuned.replan, 0)
         return loop.film(rollout, torch.stack(list(followed[0]))) if followed.get(0) else []
     except UserError:  # a picture needs no simulator
         return []
 
 
-def _plans(model: ConceptModel, own: Composition, tuned: ModelSettings, starts: InitialStates | None, count: int) -> torch.Tensor:
+def _plans(
+    model: ConceptModel, concept: Composition, tuned: ModelSettings, starts: InitialStates | None, count: int
+) -> torch.Tensor:
     seen = {} if starts is None else moved(starts.take(slice(0, count)).observed, model.device)
-    return model.sample([own], count, tuned.sampling, [generator("cpu", 0)], seen)[0].cpu()
+    return model.sample([concept], count, tuned.sampling, [generator("cpu", 0)], seen)[0].cpu()
 
 
 def _starts(domain: Domain, name: str, count: int) -> InitialStates | None:
-    """New initial states of a task, or of the first training concept where the domain cannot read its name."""
+    """New initial states of a task, or of the first training concept if the domain cannot read the name."""
     if not domain.observed:
         return None
     task = next((text for text in (name, *domain.concepts.training) if domain.concepts.reads(text)), "")
     try:
         return domain.source(None).starts(task, count, 0)
-    except (UserError, KeyError, ValueError, IndexError):  # a source of somebody else's
+    except (UserError, KeyError, ValueError, IndexError):  # a third-party source
         return None
 
 
 def small(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """An animation of at most :data:`MOST_BYTES`, of fewer frames and colours where all are too many; empty if there is none."""
+    """Animation of at most :data:`MOST_BYTES`, with fewer frames and colours if necessary; empty if it cannot fit."""
     for each, colours in ((1, 64), (2, 64), (4, 32), (8, 16)):
         if len(content := gif(frames[::each], colours=colours)) <= MOST_BYTES:
             return content

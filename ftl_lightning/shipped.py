@@ -1,7 +1,7 @@
-"""Files that come with the package: configurations (``conf/...``) and pretrained models (``pretrained/...``).
+"""Shipped files: configurations (``conf/...``) and pretrained models (``pretrained/...``).
 
-In the repository both folders stand at the root; the package holds links to them, which a wheel has as folders. So the paths in
-the documentation are true in a checkout and, after ``pip install``, in any folder.
+Both folders are at the root of the repository; the package has links to them, which are folders in a wheel. So the documented
+paths work in a checkout and, after ``pip install``, in any folder.
 """
 
 import difflib
@@ -10,22 +10,22 @@ from pathlib import Path
 from ftl_lightning.errors import short
 
 FOLDERS = ("conf", "pretrained")
-"""What is shipped."""
+"""Shipped folders."""
 _PACKAGE = Path(__file__).parent
 CONFIGURATIONS = _PACKAGE / "conf"
-"""The configuration files that ship."""
+"""Folder of the shipped configuration files."""
 MODELS = _PACKAGE / "pretrained"
-"""The models that ship."""
+"""Folder of the shipped models."""
 
 
 def shipped(path: str | Path) -> Path:
-    """The path as given, if something is there; else the same path among the shipped folders, if something is there.
+    """Resolve a path: as given, or else in the shipped folders.
 
     Args:
         path: for example ``conf/agent.yaml`` or ``pretrained/agent``, relative to the current folder.
 
     Returns:
-        The path as given where nothing is found either way, so that errors name what the user wrote.
+        The path; as given if neither exists, so that errors name the user's path.
     """
     path = Path(path)
     if path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts and not path.exists():
@@ -36,25 +36,25 @@ def shipped(path: str | Path) -> Path:
 
 
 def shipped_models() -> list[str]:
-    """Names of the models that ship, such as ``agent``; baselines apart."""
+    """Names of the shipped models, such as ``agent``, without baselines."""
     return sorted(path.parent.name for path in MODELS.glob("*/config.json"))
 
 
 def list_models(baselines: bool = False) -> list[str]:
-    """Names of the models that ship, which ``FewShot.from_pretrained`` takes.
+    """Names of the shipped models for ``FewShot.from_pretrained``.
 
     Args:
-        baselines: name those of the baselines too, such as ``baseline/cvae/agent``.
+        baselines: include baselines, such as ``baseline/cvae/agent``.
     """
     others = sorted(str(path.parent.relative_to(MODELS)) for path in MODELS.glob("baseline/*/*/config.json"))
     return shipped_models() + (others if baselines else [])
 
 
 def missing_model(place: str | Path) -> str:
-    """What is told of a place where no model is, with the nearest names of those that ship."""
+    """Error message for ``place`` without a model, with the nearest shipped names."""
     place = short(str(place), 80)
-    told = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
-    near = difflib.get_close_matches(told, list_models(baselines=True), n=2)
+    normalised = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
+    near = difflib.get_close_matches(normalised, list_models(baselines=True), n=2)
     ship = f"did you mean {' or '.join(near)}? all that ship:" if near else f"{', '.join(shipped_models())} ship, see"
     return (
         f"{Path(place) / 'config.json'}: expected a pretrained model, found nothing; {ship} ftl_lightning.list_models(); "
@@ -63,7 +63,7 @@ def missing_model(place: str | Path) -> str:
 
 
 def pretrained_folder(name: str | Path) -> Path:
-    """The folder of a pretrained model by its path, or by the name of one that ships, such as ``agent``."""
+    """Folder of a pretrained model by its path or shipped name, such as ``agent``."""
     for path in (Path(name), shipped(name), shipped(Path("pretrained") / name)):
         if (path / "config.json").is_file():
             return path
@@ -71,6 +71,6 @@ def pretrained_folder(name: str | Path) -> Path:
 
 
 def shipped_name(folder: Path) -> str:
-    """The name of a model that ships, such as ``agent``, by its folder; empty for another one."""
+    """Name of a shipped model, such as ``agent``, by its folder; empty for other folders."""
     place, models = folder.resolve(), MODELS.resolve()
     return place.relative_to(models).as_posix() if place.is_relative_to(models) and place != models else ""

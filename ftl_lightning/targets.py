@@ -1,4 +1,4 @@
-"""What may be written to: looked at before any work, and once more when it is written."""
+"""Checks of output paths, before any work and again before writing."""
 
 import os
 import stat
@@ -9,34 +9,34 @@ from ftl_lightning.errors import UserError, short
 
 
 def expect_file(path: str | Path, key: str = "") -> None:
-    """Refuse a target that is there and no regular file: a folder, a device, a pipe, a socket, or a link to one of them.
+    """Refuse an existing path that is no regular file: a folder, a device, a pipe, a socket, or a link to one.
 
     Args:
-        path: of a file to write.
-        key: option that names it; empty for none.
+        path: file to write.
+        key: option that names the path; empty for none.
 
     Raises:
-        UserError: naming it.
+        UserError: naming the path.
     """
     _expect(path, key, "file")
 
 
 def expect_folder(path: str | Path, key: str = "") -> None:
-    """The same of a folder that files are to be written to."""
+    """Refuse an existing path that is no folder, as :func:`expect_file`."""
     _expect(path, key, "folder")
 
 
 def expect_writable_file(path: str | Path, key: str = "") -> None:
-    """As :func:`expect_file`, and refuse a place that nothing can be written to, or a name that it does not take.
+    """As :func:`expect_file`, and refuse an invalid name or an unwritable place.
 
-    Tried before long work: a file without a name is made in the nearest folder that is there.
+    The place is tested by an unnamed file in the nearest existing folder, before long work.
     """
     expect_file(path, key)
     _expect_place(Path(path).absolute().parent, Path(path), key)
 
 
 def expect_new_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`expect_folder`, and refuse a folder that holds something.
+    """As :func:`expect_folder`, and refuse a folder that is not empty.
 
     Raises:
         UserError: naming the path and its key.
@@ -48,14 +48,14 @@ def expect_new_folder(path: str | Path, key: str = "") -> None:
 
 
 def expect_writable_folder(path: str | Path, key: str = "") -> None:
-    """The same of a folder that files are to be written to."""
+    """As :func:`expect_folder`, and refuse an invalid name or an unwritable place."""
     expect_folder(path, key)
     _expect_place(Path(path).absolute(), Path(path), key)
 
 
 def _expect_place(folder: Path, path: Path, key: str) -> None:
     name = short(f"{key}: {path}" if key else str(path), 150)
-    there = next(one for one in (folder, *folder.parents) if one.exists())
+    there = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         longest = os.pathconf(there, "PC_NAME_MAX")
         for part in path.absolute().relative_to(there).parts:
@@ -66,8 +66,8 @@ def _expect_place(folder: Path, path: Path, key: str) -> None:
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError) and not there.exists():  # another process has just removed it
             return _expect_place(folder, path, key)
-        told = getattr(error, "strerror", None) or error
-        raise UserError(f"{name}: cannot be written ({told}); choose a writable place with room") from error
+        message = getattr(error, "strerror", None) or error
+        raise UserError(f"{name}: cannot be written ({message}); choose a writable place with room") from error
 
 
 def _expect(path: str | Path, key: str, kind: str) -> None:
@@ -77,8 +77,8 @@ def _expect(path: str | Path, key: str, kind: str) -> None:
     except FileNotFoundError:
         return  # nothing, or a link to nothing, whose target is made
     except (OSError, ValueError) as error:
-        told = getattr(error, "strerror", None) or error
-        raise UserError(f"{name}: cannot be written ({told}); choose another place") from error
-    found = "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "device, pipe or socket"
-    if found != kind:
-        raise UserError(f"{name}: expected a {kind} or nothing there, found a {found}; choose another name")
+        message = getattr(error, "strerror", None) or error
+        raise UserError(f"{name}: cannot be written ({message}); choose another place") from error
+    actual = "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "device, pipe or socket"
+    if actual != kind:
+        raise UserError(f"{name}: expected a {kind} or nothing there, found a {actual}; choose another name")

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read without unpickling anything."""
+"""Write files atomically, and read them without unpickling."""
 
 import fcntl
 import hashlib
@@ -22,7 +22,7 @@ from ftl_lightning.targets import expect_file
 
 _HEADER = "ftl_lightning"
 FORMAT = 1
-"""Version of the format of a file, unless its kind has another; a reader refuses all others."""
+"""Default version of a file's format; a reader refuses all others."""
 
 
 def cache_folder() -> Path:
@@ -31,19 +31,19 @@ def cache_folder() -> Path:
 
 
 def data_folder() -> Path:
-    """``$XDG_DATA_HOME/ftl-lightning``, or ``~/.local/share/ftl-lightning``: what a user keeps."""
+    """``$XDG_DATA_HOME/ftl-lightning``, or ``~/.local/share/ftl-lightning``: files that a user keeps."""
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "ftl-lightning"
 
 
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name in the same folder, renamed to ``path`` when the block ends well and removed when it does not.
+    """Yield a temporary path in the same folder, which is renamed to ``path`` on success and removed on failure.
 
-    A symbolic link stays one: the file that it leads to is replaced. Temporary names are hidden ones (see :func:`visible`); those
-    of the same file that a killed process left behind are removed first.
+    A symbolic link is kept and its target replaced. Temporary files are hidden (see :func:`visible`). Those that a killed process
+    left of the same file are removed first.
 
     Raises:
-        UserError: where the folder cannot be written or the disk is full, or ``path`` is there and no file.
+        UserError: if the folder cannot be written, the disk is full, or ``path`` exists and is no file.
     """
     expect_file(path)
     path = Path(path).resolve() if Path(path).is_symlink() else Path(path)
@@ -67,21 +67,21 @@ def atomic(path: str | Path) -> Iterator[Path]:
 
 
 _LONGEST = 100
-"""Bytes of a file's name that its temporary name takes over."""
+"""Bytes of a file's name that are kept in its temporary name."""
 
 
 def _locked(folder: Path, begin: str, end: str) -> tuple[int, Path]:
-    """A new file, locked as long as its handle is open: so it is known whether who made it is still there."""
+    """Create a file that is locked while its handle is open, which shows that its process still runs."""
     while True:
         handle, name = tempfile.mkstemp(prefix=begin, suffix=end, dir=folder)
         fcntl.flock(handle, fcntl.LOCK_EX)
-        if os.fstat(handle).st_nlink:  # else another process took it for one that was left
+        if os.fstat(handle).st_nlink:  # else another process removed it as left over
             return handle, Path(name)
         os.close(handle)
 
 
 def _remove_left(folder: Path, begin: str, end: str) -> None:
-    """Temporary files of this name whose process is gone."""
+    """Remove temporary files of this name whose process has ended."""
     for left in folder.iterdir():
         if not (left.name.startswith(begin) and left.name.endswith(end) and left.is_file()):
             continue
@@ -92,7 +92,7 @@ def _remove_left(folder: Path, begin: str, end: str) -> None:
 
 @contextmanager
 def alone(folder: str | Path) -> Iterator[None]:
-    """Hold a folder's lock, so that processes that change the same files in it wait for one another. It is made if missing."""
+    """Lock a folder, so that processes that change the same files in it wait for one another. It is made if missing."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)
@@ -104,12 +104,12 @@ def alone(folder: str | Path) -> Iterator[None]:
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:
-    """Paths below a folder that match, in their order, without hidden ones and those in hidden folders.
+    """Sorted paths below a folder that match a pattern, without hidden files and folders.
 
-    Hidden are the temporary names of :func:`atomic`, which a process that was killed leaves behind.
+    Temporary files of :func:`atomic`, which a killed process leaves behind, are hidden.
     """
-    found = sorted(folder.glob(pattern))
-    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    paths = sorted(folder.glob(pattern))
+    return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
 
 def _umask() -> int:
@@ -125,36 +125,36 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def serialise(kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any], version: int = FORMAT) -> bytes:
-    """A safetensors file with a JSON header; the same content gives the same bytes.
+    """Serialise tensors with a JSON header as safetensors; the same content gives the same bytes.
 
     Args:
-        kind: what the file is, checked when it is read.
-        tensors: by name.
+        kind: kind of file, checked by readers.
+        tensors: tensors by name.
         header: anything JSON can hold.
-        version: of the format of this kind.
+        version: version of this kind's format.
     """
-    # One metadata key: safetensors does not keep the order of several, and bytes would differ from run to run.
+    # A single metadata key: safetensors does not keep the order of several, and bytes would differ between runs.
     text = json.dumps({"kind": kind, "format": version, **header}, sort_keys=True)
-    # Copies: safetensors refuses tensors that share memory, such as a scene that is all of what is observed.
-    own = {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
-    return safetensors.torch.save(own, {_HEADER: text})
+    # Copies: safetensors refuses tensors that share memory, such as a scene that is the only observed feature.
+    copies = {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+    return safetensors.torch.save(copies, {_HEADER: text})
 
 
 def save_tensors(
     path: str | Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any], version: int = FORMAT
 ) -> None:
-    """Write what :func:`serialise` makes of its arguments, whole or not at all."""
+    """Write the bytes of :func:`serialise`, with the same arguments, whole or not at all."""
     with atomic(path) as temporary:
         temporary.write_bytes(serialise(kind, tensors, header, version))
 
 
 def load_tensors(path: str | Path, kind: str, version: int = FORMAT) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what :func:`save_tensors` wrote.
+    """Read a file of :func:`save_tensors`.
 
     Args:
         path: the file.
-        kind: what it is expected to be.
-        version: of the format of this kind.
+        kind: expected kind.
+        version: version of this kind's format.
 
     Returns:
         Tensors by name, and the header.
@@ -169,14 +169,14 @@ def load_tensors(path: str | Path, kind: str, version: int = FORMAT) -> tuple[di
 
 
 def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]], Any]:
-    """What a file of tensors says of itself; the tensors are not read, and nothing is checked that :func:`expect_kind` checks.
+    """Read the header and the shapes of a file of tensors, without the tensors and without the checks of :func:`expect_kind`.
 
     Args:
         path: the file.
-        kind: what it is expected to be, for messages.
+        kind: expected kind, for messages.
 
     Returns:
-        Shapes of its tensors by name, and its header as JSON has it.
+        Shapes of tensors by name, and the header as parsed JSON.
 
     Raises:
         UserError: for a file that is missing or damaged.
@@ -189,7 +189,7 @@ def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]]
 
 @contextmanager
 def _opened(path: Path, kind: str) -> Iterator[tuple[Any, str]]:
-    """A file of tensors, and the text of its header."""
+    """Open a file of tensors; yield it with the text of its header."""
     expect_header(path, kind, expect_readable(path, kind))
     try:
         with safetensors.safe_open(path, framework="pt") as file:
@@ -202,37 +202,37 @@ def expect_kind(header: object, kind: str, version: int = FORMAT) -> dict[str, A
     """Refuse the header of a file of another kind or version.
 
     Raises:
-        UserError: saying what it is.
+        UserError: naming the actual kind or version.
     """
-    found = header.get("kind") if isinstance(header, dict) else None
-    if not isinstance(header, dict) or found != kind:
-        told = f"a {short(str(found))} file" if found else "a file of other software"
-        raise UserError(f"expected a {kind} file, found {told}")
+    actual = header.get("kind") if isinstance(header, dict) else None
+    if not isinstance(header, dict) or actual != kind:
+        message = f"a {short(str(actual))} file" if actual else "a file of other software"
+        raise UserError(f"expected a {kind} file, found {message}")
     if header.get("format") != version or isinstance(header["format"], bool):
         raise UserError(f"key 'format': expected {version}, found {shown(header.get('format'))}; it is of another version")
     return header
 
 
 def kind_of(content: bytes) -> str:
-    """What a safetensors file of this package says it is; empty for anything else. Only its header is read."""
+    """Kind of a safetensors file of this package, from its header alone; empty for any other content."""
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or length > min(len(content), raised(MOST_HEADER)):
         return ""
     try:
         header = parse_json(content[8 : 8 + length])
-        own = parse_json(header["__metadata__"][_HEADER])
-        return str(own["kind"])
+        metadata = parse_json(header["__metadata__"][_HEADER])
+        return str(metadata["kind"])
     except (UserError, KeyError, TypeError, IndexError):
         return ""
 
 
 def expect_header(path: Path, kind: str, size: int) -> None:
-    """Refuse a safetensors file whose header is longer, or names more tensors, than an honest one: it takes minutes to read.
+    """Refuse a safetensors file whose header is too long or names too many tensors: reading it takes minutes.
 
     Args:
         path: the file.
-        kind: what it is expected to be.
-        size: bytes of it.
+        kind: expected kind.
+        size: size in bytes.
 
     Raises:
         UserError: naming the file.
@@ -241,18 +241,18 @@ def expect_header(path: Path, kind: str, size: int) -> None:
         length = int.from_bytes(file.read(8), "little")
         most = raised(MOST_HEADER)
         if length > min(size, most):
-            told = "a damaged or foreign file" if length > size else f"a header of {length} bytes, more than {most}"
-            raise UserError(f"{path}: expected a {kind} file, found {told}")
+            message = "a damaged or foreign file" if length > size else f"a header of {length} bytes, more than {most}"
+            raise UserError(f"{path}: expected a {kind} file, found {message}")
         # Each tensor is a mapping, however its keys are written; braces in texts are too few to matter.
         if (tensors := file.read(length).count(b"{")) > MOST_TENSORS:
             raise UserError(f"{path}: expected a {kind} file of at most {MOST_TENSORS} tensors, found {tensors}")
 
 
 def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
-    """Refuse numbers that are none.
+    """Refuse tensors with numbers that are not finite.
 
     Raises:
-        UserError: naming the first tensor that holds one.
+        UserError: naming the first such tensor.
     """
     for name, value in tensors.items():
         if not value.isfinite().all():
@@ -260,15 +260,15 @@ def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> Non
 
 
 def bytes_hash(content: bytes) -> str:
-    """First 16 hexadecimal digits of the SHA-256."""
+    """First 16 hexadecimal digits of the SHA-256 of bytes."""
     return hashlib.sha256(content).hexdigest()[:16]
 
 
 def file_hash(path: str | Path) -> str:
-    """The same of a file's bytes."""
+    """:func:`bytes_hash` of a file."""
     return bytes_hash(Path(path).read_bytes())
 
 
 def content_hash(content: Any) -> str:
-    """The same of anything JSON can hold."""
+    """:func:`bytes_hash` of anything JSON can hold."""
     return bytes_hash(json.dumps(content, sort_keys=True, default=str).encode())

@@ -1,4 +1,4 @@
-"""Lightning's trainer with one more verb."""
+"""Lightning's trainer with the additional verb ``invert``."""
 
 import inspect
 import math
@@ -44,13 +44,13 @@ HARMLESS = {
     "reload_dataloaders_every_n_epochs",
     "val_check_interval",
 }
-"""Options that change no number of a run on one device; every other one does."""
+"""Options that change no number of a run on one device; all other options do."""
 MOST_PROCESSES = 256
-"""In which concepts are learned."""
+"""Maximum number of processes that learn concepts."""
 _STARTS = ("`val_check_interval`", "Early stopping conditioned")
-"""How messages of Lightning begin that are about options."""
+"""Beginnings of Lightning's messages about options."""
 USUAL = {"max_epochs": 1, "deterministic": True}
-"""Of a configuration that ships with ``invert``, where Lightning's default is another one."""
+"""Defaults of the shipped configurations of ``invert`` that differ from Lightning's."""
 
 
 RANGES = {
@@ -67,7 +67,7 @@ RANGES = {
     "reload_dataloaders_every_n_epochs": (0, math.inf),
     "gradient_clip_val": (0, math.inf),
 }
-"""Of options that Lightning takes as they are, and fails with in the middle of a run or never uses."""
+"""Ranges of options that Lightning does not check: invalid values fail during a run, or are ignored."""
 LIMITS = {
     "limit_train_batches": "batches",
     "limit_val_batches": "batches",
@@ -75,11 +75,11 @@ LIMITS = {
     "overfit_batches": "batches",
     "val_check_interval": "steps",
 }
-"""The same of shares or numbers, with what they count."""
+"""Unchecked options that are a share or a number, with the unit of the number."""
 
 
 class _Begun(pl.Callback):
-    """Notes that learning has begun, and that what callbacks watch is there."""
+    """Record the start of learning, and check that metrics monitored by callbacks exist."""
 
     def on_train_batch_start(self, *_: Any) -> None:
         log_folder.keep()
@@ -90,10 +90,10 @@ class _Begun(pl.Callback):
 
 
 def _expect_monitors(trainer: pl.Trainer) -> None:
-    """Refuse a callback that watches a number which is not logged: it would do nothing.
+    """Refuse a callback that monitors a metric which is not logged: it would have no effect.
 
     Raises:
-        UserError: naming the callback and what is logged.
+        UserError: naming the callback and the logged metrics.
     """
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         watched = getattr(callback, "monitor", None)
@@ -103,12 +103,12 @@ def _expect_monitors(trainer: pl.Trainer) -> None:
 
 
 class Trainer(pl.Trainer):
-    """A trainer that can also ``invert``.
+    """A trainer with the additional verb ``invert``.
 
     Attributes:
-        verb: what it does, for the progress bar.
-        unusual: options that can change what is learned and have not their usual values: these are part of a result's identity.
-        processes: in which ``invert`` learns concepts, each its share of them, see :mod:`ftl_lightning.learning.in_processes`.
+        verb: current verb, for the progress bar.
+        unusual: options that can affect learning and differ from their defaults; they are part of a result's identity.
+        processes: number of processes among which ``invert`` divides the concepts, see :mod:`ftl_lightning.learning.in_processes`.
     """
 
     verb = "fit"
@@ -118,7 +118,7 @@ class Trainer(pl.Trainer):
         self.processes = processes
         for name, (least, most) in RANGES.items():
             value = options.get(name)
-            value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a text
+            value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a string
             if isinstance(value, int | float) and not isinstance(value, bool):
                 expect_range(f"trainer.{name}", value, least, most)
         for name, words in LIMITS.items():
@@ -133,12 +133,12 @@ class Trainer(pl.Trainer):
             super().__init__(*arguments, **options)
         except UserError:
             raise
-        except Exception as error:  # of many kinds, by accelerators, strategies and plugins
+        except Exception as error:  # of many types, by accelerators, strategies and plugins
             raise UserError(f"trainer: {short(str(error), 200)}") from error
         if isinstance(self.accelerator, CPUAccelerator):
             expect_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
         known = inspect.signature(pl.Trainer.__init__).parameters
-        usual = {name: one.default for name, one in known.items()} | USUAL
+        usual = {name: parameter.default for name, parameter in known.items()} | USUAL
         self.unusual = {
             name: value if isinstance(value, int | float | str | None) else type(value).__name__
             for name, value in options.items()
@@ -150,7 +150,7 @@ class Trainer(pl.Trainer):
             self.strategy.checkpoint_io = WholeCheckpoints()
 
     def fit(self, model: pl.LightningModule, *arguments: Any, **options: Any) -> None:
-        """As Lightning's, for what learns."""
+        """Lightning's ``fit``, for models that learn."""
         if isinstance(model, Adaptation) and not model.learns:
             raise UserError(f"verb: expected invert (model.class_path: {type(model).__name__} learns nothing), found fit")
         for key, length in (("max_steps", self.max_steps), ("max_epochs", self.max_epochs)):
@@ -164,46 +164,46 @@ class Trainer(pl.Trainer):
         with self._restoring():
             try:
                 super().fit(model, *arguments, **options)
-            except (ValueError, RuntimeError) as error:  # what Lightning finds out as it starts
+            except (ValueError, RuntimeError) as error:  # raised by Lightning at the start
                 if str(error).strip().startswith(_STARTS):
                     raise UserError(f"trainer: {short(str(error), 250)}") from error
                 raise
         _expect_monitors(self)
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
-        """As Lightning's, in one process."""
+        """Lightning's ``validate``, in one process."""
         process_group.expect_alone(self, "validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
     def test(self, *arguments: Any, **options: Any) -> Any:
-        """As Lightning's, in one process."""
+        """Lightning's ``test``, in one process."""
         process_group.expect_alone(self, self.verb if self.verb == "invert" else "test")
         with self._restoring():
             return super().test(*arguments, **options)
 
     @contextmanager
     def _restoring(self) -> Iterator[None]:
-        """Tell in one line what Lightning and torch raise, each in its own way, of a checkpoint that they cannot restore."""
+        """Report errors of Lightning and torch about a checkpoint that cannot be restored, in one line."""
         try:
             yield
         except UserError:
             raise
         except Exception as error:
-            if not self._checkpoint_connector._loaded_checkpoint:  # which is let go of as soon as all of it is restored
+            if not self._checkpoint_connector._loaded_checkpoint:  # released once restoring is complete
                 raise
-            told = " ".join(f"{type(error).__name__}: {error}".split())[:150]
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:150]
             raise UserError(
-                f"{self.ckpt_path}: expected a checkpoint of a run like this one, found one that cannot be restored ({told})"
+                f"{self.ckpt_path}: expected a checkpoint of a run like this one, found one that cannot be restored ({reason})"
             ) from error
 
     def invert(self, model: Adaptation, datamodule: pl.LightningDataModule, ckpt_path: str | None = None) -> None:
-        """Learn the concepts, write them to files, then generate and judge.
+        """Learn the concepts, write them to files, then generate and judge samples.
 
         Args:
-            model: what adapts a pretrained model.
+            model: adapts a pretrained model.
             datamodule: demonstrations.
-            ckpt_path: checkpoint of an inversion to go on with.
+            ckpt_path: checkpoint of an inversion to resume.
         """
         if not isinstance(model, Adaptation):
             raise UserError(f"model.class_path: expected a module that adapts a pretrained model, found {type(model).__name__}")
@@ -218,13 +218,13 @@ class Trainer(pl.Trainer):
         self.test(model, datamodule=datamodule, verbose=False)
 
     def _expect_plain(self, model: Adaptation, ckpt_path: str | None) -> None:
-        """Refuse what learning in several processes does not look at: there are no trainer's steps in them."""
+        """Refuse options that learning in several processes ignores, because no trainer runs in them."""
         if not model.learns:
-            told = f"expected 1 for {model.method}, which learns nothing, found {self.processes}"
+            message = f"expected 1 for {model.method}, which learns nothing, found {self.processes}"
         elif ckpt_path:
-            told = f"expected 1 to go on with a checkpoint, found {self.processes}"
+            message = f"expected 1 to go on with a checkpoint, found {self.processes}"
         elif self.unusual:
-            told = f"expected 1 with trainer.{next(iter(self.unusual))}, found {self.processes}"
+            message = f"expected 1 with trainer.{next(iter(self.unusual))}, found {self.processes}"
         else:
             return
-        raise UserError(f"trainer.processes: {told}")
+        raise UserError(f"trainer.processes: {message}")

@@ -1,4 +1,4 @@
-"""Lightning's progress bar, as one bar over all steps of a run."""
+"""Lightning's progress bar as a single bar over all steps of a run."""
 
 import time
 from contextlib import ExitStack
@@ -10,11 +10,11 @@ from lightning.pytorch.callbacks import ProgressBar
 from ftl_lightning.progress import Advance, bar
 
 REFRESH = 0.5
-"""Seconds from one look at loss and accuracy to the next; at every step it would cost time."""
+"""Seconds between updates of loss and accuracy, which would be slow at every step."""
 
 
 class TrainingBar(ProgressBar):
-    """One bar for all steps of ``fit`` or ``invert``, and one while a model is evaluated after it."""
+    """Bar over all steps of ``fit`` or ``invert``, and another for an evaluation after it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,23 +73,23 @@ class TrainingBar(ProgressBar):
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
         self._advance = None
-        # With the exception, so that the bar does not say that it came to its end.
+        # With the exception, so that the bar does not report its end.
         self._open.__exit__(type(exception), exception, exception.__traceback__)
 
 
 def told(trainer: pl.Trainer) -> str:
-    """Loss and accuracy of a run, as far as they are logged: ``loss 0.031, accuracy 0.98``."""
+    """Logged loss and accuracy of a run: ``loss 0.031, accuracy 0.98``."""
     metrics = trainer.callback_metrics
     loss = [f"loss {metrics['train/loss']:.3g}"] if "train/loss" in metrics else []
     return ", ".join([*loss, *accuracies(trainer)])
 
 
 def accuracies(trainer: pl.Trainer) -> list[str]:
-    """What the evaluator logged while fitting, ``accuracy 0.98``, with the setting's name where a metric has several."""
+    """Metrics that the evaluator logged during fitting, ``accuracy 0.98``, with the setting's name if a metric has several."""
     logged = [key.split("/") for key in trainer.callback_metrics if key.startswith("val/")]
-    found = [(key[1], key[2]) for key in logged if len(key) == 3]  # val/METRIC/SETTING
-    settings = {name: [setting for metric, setting in found if metric == name] for name, _ in found}
+    pairs = [(key[1], key[2]) for key in logged if len(key) == 3]  # val/METRIC/SETTING
+    settings = {name: [setting for metric, setting in pairs if metric == name] for name, _ in pairs}
     return [
         f"{name}{f' ({setting})' if len(settings[name]) > 1 else ''} {trainer.callback_metrics[f'val/{name}/{setting}']:.2f}"
-        for name, setting in found
+        for name, setting in pairs
     ]

@@ -1,8 +1,8 @@
-"""Whose code runs. Files name modules, too, but only an installation or the person at the keyboard decides that one is imported.
+"""Trust in code: files may name modules, but only installed or user-trusted modules are imported.
 
-A model's folder may ask for a domain that an installed package offers. A configuration may ask for classes and domains of installed
-modules. Everything else, and the current folder above all, takes a person's word: on the command line, by ``--trust MODULE`` or by
-naming the class or domain there, in Python by an argument.
+A model's folder may name a domain of an installed package. A configuration may name classes and domains of installed modules.
+Other modules, the current folder's in particular, must be trusted by the user: on the command line by ``--trust MODULE`` or by
+naming the class or domain, in Python by an argument.
 """
 
 import contextvars
@@ -18,26 +18,26 @@ from pathlib import Path
 from ftl_lightning.errors import UserError, about, short
 
 OPTION = "--trust"
-"""Names a module that may be imported, wherever it is named and though it lies in the current folder."""
+"""Option that trusts a module, wherever it is named, the current folder included."""
 NO_CODE = ("ftl_lightning.conf", "ftl_lightning.pretrained")
-"""Folders inside of the package that hold files of others and never a module."""
+"""Folders of the package with data files of others and never a module."""
 _PACKAGE = Path(__file__).parent.parent
 _REFERENCE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 _CLASS = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)+")
 _INLINE = re.compile(r"\b(class_path|domain)[\"']?\s*:\s*[\"']?([\w.:]+)")
 _CLASSES = ("class_path", "model", "data", "callbacks", "logger", "strategy", "plugins", "profiler", "optimizer", "lr_scheduler")
-"""Ends of options that name classes."""
+"""Last parts of options that name classes."""
 _SAFE_PATH = "PYTHONSAFEPATH"
 _POSITIONAL = ("generate", "encode", "prepare", "study")
-"""Verbs whose first argument is a domain."""
+"""Verbs with a domain as first argument."""
 _vouched: contextvars.ContextVar[frozenset[str]] = contextvars.ContextVar("vouched", default=frozenset())
 
 
 def search_path() -> list[str]:
-    """Where modules are looked for: Python's path without the current folder, which is on it by accident.
+    """Python's path without the current folder, unless the package is in it.
 
-    Python puts it there for ``-c``, for ``-m`` (see ``__main__``), in a notebook, and for an empty part of ``PYTHONPATH``. The
-    folder that this package comes from stays.
+    Python adds the current folder for ``-c``, for ``-m`` (see ``__main__``), in a notebook, and for an empty part of
+    ``PYTHONPATH``.
     """
     here = Path.cwd()
     python_path = os.environ.get("PYTHONPATH")
@@ -47,17 +47,17 @@ def search_path() -> list[str]:
 
 
 def _appended() -> str:
-    """The current folder as it stands at the end of Python's path, where it hides no other module, if a module in it is named."""
+    """Entry of the current folder at the end of Python's path, where it hides no other module."""
     return f"{Path.cwd()}{os.sep}."
 
 
 def entry_points(group: str) -> list[EntryPoint]:
-    """What installed packages offer in a group; the current folder is none."""
+    """Entry points of installed packages in a group, without the current folder."""
     return [point for package in distributions(path=search_path()) for point in package.entry_points if point.group == group]
 
 
 def is_installed(module: str) -> bool:
-    """Whether Python finds the package of a module without the current folder. Nothing is imported."""
+    """Whether a module's package is found without the current folder. Nothing is imported."""
     if any(module == folder or module.startswith(f"{folder}.") for folder in NO_CODE):
         return False
     package, path = module.partition(".")[0], search_path()
@@ -69,19 +69,19 @@ def is_installed(module: str) -> bool:
 
 
 def is_vouched(reference: str) -> bool:
-    """Whether a person named this ``module:ATTRIBUTE``, its module, or a package that the module is in."""
+    """Whether the user trusts this ``module:ATTRIBUTE``, its module, or a parent package."""
     module, names = reference.partition(":")[0], _vouched.get()
     return reference in names or any(module == name or module.startswith(f"{name}.") for name in names)
 
 
 def vouched() -> frozenset[str]:
-    """All that a person named, for processes that are started elsewhere."""
+    """All names that the user trusts, for other processes."""
     return _vouched.get()
 
 
 @contextmanager
 def vouching(names: Iterable[str]) -> Iterator[None]:
-    """Within the block, these are vouched for: modules, packages, or ``module:ATTRIBUTE``."""
+    """Trust modules, packages, or ``module:ATTRIBUTE`` within the block."""
     token = _vouched.set(_vouched.get() | set(names))
     try:
         yield
@@ -91,10 +91,10 @@ def vouching(names: Iterable[str]) -> Iterator[None]:
 
 @contextmanager
 def person(arguments: Sequence[str]) -> Iterator[list[str]]:
-    """Take what a command line names as a person's word, and the current folder off Python's path unless something in it is named.
+    """Trust names in a command line, and remove the current folder from Python's path unless a module in it is named.
 
     Args:
-        arguments: of the program, the verb first.
+        arguments: arguments of the program, the verb first.
 
     Yields:
         The arguments without :data:`OPTION`.
@@ -106,7 +106,7 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
     names |= _named(rest)
     before, safe = list(sys.path), os.environ.get(_SAFE_PATH)
     sys.path[:] = search_path()
-    os.environ[_SAFE_PATH] = "1"  # of worker processes, which are started with the current folder on their path
+    os.environ[_SAFE_PATH] = "1"  # for worker processes, whose path would include the current folder
     if any(not is_installed(name.partition(":")[0]) for name in names):
         sys.path.append(_appended())
     try:
@@ -121,7 +121,7 @@ def person(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 
 def _trusted(arguments: Sequence[str]) -> tuple[set[str], list[str]]:
-    """The modules that :data:`OPTION` names, and the arguments without it."""
+    """Modules named by :data:`OPTION`, and the arguments without it."""
     names, rest, left = set(), [], iter(arguments)
     for argument in left:
         option, equals, value = argument.partition("=")
@@ -136,7 +136,7 @@ def _trusted(arguments: Sequence[str]) -> tuple[set[str], list[str]]:
 
 
 def _named(arguments: Sequence[str]) -> set[str]:
-    """Domains as ``module:ATTRIBUTE``, and modules of classes, that the command line itself names."""
+    """Domains ``module:ATTRIBUTE`` and modules of classes in the command line itself."""
     names = set()
     if len(arguments) > 1 and arguments[0] in _POSITIONAL and _REFERENCE.fullmatch(arguments[1]):
         names.add(arguments[1])
@@ -155,14 +155,14 @@ def _named(arguments: Sequence[str]) -> set[str]:
 
 
 def expect_classes(keys: object, where: str) -> None:
-    """Refuse a configuration that asks for a class of a module which neither is installed nor a person vouches for.
+    """Refuse a configuration with a class of a module that is neither installed nor trusted.
 
     Args:
-        keys: what a configuration file says, mappings and lists within one another.
+        keys: content of a configuration file, nested mappings and lists.
         where: the file.
 
     Raises:
-        UserError: naming the file, the key and the module.
+        UserError: with the file, the key and the module.
     """
     for key, value in leaves(keys):
         if key.rpartition(".")[2] == "class_path" and _CLASS.fullmatch(value):
@@ -171,10 +171,10 @@ def expect_classes(keys: object, where: str) -> None:
 
 
 def expect_module(reference: str, key: str) -> None:
-    """Refuse a module, or ``module:ATTRIBUTE``, that neither is installed nor a person vouches for.
+    """Refuse a module, or ``module:ATTRIBUTE``, that is neither installed nor trusted.
 
     Raises:
-        UserError: naming the key and the module.
+        UserError: with the key and the module.
     """
     module = reference.partition(":")[0]
     if not is_installed(module) and not is_vouched(reference):
@@ -185,9 +185,9 @@ def expect_module(reference: str, key: str) -> None:
 
 
 def allowed(keys: object) -> set[str]:
-    """Packages and modules that a configuration's classes may come from: installed ones that it names, and those vouched for.
+    """Packages and modules allowed for a configuration's classes: installed packages that it names, and trusted modules.
 
-    Python's own library is left out: none of its classes is a model, data or a part of a trainer.
+    The standard library is excluded: it has no models, data or trainer parts.
     """
     texts = {value for _, value in leaves(keys) if _CLASS.fullmatch(value)}
     packages = {text.partition(".")[0] for text in texts if is_installed(text)}
@@ -195,30 +195,30 @@ def allowed(keys: object) -> set[str]:
 
 
 def allow_classes(packages: Iterable[str]) -> None:
-    """Let configurations name classes and types of these packages alone, until it is called again.
+    """Allow only classes and types of these packages in configurations, until the next call.
 
-    Whatever else names a class, such as a value that is put together from others, is refused where it would be imported.
+    Other names of classes, such as interpolated values, are refused on import.
     """
     from jsonargparse import set_parsing_settings
 
     now = set(packages)
-    # jsonargparse adds to what it was told before, so what is allowed no more has to be denied, unless it is inside of what is.
-    inside = {name for name in _told if any(name.startswith(f"{package}.") for package in now)}
+    # jsonargparse accumulates settings, so earlier packages must be denied, unless they are inside an allowed package.
+    inside = {name for name in _allowed_before if any(name.startswith(f"{package}.") for package in now)}
     set_parsing_settings(
         instantiate_subclass_spec_in_any=False,
-        import_path_denylist=["*", *sorted(_told - now - inside)],
+        import_path_denylist=["*", *sorted(_allowed_before - now - inside)],
         import_path_allowlist=sorted(now | inside),
     )
     set_parsing_settings(import_path_denylist=list(NO_CODE))
-    _told.update(now)
+    _allowed_before.update(now)
 
 
-_told: set[str] = set()
-"""What :func:`allow_classes` was ever told, for the whole process, as jsonargparse's settings are."""
+_allowed_before: set[str] = set()
+"""All packages ever passed to :func:`allow_classes`; global, as are jsonargparse's settings."""
 
 
 def leaves(keys: object, above: str = "") -> Iterator[tuple[str, str]]:
-    """Every text in mappings and lists, with its keys joined by dots."""
+    """Every text in nested mappings and lists, with its keys joined by dots."""
     if isinstance(keys, Mapping):
         for key, value in keys.items():
             yield from leaves(value, f"{above}.{key}" if above else str(key))

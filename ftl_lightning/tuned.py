@@ -1,4 +1,4 @@
-"""The settings that go with a pretrained model: those of ``invert`` in its domain's configuration."""
+"""Settings of a pretrained model, from ``invert`` in its domain's configuration."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,13 +14,13 @@ from ftl_lightning.trust import is_installed, is_vouched
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """The settings that go with a model.
+    """Settings of a model.
 
     Attributes:
-        inversion: how concepts are learned.
-        learning_steps: of gradient descent.
-        sampling: how behaviour is generated.
-        replan: steps that a plan is followed in closed loop before a new one is made.
+        inversion: settings of the inversion.
+        learning_steps: gradient steps.
+        sampling: settings of sampling.
+        replan: steps between plans in closed loop.
     """
 
     inversion: InversionSettings
@@ -30,15 +30,15 @@ class ModelSettings:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """From a configuration file of ``invert``.
+        """Read a configuration file of ``invert``.
 
         Args:
-            path: of the file, in the current folder or among those that ship.
+            path: path of the file, in the current folder or among shipped files.
 
         Raises:
-            UserError: naming the file, if it is none or a value is not allowed.
+            UserError: with the file, if it or a value is invalid.
         """
-        from ftl_lightning.configuration import load  # OmegaConf, which nothing else here needs
+        from ftl_lightning.configuration import load  # needs OmegaConf
 
         content = load(path, "invert")
         model, data, evaluation = (content.get(key) or {} for key in ("model", "data", "evaluation"))
@@ -62,15 +62,15 @@ class ModelSettings:
 
     @staticmethod
     def domains(path: str | Path) -> list[str]:
-        """The domain ``module:ATTRIBUTE`` that a configuration file names, if its module is installed or a person vouches for it.
+        """The domain ``module:ATTRIBUTE`` in a configuration file, if its module is installed or trusted.
 
-        A model's folder may ask for the same one.
+        A model's folder may then use it.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
-            UserError: naming the file, if it is none.
+            UserError: with the file, if it is invalid.
         """
         from ftl_lightning.configuration import load
 
@@ -80,18 +80,18 @@ class ModelSettings:
 
 
 OWN = "conf/own.yaml"
-"""The settings where a domain has none."""
+"""Default settings for domains without a configuration."""
 
 
 def settings_of(domain: str, folder: str = "conf") -> str:
-    """The configuration file with the settings of ``invert`` that go with a domain's models.
+    """Configuration file with the settings of ``invert`` for a domain's models.
 
     Args:
-        domain: its name.
-        folder: of the configuration files of the models' method, such as ``conf/in_context``; empty for none.
+        domain: name of the domain.
+        folder: folder of the method's configuration files, such as ``conf/in_context``; empty for none.
 
     Raises:
-        UserError: naming the file, if it cannot be read.
+        UserError: with the file, if it cannot be read.
     """
     from ftl_lightning.configuration import load
 
@@ -99,4 +99,4 @@ def settings_of(domain: str, folder: str = "conf") -> str:
     if not folder or not shipped(path).is_file():
         return OWN
     model = load(path, "invert").get("model") or {}
-    return path if "pretrained" in (model.get("init_args") or {}) else OWN  # else it is for pretraining alone
+    return path if "pretrained" in (model.get("init_args") or {}) else OWN  # otherwise for pretraining alone

@@ -153,11 +153,13 @@ def test_the_tables_of_fields_are_what_the_docstrings_say() -> None:
 
 
 def test_the_tables_of_forms_are_what_the_results_say(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    forms = runpy.run_path(str(ROOT / "benchmarks" / "forms.py"))
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "experiments"))
+    forms = runpy.run_path(str(ROOT / "benchmarks" / "experiments" / "forms.py"))
     content = json.loads((ROOT / "results" / "forms.json").read_text(encoding="utf-8"))
     assert forms["summary"](content["families"]) == content["summary"]
-    assert forms["page"](content) == (ROOT / "results" / "forms.md").read_text(encoding="utf-8"), "run benchmarks/forms.py"
+    assert forms["page"](content) == (ROOT / "results" / "forms.md").read_text(encoding="utf-8"), (
+        "run benchmarks/experiments/forms.py"
+    )
 
 
 def test_pages_tell_the_numbers_of_strokes() -> None:
@@ -182,10 +184,10 @@ def test_pages_tell_the_numbers_of_strokes() -> None:
 def test_the_tables_of_the_table_top_and_of_human_motion_are_what_the_results_say(
     script: str, results: str, out: str, names: tuple[str, ...], tmp_path: Path
 ) -> None:
-    runpy.run_path(str(ROOT / "benchmarks" / script))["main"]([f"--results={ROOT / results}", f"--out={tmp_path / out}"])
+    runpy.run_path(str(ROOT / "benchmarks" / "making" / script))["main"]([f"--results={ROOT / results}", f"--out={tmp_path / out}"])
     for name in names:
         kept = (ROOT / "results" / name).read_text(encoding="utf-8")
-        assert (tmp_path / name).read_text(encoding="utf-8") == kept, f"run benchmarks/{script}"
+        assert (tmp_path / name).read_text(encoding="utf-8") == kept, f"run benchmarks/making/{script}"
 
 
 @pytest.mark.parametrize("name", ["settings", "paper"])
@@ -197,11 +199,11 @@ def test_a_generated_page_is_what_its_command_writes(name: str) -> None:
 
 
 def test_the_table_of_starts_is_what_was_measured() -> None:
-    imports = runpy.run_path(str(ROOT / "benchmarks" / "imports.py"))
+    imports = runpy.run_path(str(ROOT / "benchmarks" / "speed" / "imports.py"))
     page = imports["PAGE"].read_text(encoding="utf-8")
     found = json.loads((ROOT / "results" / "imports.json").read_text(encoding="utf-8"))
-    assert imports["written"](page, found) == page, "run benchmarks/imports.py --page"
-    assert set(found["help"]) <= TRAINER_VERBS.keys() | COMMANDS.keys(), "run benchmarks/imports.py"
+    assert imports["written"](page, found) == page, "run benchmarks/speed/imports.py --page"
+    assert set(found["help"]) <= TRAINER_VERBS.keys() | COMMANDS.keys(), "run benchmarks/speed/imports.py"
 
 
 ONLY_PRINTED = {"0.32": "Section 4.1", "people 73.3 %": "Table 1", "people 26.7 %": "Table 1", "people 0 %": "Table 1"}

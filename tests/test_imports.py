@@ -1,4 +1,4 @@
-"""What starting costs: large packages that a verb does not need are not imported by it. Times are in ``benchmarks/imports.py``."""
+"""No verb imports large packages that it does not need. Times are in ``benchmarks/speed/imports.py``."""
 
 import importlib.util
 import json

@@ -1,4 +1,4 @@
-"""Ablations: grids of configurations, each run through the same verbs as by hand, skipping what the results hold already."""
+"""Ablations: grids of configurations, run through the usual verbs; configurations with results are skipped."""
 
 from ftl_lightning.ablation.plan import Stage
 

@@ -1,4 +1,4 @@
-"""Mistakes in a plan, found before any of it runs."""
+"""Check a plan before it runs."""
 
 import importlib
 from argparse import ArgumentError
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 def check(cells: Sequence[Cell]) -> None:
-    """Check every cell's files, keys and encoder and, for ``invert``, its domain, suites and pretrained model.
+    """Check files, keys and encoder of each cell and, for ``invert``, domain, suites and model.
 
     Raises:
-        UserError: one line with every mistake; nothing was started.
+        UserError: all mistakes in one line; nothing was started.
     """
     made = {cell.options["model.output"] for cell in cells if cell.verb == "fit" and "model.output" in cell.options}
     mistakes = {}
@@ -29,8 +29,8 @@ def check(cells: Sequence[Cell]) -> None:
         except (UserError, ArgumentError) as error:
             mistakes[cell.command] = " ".join(str(error).split())
     if mistakes:
-        told = dict.fromkeys(mistakes.values())
-        raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(told)}")
+        messages = dict.fromkeys(mistakes.values())
+        raise UserError(f"ablation: {len(mistakes)} of {len(cells)} cells cannot run, none was started: {'; '.join(messages)}")
 
 
 def _check(cell: Cell, made: set[str]) -> None:
@@ -57,12 +57,12 @@ def _check(cell: Cell, made: set[str]) -> None:
             raise UserError(f"{key}: expected some of {expected} (domain {domain.name}), found {', '.join(sorted(unknown))}")
     if model["pretrained"] not in made:
         adaptation = _class(config["model"]["class_path"])
-        found = read_config(pretrained_folder(model["pretrained"]))
-        if found["domain"] != domain.name or not adapts(adaptation, found["kind"]):
+        trained = read_config(pretrained_folder(model["pretrained"]))
+        if trained["domain"] != domain.name or not adapts(adaptation, trained["kind"]):
             expected = " or ".join(kinds_for(adaptation))
             raise UserError(
-                f"model.pretrained: expected a model of {domain.name} ({expected}), found one of {found['domain']} "
-                f"({found['kind']}) in {model['pretrained']}"
+                f"model.pretrained: expected a model of {domain.name} ({expected}), found one of {trained['domain']} "
+                f"({trained['kind']}) in {model['pretrained']}"
             )
     if "encoder" in model:
         load_encoder(model["encoder"], domain.concepts.table, model["revision"])
@@ -70,5 +70,5 @@ def _check(cell: Cell, made: set[str]) -> None:
 
 def _class(path: str) -> type["Adaptation"]:
     module, _, name = path.rpartition(".")
-    found: type[Adaptation] = getattr(importlib.import_module(module), name)
-    return found
+    adaptation: type[Adaptation] = getattr(importlib.import_module(module), name)
+    return adaptation

@@ -1,4 +1,4 @@
-"""Cells on a Ray cluster: placed by what they book, run again once where a process or a machine is lost."""
+"""Run cells on a Ray cluster, placed by their resources; a cell that loses its process or machine runs once more."""
 
 import fcntl
 import os
@@ -20,30 +20,30 @@ from ftl_lightning.errors import UserError, short
 from ftl_lightning.tensor_file import alone, write_text
 
 POLL = 0.5
-"""Seconds between two looks at what runs."""
+"""Seconds between two checks of the cells."""
 LOOK = 5.0
-"""Seconds between two looks at the cluster itself."""
+"""Seconds between two checks of the cluster."""
 HEAD_WAIT = 20.0
-"""Seconds that the head may be silent. Ray ends the whole process after 60, without a word that would help."""
+"""Maximum seconds without an answer of the head; Ray ends the process after 60 without a useful message."""
 NODE_WAIT = 60.0
-"""Seconds that a cell may wait for a machine which the cluster no longer has."""
+"""Maximum seconds that a cell waits for a machine that has left the cluster."""
 MOST_RUNS = 2
-"""Of one cell: one that costs its machine twice would cost the others, too."""
+"""Maximum runs of a cell, so that a cell that crashes machines does not crash them all."""
 _FOLDER = ".cells."
 
 
 @contextmanager
 def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Iterator[Run]:
-    """Connect to a Ray cluster for the length of the block; one that the caller is connected to already is used and left as it is.
+    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open.
 
     Args:
-        address: ``'HOST:PORT'`` of its head; ``'auto'`` for the one that this machine is a node of; ``'local'`` for this machine's
-            processors alone; empty for Ray's way: ``RAY_ADDRESS``, else a cluster that runs on this machine, else its processors.
+        address: ``'HOST:PORT'`` of the head; ``'auto'`` for the cluster of this machine; ``'local'`` for the processors of this
+            machine; empty for Ray's order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
         attempt: runs a cell on a machine of the cluster, in the current folder.
-        cells: that are to be run.
+        cells: cells to run.
 
     Raises:
-        UserError: where Ray is missing, no cluster answers, or no machine of it has room for one of the cells.
+        UserError: if Ray is missing, no cluster answers, or a cell fits on no machine.
     """
     try:
         import ray
@@ -71,24 +71,24 @@ def _connect(address: str) -> None:
         raise UserError("address: expected a Ray cluster that this machine is a node of, found none; start it by: ray start")
     if ":" in address and not _answers(address):
         raise UserError(f"address: expected the head of a Ray cluster at {short(address)}, found that nothing answers there")
-    os.environ.setdefault("RAY_worker_niceness", "0")  # by default workers stand back for everything else
+    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's default gives workers low priority
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
-        # By "auto" Ray also finds the token of a cluster that asks for one.
+        # With "auto" Ray also finds the token of the cluster.
         ray.init(address="auto" if here else address or "local", log_to_driver=False, include_dashboard=False)
     except (ConnectionError, RuntimeError, ValueError) as error:  # also for other versions of Ray or Python
         raise UserError(f"address: expected a Ray cluster at {here or address}, found: {short(str(error), 150)}") from error
 
 
 def _here() -> str:
-    """The address of the cluster that this machine is a node of; empty for none.
+    """The address of this machine's cluster; empty for none.
 
-    Ray itself trusts the file in which it stands, and tries for minutes to reach a cluster that was killed.
+    Ray itself trusts the file with the address, and tries for minutes to reach a killed cluster.
     """
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
     file = Path(folder, "ray", "ray_current_cluster")
     try:
-        if file.stat().st_uid not in (os.getuid(), 0):  # anyone may write there, and who runs a cluster runs code on its machines
+        if file.stat().st_uid not in (os.getuid(), 0):  # the folder is writable for anyone, and a cluster runs code
             return ""
         address = file.read_text("utf-8").strip()
     except OSError:
@@ -110,21 +110,21 @@ def _answers(address: str) -> bool:
 
 @dataclass
 class _Sent:
-    """A cell that was sent to the cluster, for the how many-th time, and the file by which it says where it has begun."""
+    """A cell on the cluster, with attempt number, and the file to which it writes its node when it begins."""
 
     cell: Cell
     runs: int
     begun: Path
     node: str = ""
     homeless: float = 0.0
-    """Since when no machine of the cluster has what it books, in seconds of a clock; 0 while one has."""
+    """Clock time in seconds since which the cell fits on no machine; 0 if it fits."""
 
 
 def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -> Iterator[tuple[Cell, Outcome]]:
     import ray
 
     address = ray.get_runtime_context().gcs_address
-    remote = ray.remote(max_retries=0)(_attempt_in)  # Ray would run a lost cell again without a word
+    remote = ray.remote(max_retries=0)(_attempt_in)  # otherwise Ray silently repeats lost cells
     with _begun_folder() as folder:
         waiting: dict[Any, _Sent] = {}
 
@@ -144,13 +144,13 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
             now = time.monotonic()
             _tell_begun(waiting.values(), tell)
             for task in ready:
-                one = waiting.pop(task)
+                ended = waiting.pop(task)
                 outcome, lost = _outcome(task)
-                if lost and one.runs < MOST_RUNS:
-                    tell(one.cell, "again", one.node, outcome.error)
-                    send(one.cell, one.runs + 1)
+                if lost and ended.runs < MOST_RUNS:
+                    tell(ended.cell, "again", ended.node, outcome.error)
+                    send(ended.cell, ended.runs + 1)
                 else:
-                    yield one.cell, replace(outcome, node=outcome.node or one.node)
+                    yield ended.cell, replace(outcome, node=outcome.node or ended.node)
             if ready or now - looked < LOOK:
                 continue
             looked = now
@@ -167,10 +167,10 @@ def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -
 
 
 def _expect_room(cells: Sequence[Cell]) -> None:
-    """Refuse cells that no machine of the cluster has room for, which would wait for ever.
+    """Refuse cells that fit on no machine of the cluster and would wait for ever.
 
     Raises:
-        UserError: naming the first.
+        UserError: naming the first such cell.
     """
     nodes = [node["Resources"] for node in _nodes()]
     for cell in cells:
@@ -188,50 +188,50 @@ def _nodes() -> list[dict[str, Any]]:
 
 
 def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
-    for one in waiting:
-        if not one.node and one.begun.is_file():
-            one.node = one.begun.read_text("utf-8") or "?"
-            tell(one.cell, "running", one.node, "")
+    for sent in waiting:
+        if not sent.node and sent.begun.is_file():
+            sent.node = sent.begun.read_text("utf-8") or "?"
+            tell(sent.cell, "running", sent.node, "")
 
 
 def _outcome(task: Any) -> tuple[Outcome, bool]:
-    """What became of a cell, and whether it was lost with the process or machine that ran it."""
+    """Outcome of a cell, and whether its process or machine was lost."""
     import ray
 
     try:
         return ray.get(task), False
-    except ray.exceptions.RayTaskError as error:  # our own code failed, as it would again
+    except ray.exceptions.RayTaskError as error:  # an error in our code; a second run would fail, too
         return Outcome(error=short(str(error.cause), 200)), False
     except ray.exceptions.RayError as error:
         return Outcome(error=f"{type(error).__name__}: {short(str(error).partition('. ')[0], 200)}"), True
 
 
 def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell, Outcome]]:
-    """Give up cells whose last machine has gone for good."""
+    """Give up cells that have fitted on no machine for :data:`NODE_WAIT`."""
     import ray
 
     nodes = [node["Resources"] for node in _nodes()]
-    for task, one in list(waiting.items()):
-        if one.node or any(one.cell.resources.fit(node) for node in nodes):
-            one.homeless = 0.0
+    for task, sent in list(waiting.items()):
+        if sent.node or any(sent.cell.resources.fit(node) for node in nodes):
+            sent.homeless = 0.0
             continue
-        one.homeless = one.homeless or now
-        if now - one.homeless > NODE_WAIT:
+        sent.homeless = sent.homeless or now
+        if now - sent.homeless > NODE_WAIT:
             ray.cancel(task)
             del waiting[task]
-            yield one.cell, Outcome(error=f"no machine of the cluster has {one.cell.resources} any more")
+            yield sent.cell, Outcome(error=f"no machine of the cluster has {sent.cell.resources} any more")
 
 
 @contextmanager
 def _begun_folder() -> Iterator[Path]:
-    """A hidden folder in the current one, in which cells say where they run. Those that killed processes left are removed."""
+    """Create a hidden folder in which cells write their node; folders of killed processes are removed."""
     with ExitStack() as stack:
-        with alone(Path.cwd()):  # none is taken for one that was left before it is held
+        with alone(Path.cwd()):  # protects new folders until they are locked
             for left in Path.cwd().glob(f"{_FOLDER}*"):
-                with suppress(OSError), _held(left):
+                with suppress(OSError), _locked(left):
                     shutil.rmtree(left)
             folder = Path(tempfile.mkdtemp(prefix=_FOLDER, dir=Path.cwd()))
-            stack.enter_context(_held(folder))
+            stack.enter_context(_locked(folder))
         try:
             yield folder
         finally:
@@ -239,11 +239,11 @@ def _begun_folder() -> Iterator[Path]:
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock.
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder.
 
     Raises:
-        OSError: where another process holds it.
+        OSError: if another process holds the lock.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -256,20 +256,20 @@ def _held(folder: Path) -> Iterator[None]:
 def _attempt_in(
     folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str, again: bool
 ) -> Outcome:
-    """Run a cell in the folder that all machines of a cluster share, with the modules that a person vouches for."""
+    """Run a cell in the shared folder of a cluster, with the modules that the user vouches for."""
     node = _node_name()
     if not Path(begun).parent.is_dir():
-        told = f"{folder}: expected a folder that all machines share, found that {node} does not have it; call ablate in one"
-        return Outcome(error=told, node=node)
+        message = f"{folder}: expected a folder that all machines share, found that {node} does not have it; call ablate in one"
+        return Outcome(error=message, node=node)
     os.chdir(folder)
-    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # as the command line has it; checkpoints may be read
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # as on the command line; checkpoints may be read
     write_text(begun, node)
     with trust.vouching(vouched):
         return replace(attempt(cell, known, again), node=node)
 
 
 def _node_name() -> str:
-    """The machine's name, and the first letters of the node's number: a machine may be several nodes."""
+    """Host name and the first letters of the node id, since a machine may run several nodes."""
     import ray
 
     return f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"

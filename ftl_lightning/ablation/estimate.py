@@ -1,4 +1,4 @@
-"""What a grid will cost, from cells that ended before."""
+"""Estimated cost of a grid, from completed cells."""
 
 import heapq
 from collections.abc import Callable, Mapping, Sequence
@@ -11,12 +11,12 @@ MINUTE, HOUR = 60.0, 3600.0
 
 
 def seconds_of(cell: Cell, entries: Mapping[str, Entry]) -> float | None:
-    """How long a cell takes: the mean of what was measured of it, or else of the nearest others.
+    """Duration of a cell: its measured duration, or else the mean over similar cells.
 
-    These are, in order: the same cell with other seeds; cells of the same configuration files, whose options differ.
+    Similar cells are, in order: the same cell with other seeds; cells of the same configuration files with other options.
 
     Returns:
-        Seconds; ``None`` where neither was measured.
+        Seconds; ``None`` without measurements.
     """
     measured = {name: entry for name, entry in entries.items() if entry.seconds}
     if cell.name in measured:
@@ -26,57 +26,57 @@ def seconds_of(cell: Cell, entries: Mapping[str, Entry]) -> float | None:
         lambda name, entry: entry.configs == cell.configs and name.startswith(f"{cell.verb} "),
     )
     for alike in nearest:
-        if found := [entry.seconds for name, entry in measured.items() if alike(name, entry)]:
-            return mean(found)
+        if seconds := [entry.seconds for name, entry in measured.items() if alike(name, entry)]:
+            return mean(seconds)
     return None
 
 
 def makespan(seconds: Sequence[Sequence[float]], workers: int) -> float:
-    """Seconds from start to end of stages, one after another, when each next cell goes to the first worker that is free.
+    """Total seconds of consecutive stages, when the next cell goes to the first free worker.
 
     Args:
-        seconds: of the cells of each stage, in order.
-        workers: cells that run side by side.
+        seconds: durations of the cells of each stage, in order.
+        workers: number of parallel cells.
     """
     total = 0.0
     for stage in seconds:
         free = [0.0] * workers
-        for one in stage:
-            heapq.heapreplace(free, free[0] + one)
+        for duration in stage:
+            heapq.heapreplace(free, free[0] + duration)
         total += max(free)
     return total
 
 
 def estimate(plan: Sequence[Sequence[Cell]], entries: Mapping[str, Entry], total: int, workers: int = 0) -> list[str]:
-    """Lines that say how many cells are to be run, and for how many hours, as far as that was measured.
+    """Lines with the number of cells to run and the estimated hours, if known.
 
     Args:
-        plan: the cells of each stage that are to be run.
-        entries: of the record.
-        total: cells of the whole plan.
-        workers: cells that run side by side; 0 for 1, 2, 4, 8 and so on, up to the number of cells.
+        plan: the cells to run of each stage.
+        entries: entries of the record.
+        total: number of cells of the whole plan.
+        workers: number of parallel cells; 0 for 1, 2, 4, 8 and so on, up to the number of cells.
     """
     cells = [cell for stage in plan for cell in stage]
     lines = [f"{total} cells: {total - len(cells)} need not be run, {len(cells)} to run"]
     if not cells:
         return lines
-    found = [[seconds_of(cell, entries) for cell in stage] for stage in plan]
-    known = [[one for one in stage if one is not None] for stage in found]
+    times = [[seconds_of(cell, entries) for cell in stage] for stage in plan]
+    known = [[time for time in stage if time is not None] for stage in times]
     count = sum(map(len, known))
-    itself = sum(entries[cell.name].seconds > 0 for cell in cells if cell.name in entries)
+    repeated = sum(entries[cell.name].seconds > 0 for cell in cells if cell.name in entries)
     if not count:
         return [*lines, "hours: not known, as no cell like them was measured; run one, for example with --shard, and ask again"]
     if count < len(cells):
-        names = [cell.name for cell, one in zip(cells, (one for stage in found for one in stage), strict=True) if one is None]
+        names = [cell.name for cell, time in zip(cells, (time for stage in times for time in stage), strict=True) if time is None]
         lines.append(f"not known: {len(names)} of them, none like which was measured, such as {names[0]}; their time comes on top")
-    lines.append(f"measured: {itself} of them before, {count - itself} estimated from other seeds or options of the same files")
+    lines.append(f"measured: {repeated} of them before, {count - repeated} estimated from other seeds or options of the same files")
     counts = [workers] if workers else [2**power for power in range((len(cells) - 1).bit_length() + 1)]
-    lines += [f"{number} at a time: {_told(makespan(known, number))}" for number in counts]
+    lines += [f"{number} at a time: {_time(makespan(known, number))}" for number in counts]
     return lines
 
 
-def _told(seconds: float) -> str:
-    """A time in the unit that it has a few of."""
+def _time(seconds: float) -> str:
+    """Format a time in hours, minutes or seconds."""
     if seconds >= HOUR:
         return f"{seconds / HOUR:.1f} hours"
     return f"{seconds / MINUTE:.0f} minutes" if seconds >= 2 * MINUTE else f"{seconds:.0f} seconds"

@@ -1,4 +1,4 @@
-"""The end of a cell, and how what runs cells is called."""
+"""Outcomes of cells, and types of functions that run cells."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 State = Literal["queued", "running", "again", "done", "failed"]
-"""Of a cell; ``again`` is queued a second time, after its process or its machine was lost."""
+"""State of a cell; ``again`` is queued once more, after its process or machine was lost."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a cell.
+    """Outcome of a cell.
 
     Attributes:
-        rows: of results; ``None`` for none.
-        note: in a few words.
-        error: of a cell that failed, one line.
-        seconds: that it took; 0 where nothing had to be run.
-        node: the machine that ran it.
+        rows: rows of results, or ``None``.
+        note: a short note.
+        error: error of a failed cell, in one line.
+        seconds: duration; 0 if nothing was run.
+        node: the machine that ran the cell.
     """
 
     rows: "pd.DataFrame | None" = None
@@ -33,8 +33,8 @@ class Outcome:
 
 
 Tell = Callable[[Cell, State, str, str], None]
-"""Is told that a cell is in a state from now on, the machine, and a note."""
+"""Callback for a new state of a cell, with machine and note."""
 Run = Callable[[Sequence[Cell], set[str], Tell], Iterator[tuple[Cell, Outcome]]]
-"""Runs cells, given the configuration hashes that need not be run; yields each with its outcome as it ends."""
+"""Runs cells, given the configuration hashes that need not run; yields each cell with its outcome."""
 Attempt = Callable[[Cell, set[str], bool], Outcome]
-"""Runs one cell, unless its configuration hash is among those; for the second time, if it was lost before."""
+"""Runs a cell, unless its configuration hash is known; the flag says whether it was lost before."""

@@ -1,4 +1,4 @@
-"""The plan of an ablation: stages as they stand in a configuration file, and the cells that they come to."""
+"""The plan of an ablation: stages of a configuration file, and their cells."""
 
 import itertools
 import json
@@ -15,20 +15,20 @@ from ftl_lightning.errors import UserError
 
 @dataclass(frozen=True)
 class Stage:
-    """One verb with a grid of options. ``{seed}`` in any value stands for the seed, ``{name}`` for a value of ``each``.
+    """A verb with a grid of options. In values, ``{seed}`` stands for the seed, ``{name}`` for a value of ``each``.
 
     Attributes:
         verb: ``fit`` or ``invert``.
-        config: its configuration file, or several that are added to one another in order.
-        name: stands in the names of the cells, for stages that differ in their options alone.
-        each: names with a list of texts each, which stand in the other values; the stage runs for their product.
-        options: that all cells share, by their names on the command line.
-        grid: options with a list of values each; the cells are their product.
-        done: a file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content
-            is not looked at: remove it after a change of the stage's configuration.
-        seeds: of the ablation's seeds those that the stage runs for; empty for all.
-        resources: that each of its cells books on a cluster: ``cpus`` (1 if it is not named), ``gpus``, ``memory_gb``, and any
-            resource that the nodes of a Ray cluster were started with.
+        config: configuration file, or several files to merge in order.
+        name: part of the cells' names, for stages that differ only in their options.
+        each: lists of texts by name, for placeholders in other values; the stage runs for their product.
+        options: options of all cells, by their names on the command line.
+        grid: lists of values by option; the cells are their product.
+        done: file whose presence means that the stage need not run, such as a pretrained model; empty for none. Its content is
+            not checked: remove it after a change of the stage's configuration.
+        seeds: subset of the ablation's seeds; empty for all.
+        resources: resources of each cell on a cluster: ``cpus`` (default 1), ``gpus``, ``memory_gb``, and any resource with which
+            the nodes of a Ray cluster were started.
     """
 
     verb: Literal["fit", "invert"]
@@ -43,17 +43,17 @@ class Stage:
 
     @property
     def configs(self) -> list[str]:
-        """Its configuration files.
+        """The configuration files.
 
         Raises:
-            UserError: for none.
+            UserError: if there is none.
         """
         if not self.config:
             raise UserError("config: expected a configuration file or a list of them, found none")
         return [self.config] if isinstance(self.config, str) else self.config
 
     def cells(self, seed: int) -> Iterator["Cell"]:
-        """Every cell for one seed."""
+        """The cells of a seed."""
         if self.seeds and seed not in self.seeds:
             return
         for texts in itertools.product(*self.each.values()):
@@ -72,7 +72,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Cell:
-    """One run: a verb, its configuration files, options, the file that says that it need not run, its name, and what it books."""
+    """A run: verb, configuration files, options, ``done`` file, name and resources."""
 
     verb: Literal["fit", "invert"]
     configs: tuple[str, ...]
@@ -83,18 +83,18 @@ class Cell:
 
     @property
     def arguments(self) -> list[str]:
-        """As on the command line, without the verb."""
+        """Command-line arguments, without the verb."""
         files = [f"--config={config}" for config in self.configs]
         return [*files, *(f"--{key}={value}" for key, value in self.options.items())]
 
     @property
     def command(self) -> str:
-        """What runs the cell by hand."""
+        """Shell command of the cell."""
         return shlex.join(("python", "-m", "ftl_lightning", self.verb, *self.arguments))
 
     @property
     def folder(self) -> str:
-        """The name as that of a folder."""
+        """The name as a folder name."""
         return re.sub(r"[^\w.+-]+", "_", self.name).strip("_")
 
     def __str__(self) -> str:
@@ -109,14 +109,14 @@ def _text(value: Any, names: Mapping[str, str]) -> str:
 
 
 def part(plan: Sequence[Sequence[Cell]], shard: str) -> list[list[Cell]]:
-    """Every n-th cell of each stage of a plan, for shard i of n (``'i/n'``); counting goes on from stage to stage.
+    """Shard i of n (``'i/n'``) of a plan: every n-th cell, counted across stages.
 
     Raises:
-        UserError: for another text.
+        UserError: for an invalid shard.
     """
-    found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
-    if not found or int(found[1]) > int(found[2]):
+    match = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
+    if not match or int(match[1]) > int(match[2]):
         raise UserError(f"shard: expected 'number/shards' such as 3/8, found {shard!r}")
-    number, shards = int(found[1]), int(found[2])
+    number, shards = int(match[1]), int(match[2])
     position = itertools.count()
     return [[cell for cell in cells if next(position) % shards == number - 1] for cells in plan]

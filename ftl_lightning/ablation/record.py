@@ -1,4 +1,4 @@
-"""What became of each cell: a file beside the results, which all shards write, and the table that it is read in."""
+"""States of cells: a file beside the results, written by all shards, and its table."""
 
 import json
 import re
@@ -24,15 +24,15 @@ _SEED = re.compile(r", seed \d+$")
 
 @dataclass(frozen=True)
 class Entry:
-    """What became of a cell.
+    """State of a cell.
 
     Attributes:
-        state: the last that was told.
-        configs: its configuration files.
-        node: the machine that ran it last.
-        runs: how often it was begun by the last command that ran it.
-        seconds: that its last complete run took; 0 for none.
-        note: its outcome, or the error.
+        state: last reported state.
+        configs: configuration files of the cell.
+        node: last machine of the cell.
+        runs: number of attempts by the last command.
+        seconds: duration of the last complete run; 0 for none.
+        note: outcome, or the error.
     """
 
     state: Literal["queued", "running", "again", "done", "failed"] = "queued"
@@ -44,12 +44,12 @@ class Entry:
 
 
 def record_path(results: str | Path) -> Path:
-    """The file beside a results file: ``results/agent.csv`` has ``results/agent.cells.json``."""
+    """The record of a results file: ``results/agent.cells.json`` for ``results/agent.csv``."""
     return Path(results).with_suffix(".cells.json")
 
 
 def read_record(results: str | Path) -> dict[str, Entry]:
-    """Entries by the names of their cells; none where there is no file.
+    """Read the entries by cell name; empty if there is no file.
 
     Raises:
         UserError: for a damaged file.
@@ -62,20 +62,20 @@ def read_record(results: str | Path) -> dict[str, Entry]:
         kind, version = (content.get("kind"), content.get("format")) if isinstance(content, dict) else (None, None)
         if (kind, version) != (KIND, FORMAT):
             raise UserError(f"expected {KIND} of format {FORMAT}, found another file; remove it, it holds no results")
-        found: dict[str, Entry] = expect_type(content.get("cells"), dict[str, Entry], "cells")
-        return found
+        entries: dict[str, Entry] = expect_type(content.get("cells"), dict[str, Entry], "cells")
+        return entries
 
 
 def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "", note: str = "", seconds: float = 0.0) -> None:
-    """Put down that cells are in a state from now on. Processes that write the same file wait for one another.
+    """Record a new state of cells. The file is locked against other processes.
 
     Args:
         results: the results file.
-        cells: all in the same state.
-        state: from now on.
-        node: the machine; empty for the one known before.
-        note: the outcome, the error, or why it runs again.
-        seconds: that a run which ended took; 0 to keep what is known.
+        cells: the cells.
+        state: the new state.
+        node: the machine; empty to keep the known machine.
+        note: the outcome, the error, or the reason for another run.
+        seconds: duration of a completed run; 0 to keep the known duration.
     """
     path = record_path(results)
     with alone(path.parent):
@@ -98,25 +98,25 @@ def tell(results: str | Path, cells: Sequence[Cell], state: State, node: str = "
 
 
 def without_seed(name: str) -> str:
-    """The name of a cell without its seed: cells that share it take about as long."""
+    """The name of a cell without its seed; cells with the same name take about as long."""
     return _SEED.sub("", name)
 
 
 def table(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> Table:
-    """How far cells are: one line for each, with its state, machine, runs, seconds, and outcome or error.
+    """Table of cells with state, machine, runs, seconds, and outcome or error.
 
     Args:
-        entries: of the record.
-        cells: of the plan, in order; one without an entry was never begun.
+        entries: entries of the record.
+        cells: cells of the plan, in order; cells without an entry were never started.
     """
-    found = {cell.name: entries.get(cell.name, Entry()) for cell in cells}
-    shown = Table(title=counted([entry.state for entry in found.values()]))
+    known = {cell.name: entries.get(cell.name, Entry()) for cell in cells}
+    shown = Table(title=counted([entry.state for entry in known.values()]))
     for name in ("cell", "state", "node"):
         shown.add_column(name)
     for name in ("runs", "seconds"):
         shown.add_column(name, justify="right")
     shown.add_column("note")
-    for name, entry in found.items():
+    for name, entry in known.items():
         seconds = f"{entry.seconds:.0f}" if entry.seconds else ""
         runs = str(entry.runs or "")
         shown.add_row(*(literal(text) for text in (name, entry.state, entry.node, runs, seconds, short(entry.note, 100))))
@@ -124,14 +124,14 @@ def table(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> Table:
 
 
 def counted(states: Sequence[str]) -> str:
-    """Cells by state, in one line: ``'4 cells: 1 queued, 3 done'``."""
+    """Count cells by state: ``'4 cells: 1 queued, 3 done'``."""
     parts = [f"{states.count(state)} {state}" for state in get_args(State) if state in states]
     cells = f"{len(states)} {'cell' if len(states) == 1 else 'cells'}"
     return f"{cells}: {', '.join(parts)}" if parts else cells
 
 
 def by_node(entries: Mapping[str, Entry], cells: Sequence[Cell]) -> list[str]:
-    """The same by machine, in one line for each."""
-    found = [entries[cell.name] for cell in cells if cell.name in entries]
-    nodes = sorted({entry.node for entry in found if entry.node})
-    return [f"{node}: {counted([entry.state for entry in found if entry.node == node])}" for node in nodes]
+    """Counts of cells by state, in a line for each machine."""
+    known = [entries[cell.name] for cell in cells if cell.name in entries]
+    nodes = sorted({entry.node for entry in known if entry.node})
+    return [f"{node}: {counted([entry.state for entry in known if entry.node == node])}" for node in nodes]

@@ -1,4 +1,4 @@
-"""What a cell asks of the machine that runs it, in the words of Ray and of Slurm."""
+"""Resources of a cell, in terms of Ray and Slurm."""
 
 import math
 import re
@@ -9,20 +9,20 @@ from typing import Any
 from ftl_lightning.errors import UserError, shown
 
 CPUS, GPUS, MEMORY = "cpus", "gpus", "memory_gb"
-"""Names that every cluster knows; others are a Ray cluster's own."""
+"""Resources of every cluster; others are custom resources of Ray."""
 GIGABYTE = 10**9
 _NAME = re.compile(r"[A-Za-z][\w.-]{0,63}")
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What one cell books.
+    """Resources of a cell.
 
     Attributes:
-        cpus: processors; whole, or a fraction below 1.
-        gpus: likewise.
-        memory_gb: gigabytes of 10^9 bytes; 0 for no wish. Ray books them and does not watch them, Slurm does.
-        custom: a Ray cluster's own resources by name, such as ``{'big': 1}`` of nodes started with that resource.
+        cpus: number of processors; whole, or a fraction below 1.
+        gpus: number of GPUs; likewise.
+        memory_gb: gigabytes of 10^9 bytes; 0 for no request. Slurm enforces the limit, Ray does not.
+        custom: custom resources of a Ray cluster by name, such as ``{'big': 1}`` of nodes started with it.
     """
 
     cpus: float = 1
@@ -38,10 +38,10 @@ class Resources:
         return options | ({"resources": dict(self.custom)} if self.custom else {})
 
     def fit(self, node: Mapping[str, float]) -> bool:
-        """Whether a node of a Ray cluster has room when nothing else runs on it.
+        """Whether an idle node of a Ray cluster has these resources.
 
         Args:
-            node: what it has, in Ray's names (memory in bytes).
+            node: its resources, in Ray's names (memory in bytes).
         """
         needs = {"CPU": self.cpus, "GPU": self.gpus, "memory": self.memory_gb * GIGABYTE, **self.custom}
         return all(node.get(name, 0) >= amount for name, amount in needs.items())
@@ -52,14 +52,14 @@ class Resources:
 
 
 def read_resources(asked: Mapping[str, Any], key: str = "resources") -> Resources:
-    """Resources as a configuration names them.
+    """Read resources from a configuration.
 
     Args:
         asked: amounts by name.
-        key: where they stand, for messages.
+        key: key of the configuration, for messages.
 
     Raises:
-        UserError: for a name that is none, or an amount that cannot be booked.
+        UserError: for an invalid name or amount.
     """
     for name, amount in asked.items():
         if not _NAME.fullmatch(name):
@@ -68,5 +68,5 @@ def read_resources(asked: Mapping[str, Any], key: str = "resources") -> Resource
         if not number or (name != MEMORY and amount > 1 and amount % 1):
             expected = "a number of 0 or more" if name == MEMORY else "a whole number of 0 or more, or a fraction of 1"
             raise UserError(f"{key}.{name}: expected {expected}, found {shown(amount)}")
-    own = {name: amount for name, amount in asked.items() if name not in (CPUS, GPUS, MEMORY)}
-    return Resources(asked.get(CPUS, 1), asked.get(GPUS, 0), asked.get(MEMORY, 0), own)
+    custom = {name: amount for name, amount in asked.items() if name not in (CPUS, GPUS, MEMORY)}
+    return Resources(asked.get(CPUS, 1), asked.get(GPUS, 0), asked.get(MEMORY, 0), custom)

@@ -1,4 +1,4 @@
-"""Running a plan, here or on a cluster, cell by cell in the same way."""
+"""Run a plan cell by cell, here or on a cluster."""
 
 import socket
 import tempfile
@@ -38,36 +38,36 @@ def run_ablation(
     address: str = "",
     only: Sequence[int] = (),
 ) -> None:
-    """Run all cells of all seeds, stage after stage. A cell that fails does not stop the others; failures are listed at the end.
+    """Run all cells of all seeds, stage after stage. A failed cell does not stop the others; failures are listed at the end.
 
-    What becomes of each cell is put down beside the results, see :mod:`~ftl_lightning.ablation.record`.
+    The state of each cell is recorded beside the results, see :mod:`~ftl_lightning.ablation.record`.
 
     Args:
-        stages: in order; a later one may read what an earlier one wrote.
-        seeds: each stage runs once a seed.
+        stages: stages in order; a stage may read files of earlier stages.
+        seeds: each stage runs once per seed.
         results: results file.
-        shard: ``'3/8'`` for the third of eight parts of the plan, for as many machines or processes.
-        executor: ``'local'``, one cell after another in this process; ``'ray'``, as many side by side as a cluster has room for,
-            whose machines share this folder. A cell that is lost with its process or machine runs again, once.
-        root: ``data.root`` of every cell; empty for what their configurations say.
-        address: of the Ray cluster, see :func:`~ftl_lightning.ablation.cluster.cluster`.
+        shard: ``'3/8'`` for the third of eight parts of the plan, run by different machines or processes.
+        executor: ``'local'`` runs cells one by one in this process; ``'ray'`` runs cells in parallel on a cluster whose machines
+            share this folder. A cell that loses its process or machine runs once more.
+        root: ``data.root`` of every cell; empty for the value of the configurations.
+        address: address of the Ray cluster, see :func:`~ftl_lightning.ablation.cluster.cluster`.
         only: numbers of the stages to run, from 1; empty for all.
 
     Raises:
-        UserError: before anything runs, for cells that cannot; at the end, naming the cells that failed.
+        UserError: before the first run, for cells that cannot run; at the end, naming failed cells.
     """
     from ftl_lightning.evaluation.results import add_rows
 
     plan = part(list(planned(stages, seeds, root, only).values()), shard)
     every = [cell for cells in plan for cell in cells]
     check(every)
-    read_record(results)  # a damaged one is told before anything runs
+    read_record(results)  # fails early if damaged
     total, number, failed = len(every), 0, []
     start = time.monotonic()
     noted = partial(tell, results)
     states: dict[str, State] = {cell.name: "queued" for cell in every}
 
-    def told_state(cell: Cell, state: State, node: str, note: str) -> None:
+    def record_state(cell: Cell, state: State, node: str, note: str) -> None:
         noted([cell], state, node, note)
         states[cell.name] = state
         advance(0, counted(list(states.values())))
@@ -80,11 +80,11 @@ def run_ablation(
     ):
         noted(every, "queued")
         for cells in plan:
-            for cell, outcome in run(cells, known_hashes(results), told_state):
+            for cell, outcome in run(cells, known_hashes(results), record_state):
                 number += 1
                 minutes = (time.monotonic() - start) / number * (total - number) / 60
-                told = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
-                say(f"[{number}/{total}, about {minutes:.0f} min left] {cell}: {told}")
+                note = f"failed: {outcome.error}\n  {cell.command}" if outcome.error else outcome.note
+                say(f"[{number}/{total}, about {minutes:.0f} min left] {cell}: {note}")
                 if outcome.rows is not None:
                     add_rows(results, outcome.rows)
                 if outcome.error:
@@ -102,13 +102,13 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
     """The cells of each stage by its number, for all seeds.
 
     Args:
-        stages: in order.
-        seeds: each stage runs once a seed.
-        root: ``data.root`` of every cell; empty for what their configurations say.
+        stages: stages in order.
+        seeds: each stage runs once per seed.
+        root: ``data.root`` of every cell; empty for the value of the configurations.
         only: numbers of the stages, from 1; empty for all.
 
     Raises:
-        UserError: for no seeds, or a number that no stage has.
+        UserError: for no seeds, or an unknown number of a stage.
     """
     if not seeds:
         raise UserError("seeds: expected one or more, found none")
@@ -121,12 +121,12 @@ def planned(stages: Sequence[Stage], seeds: Sequence[int], root: str = "", only:
 
 
 def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0) -> None:
-    """Print how many cells are to be run and for how many hours, as far as that was measured; nothing runs.
+    """Print the number of cells to run and the estimated hours, as far as known; nothing runs.
 
     Args:
         plan: the cells of each stage.
         results: results file.
-        workers: cells that run side by side; 0 for several numbers of them.
+        workers: number of parallel cells; 0 for several numbers.
 
     Raises:
         UserError: for cells that cannot run.
@@ -145,12 +145,12 @@ def show_estimate(plan: Sequence[Sequence[Cell]], results: str, workers: int = 0
 
 
 def _is_made(cell: Cell) -> bool:
-    """Whether the file is there that says that a cell need not be run."""
+    """Whether the ``done`` file of a cell exists."""
     return bool(cell.done) and Path(cell.done).is_file()
 
 
 def _is_done(cell: Cell, known: set[str]) -> bool:
-    """Whether a cell need not be run. One whose pretrained model another cell is yet to make must."""
+    """Whether a cell need not run; a cell whose pretrained model is missing must run."""
     if _is_made(cell):
         return True
     if cell.verb == "fit" or not known:
@@ -163,7 +163,7 @@ def _is_done(cell: Cell, known: set[str]) -> bool:
 
 
 def show_cells(results: str, cells: Sequence[Cell]) -> None:
-    """Print the table of what became of cells, and their states by machine."""
+    """Print the table of cells, and their states by machine."""
     from ftl_lightning.evaluation.summary import show
 
     entries = read_record(results)
@@ -189,18 +189,18 @@ def _one_after_another(cells: Sequence[Cell], known: set[str], tell: Tell) -> It
 
 
 def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
-    """Run a cell, unless its results are known; an error of any kind becomes its outcome.
+    """Run a cell, unless its results are known; any error becomes its outcome.
 
     Args:
-        cell: of a plan.
-        known: configuration hashes that need not be run.
-        again: whether it was begun before and lost: a pretraining then goes on from its last checkpoint, if it has one.
+        cell: the cell.
+        known: configuration hashes that need not run.
+        again: whether the cell was lost before; pretraining then resumes from its last checkpoint, if any.
     """
     if _is_made(cell):
         return Outcome(note="done before")
     from ftl_lightning.evaluation.results import read_rows
     from ftl_lightning.learning.checkpoint import last_checkpoint
-    from ftl_lightning.lightning_cli import build  # seconds of import that parsing the plan does not need
+    from ftl_lightning.lightning_cli import build  # slow import, not needed to parse the plan
 
     say(cell)
     with tempfile.TemporaryDirectory() as folder, log_folder.run():
@@ -214,7 +214,7 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
             getattr(line.trainer, cell.verb)(line.model, datamodule=line.datamodule, **more)
         except (UserError, ArgumentError) as error:
             return Outcome(error=str(error))
-        except Exception as error:  # a fault of ours or of the machine must not cost the other cells
+        except Exception as error:  # a bug or machine error must not stop other cells
             traceback.print_exc()
             return Outcome(error=repr(error))
         rows = read_rows(path) if path.is_file() else None
@@ -223,7 +223,7 @@ def attempt(cell: Cell, known: set[str], again: bool = False) -> Outcome:
 
 
 def _log(cell: Cell) -> list[str]:
-    """The option that names the log folder of a cell after it, unless the plan names it."""
+    """The option that names the log folder after the cell, unless the plan sets it."""
     option = "trainer.logger.init_args.version"
     trainers = [load(config, cell.verb).get("trainer", {}) for config in cell.configs]
     logger = next((trainer["logger"] for trainer in reversed(trainers) if "logger" in trainer), None)
@@ -240,7 +240,7 @@ def _hash(line: "CommandLine") -> str:
 
 
 def known_hashes(results: str) -> set[str]:
-    """The configuration hashes of a results file's rows; none where there is no file."""
+    """The configuration hashes in a results file; empty if there is no file."""
     from ftl_lightning.evaluation.results import read_rows
 
     return set(read_rows(results)["config_hash"]) if Path(results).is_file() else set()

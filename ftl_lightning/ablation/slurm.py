@@ -1,4 +1,4 @@
-"""A grid as array jobs of Slurm: scripts for sbatch, each a set of stages whose cells wait for nothing but earlier scripts."""
+"""Array jobs of Slurm for a grid: scripts for sbatch, whose stages depend on earlier scripts only."""
 
 import math
 import re
@@ -17,18 +17,18 @@ from ftl_lightning.errors import UserError, shown
 from ftl_lightning.tensor_file import write_text
 
 MOST_JOBS = 1000
-"""Of an array, in Slurm's own default."""
+"""Maximum jobs of an array by Slurm's default."""
 OWN = ("array", "ntasks", "wrap")
-"""Options of sbatch that the scripts set themselves."""
+"""Options of sbatch that the scripts set."""
 _CPUS = "cpus-per-task"
 _OPTION = re.compile(r"[a-z][a-z-]{0,39}")
 _VALUE = re.compile(r"[\w.,:/@%+=\[\]*-]{0,200}")
-"""What stands in a line that sbatch reads: nothing that would end it or begin another word."""
+"""Values of options: no characters that end a line or begin another word."""
 
 
 @dataclass(frozen=True)
 class Wave:
-    """Stages that can run at the same time, by number, and their cells."""
+    """Numbers of stages that can run in parallel, and their cells."""
 
     numbers: tuple[int, ...]
     cells: tuple[Cell, ...]
@@ -38,7 +38,7 @@ class Wave:
 
 
 def waves(plan: Mapping[int, Sequence[Cell]]) -> list[Wave]:
-    """Stages in groups: a group begins where a cell reads what one of the group before writes, such as a pretrained model.
+    """Group stages: a group begins when a cell reads an output of the previous group, such as a pretrained model.
 
     Args:
         plan: the cells of each stage by its number, in order.
@@ -51,32 +51,32 @@ def waves(plan: Mapping[int, Sequence[Cell]]) -> list[Wave]:
             made = set()
         groups[-1].append(number)
         made |= {cell.options["model.output"] for cell in cells if "model.output" in cell.options}
-    found = [Wave(tuple(group), tuple(cell for number in group for cell in plan[number])) for group in groups]
-    return [wave for wave in found if wave.cells]
+    grouped = [Wave(tuple(group), tuple(cell for number in group for cell in plan[number])) for group in groups]
+    return [wave for wave in grouped if wave.cells]
 
 
 def _reads(cell: Cell, made: set[str]) -> bool:
     values = [value for key, value in cell.options.items() if key != "model.output"]
-    return any(value == one or value.startswith(f"{one}/") for value in values for one in made)
+    return any(value == path or value.startswith(f"{path}/") for value in values for path in made)
 
 
 def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping[str, str] = {}) -> str:
-    """The script of one array, whose every job runs a shard of the cells.
+    """The script of an array, in which each job runs a shard of the cells.
 
     Args:
-        wave: of the plan.
+        wave: a wave of the plan.
         plan: the plan's configuration file.
-        folder: that all machines share; the jobs run in it.
-        jobs: of the array; 0 for one for each cell, at most :data:`MOST_JOBS`.
-        options: of sbatch by name; an empty value for one that takes none.
+        folder: working folder of the jobs, shared by all machines.
+        jobs: number of jobs; 0 for a job per cell, at most :data:`MOST_JOBS`.
+        options: options of sbatch by name; empty values for flags.
 
     Raises:
-        UserError: for an option that could be misread, or a resource that Slurm does not know.
+        UserError: for an option that sbatch could misread, or a resource that Slurm does not know.
     """
     jobs = min(jobs or MOST_JOBS, len(wave.cells))
     cpus = math.ceil(max(cell.resources.cpus for cell in wave.cells)) or 1
     name = re.sub(r"[^\w.-]+", "_", Path(plan.stem).stem)
-    lines = {"job-name": name, "array": f"1-{jobs}", "ntasks": "1", _CPUS: f"{cpus}", **_asked(wave.cells), **_checked(options)}
+    lines = {"job-name": name, "array": f"1-{jobs}", "ntasks": "1", _CPUS: f"{cpus}", **_booked(wave.cells), **_checked(options)}
     header = [f"#SBATCH --{name}={value}" if value else f"#SBATCH --{name}" for name, value in lines.items()]
     trusted = [word for name in sorted(trust.vouched()) for word in (trust.OPTION, name)]
     only = f"[{', '.join(map(str, wave.numbers))}]"
@@ -86,17 +86,17 @@ def script(wave: Wave, plan: Path, folder: Path, jobs: int = 0, options: Mapping
         ': "${SLURM_ARRAY_TASK_ID:?submit this file by sbatch}"',
         f"cd -- {shlex.quote(str(folder))}",
         f'export OMP_NUM_THREADS="${{OMP_NUM_THREADS:-{lines[_CPUS]}}}"',
-        # srun does not take over the number of processors by itself.
+        # srun does not inherit the number of processors.
         f'exec srun --ntasks=1 --{_CPUS}={lines[_CPUS]} {shlex.join(command)} --shard "$SLURM_ARRAY_TASK_ID/{jobs}"',
     ]
-    told = f"# {len(wave.cells)} cells ({wave}) in {jobs} jobs; a job that is submitted again leaves out what is in the results."
-    return "\n".join(["#!/bin/bash", *header, told, *body]) + "\n"
+    comment = f"# {len(wave.cells)} cells ({wave}) in {jobs} jobs; a job that is submitted again leaves out what is in the results."
+    return "\n".join(["#!/bin/bash", *header, comment, *body]) + "\n"
 
 
-def _asked(cells: Sequence[Cell]) -> dict[str, str]:
-    """What the cell that books most of it books, in whole numbers."""
-    if own := next((cell for cell in cells if cell.resources.custom), None):
-        name = next(iter(own.resources.custom))
+def _booked(cells: Sequence[Cell]) -> dict[str, str]:
+    """Maximum of each resource over the cells, in whole numbers."""
+    if custom := next((cell for cell in cells if cell.resources.custom), None):
+        name = next(iter(custom.resources.custom))
         raise UserError(f"resources.{name}: expected {CPUS}, {GPUS} or {MEMORY}, which Slurm knows; name others by --sbatch")
     gpus = math.ceil(max(cell.resources.gpus for cell in cells))
     memory = math.ceil(max(cell.resources.memory_gb for cell in cells) * 1000)
@@ -120,27 +120,27 @@ def write_scripts(
     jobs: int = 0,
     options: Mapping[str, str] = {},
 ) -> list[str]:
-    """Write a grid's scripts, and beside them its plan as it stands now: changes of its file do not reach jobs that wait.
+    """Write the scripts of a grid, and a copy of its plan, so that waiting jobs do not see later changes.
 
     Args:
-        file: to write, ``grid.sh``; with several waves ``grid.1.sh``, ``grid.2.sh``. The plan is ``grid.sh.yaml``.
-        stages: of the plan.
+        file: output file ``grid.sh``; with several waves ``grid.1.sh``, ``grid.2.sh``. The plan is ``grid.sh.yaml``.
+        stages: stages of the plan.
         plan: the cells of each stage by its number.
-        keys: of the plan's file beside the stages: results, seeds, root.
-        jobs: of each array; 0 for one for each cell.
-        options: of sbatch.
+        keys: keys of the plan's file beside the stages: results, seeds, root.
+        jobs: number of jobs of each array; 0 for a job per cell.
+        options: options of sbatch.
 
     Returns:
-        The commands that submit them, in order.
+        The submit commands, in order.
 
     Raises:
         UserError: as :func:`script`; nothing is written.
     """
     file, folder = Path(file), Path.cwd()
     written = folder / f"{file}.yaml"
-    found = waves(plan)
-    names = [file] if len(found) == 1 else [file.with_suffix(f".{number}{file.suffix}") for number in range(1, len(found) + 1)]
-    texts = [script(wave, written, folder, jobs, options) for wave in found]
+    parts = waves(plan)
+    names = [file] if len(parts) == 1 else [file.with_suffix(f".{number}{file.suffix}") for number in range(1, len(parts) + 1)]
+    texts = [script(wave, written, folder, jobs, options) for wave in parts]
     content = {**keys, "stages": [_plain(asdict(stage)) for stage in stages]}
     write_text(written, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
     commands = []
@@ -153,7 +153,7 @@ def write_scripts(
 
 
 def _plain(value: object) -> object:
-    """Lists and dicts all the way down, as YAML has them."""
+    """Convert to nested lists and dictionaries for YAML."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value
+        return {str(key): _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

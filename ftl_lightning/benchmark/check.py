@@ -1,7 +1,6 @@
-"""Checking a submission: its form, that it is whole, that its numbers agree, and a part of them by running it again.
+"""Check a submission: its form, completeness and consistency, and a part of its numbers by running it again.
 
-A file decides nothing here but numbers and names of suites and concepts, which have to be known. No code that it names is run: the
-method is the one that the person at the keyboard names.
+Only numbers and known names of suites and concepts are read from a file. No code that it names is run: the user names the method.
 """
 
 import re
@@ -20,22 +19,22 @@ from ftl_lightning.version import __version__
 
 HASH = re.compile(r"[0-9a-f]{16}")
 NAME = re.compile(r"[\w .+()-]{1,60}")
-"""What a method may be called."""
+"""Allowed names of methods."""
 ROUNDING = 2e-6
-"""Of values with six decimals, twice."""
+"""Tolerance for values rounded to six decimals."""
 ERRORS = 3
-"""Standard errors that a rate may differ by on another machine, where learning amplifies rounding."""
+"""Tolerance of rates in standard errors on another machine, where learning amplifies rounding."""
 LEAST, MOST = 0.0, 1.0
 
 
 def expect_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
-    """Read a submission and refuse one that is not whole or does not agree with itself and the frozen suites.
+    """Read a submission and check its completeness and its agreement with itself and the frozen suites.
 
     Returns:
-        it, and its suites by name.
+        The submission, and its suites by name.
 
     Raises:
-        UserError: naming the file, the first thing that is wrong, what was expected and what was found.
+        UserError: naming the file and the first error, with expected and actual value.
     """
     submission = Submission.load(path)
     with about(path):
@@ -46,9 +45,9 @@ def expect_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]
     return submission, suites
 
 
-def _expect(good: bool, key: str, expected: object, found: object) -> None:
+def _expect(good: bool, key: str, expected: object, value: object) -> None:
     if not good:
-        raise UserError(f"{key}: expected {expected}, found {short(str(found), 80)}")
+        raise UserError(f"{key}: expected {expected}, found {short(str(value), 80)}")
 
 
 def _expect_header(submission: Submission) -> None:
@@ -97,8 +96,8 @@ def _expect_run(run: Run, suite: BenchmarkSuite, where: str) -> None:
     known = suite.data.get(str(run.seed), {})
     parts = [part for part in known if part in ((TRAINING, *ASKED) if run.origin == PRETRAINED else ASKED)]
     for part in parts:
-        found = run.data.get(part, "none")
-        _expect(found == known[part].hash, f"{where}: data.{part}", f"the frozen data's hash {known[part].hash}", found)
+        value = run.data.get(part, "none")
+        _expect(value == known[part].hash, f"{where}: data.{part}", f"the frozen data's hash {known[part].hash}", value)
     _expect(set(run.data) == set(parts), f"{where}: data", ", ".join(parts) or "nothing", ", ".join(run.data))
     for key, seconds in (("seconds", run.seconds), ("pretraining_seconds", run.pretraining_seconds)):
         _expect(seconds >= 0, f"{where}: {key}", "0 or more", seconds)
@@ -110,63 +109,63 @@ def _expect_run(run: Run, suite: BenchmarkSuite, where: str) -> None:
 
 
 def _expect_rows(rows: Sequence[Row], suite: BenchmarkSuite, where: str, measures: Sequence[str]) -> None:
-    """Every concept of the test once, with the measures, of the suite's number of samples."""
-    asked = [(task.setting, task.concept) for task in suite.test]
-    found = [(row.setting, row.concept) for row in rows]
-    for task in asked:
-        count = found.count(task)
+    """Check that each concept of the test occurs once, with the measures and the suite's number of samples."""
+    tasks = [(task.setting, task.concept) for task in suite.test]
+    measured = [(row.setting, row.concept) for row in rows]
+    for task in tasks:
+        count = measured.count(task)
         _expect(count == 1, f"{where}: rows", f"one of {task[1]!r} ({task[0]})", count or "none")
     for row in rows:
-        _expect((row.setting, row.concept) in asked, f"{where}: rows", "concepts of the test alone", repr(row.concept))
-        told = f"{where}, {short(row.concept, 40)}"
-        _expect(row.n == suite.samples, f"{told}: n", suite.samples, row.n)
+        _expect((row.setting, row.concept) in tasks, f"{where}: rows", "concepts of the test alone", repr(row.concept))
+        place = f"{where}, {short(row.concept, 40)}"
+        _expect(row.n == suite.samples, f"{place}: n", suite.samples, row.n)
         _expect(
             set(measures) <= set(row.measures) <= set(suite.measures),
-            f"{told}: measures",
+            f"{place}: measures",
             ", ".join(measures),
             ", ".join(row.measures),
         )
         for name, value in row.measures.items():
             rate = suite.is_rate(name)
-            _expect(value >= LEAST and (not rate or value <= MOST), f"{told}: {name}", "0 to 1" if rate else "0 or more", value)
+            _expect(value >= LEAST and (not rate or value <= MOST), f"{place}: {name}", "0 to 1" if rate else "0 or more", value)
             whole = abs(value * row.n - round(value * row.n)) <= row.n * ROUNDING
-            _expect(not rate or whole, f"{told}: {name}", f"a whole number of {row.n} samples", value)
+            _expect(not rate or whole, f"{place}: {name}", f"a whole number of {row.n} samples", value)
 
 
 def _expect_scores(submission: Submission) -> None:
     expected = scored(submission).scores
     _expect(set(submission.scores) == set(expected), "scores", ", ".join(expected), ", ".join(submission.scores))
     for name, score in expected.items():
-        found = submission.scores[name]
-        _expect(found.concepts == score.concepts, f"scores.{name}.concepts", score.concepts, found.concepts)
+        submitted = submission.scores[name]
+        _expect(submitted.concepts == score.concepts, f"scores.{name}.concepts", score.concepts, submitted.concepts)
         for key in ("mean", "error"):
-            mine, theirs = getattr(score, key), getattr(found, key)
+            mine, theirs = getattr(score, key), getattr(submitted, key)
             _expect(abs(mine - theirs) <= ROUNDING, f"scores.{name}.{key}", f"{mine}, which the rows come to", theirs)
 
 
 def drawn(submission: Submission, share: float, salt: str) -> list[Run]:
-    """The runs that are run again: at least a share of all rows.
+    """The runs to run again, with at least a share of all rows.
 
-    Which ones a hash of the whole file decides, together with a word of whoever checks: who does not know the word cannot look for
-    a file whose draw suits.
+    The draw depends on a hash of the file and a word of the checker: without the word, a file cannot be tuned to a favourable
+    draw.
 
     Args:
-        submission: that is checked.
-        share: of its rows, 0 for none.
+        submission: the checked submission.
+        share: share of its rows, 0 for none.
         salt: the word; may be empty.
     """
     whole = submission.hash
     order = sorted(submission.runs, key=lambda run: content_hash([salt, whole, run.suite, run.seed]))
     wanted = share * sum(len(run.rows) for run in submission.runs)
-    found: list[Run] = []
-    while sum(len(run.rows) for run in found) < wanted:
-        found.append(order[len(found)])
-    return found
+    runs: list[Run] = []
+    while sum(len(run.rows) for run in runs) < wanted:
+        runs.append(order[len(runs)])
+    return runs
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A number that was not found again."""
+    """A number that was not reproduced."""
 
     run: Run
     where: str
@@ -178,12 +177,12 @@ class Difference:
 
 
 def allowed(submitted: float, found: float, n: int, rate: bool, alike: bool) -> bool:
-    """Whether a number was found again: the same, on a machine of the same kind; else about the same.
+    """Whether a number was reproduced: exactly on a machine of the same kind, else approximately.
 
     Args:
         submitted, found: the numbers.
-        n: samples behind them.
-        rate: whether they are shares; other numbers may differ by a fifth on another machine.
+        n: number of samples.
+        rate: whether the numbers are shares; other numbers may differ by a fifth on another machine.
         alike: whether processor, versions and threads are the same.
     """
     apart = abs(submitted - found)
@@ -193,37 +192,37 @@ def allowed(submitted: float, found: float, n: int, rate: bool, alike: bool) -> 
         return False
     if not rate:
         return apart <= 0.2 * max(submitted, found)
-    # One sample more counts where all are right or wrong, and a deviation of 0 would allow nothing.
+    # Keep the standard error above 0 when all samples are right or wrong.
     mean = min(max((submitted + found) / 2, 1 / n), 1 - 1 / n)
     return apart <= ERRORS * (2 * mean * (1 - mean) / n) ** 0.5
 
 
 def differences(run: Run, again: Run, suite: BenchmarkSuite, alike: bool) -> Iterator[Difference]:
-    """What differs between a run that was submitted and the same run here."""
+    """Differences between a submitted run and the same run here."""
     if alike and run.configuration != again.configuration:
         yield Difference(run, "configuration", run.configuration, again.configuration)
     if (alike or again.origin == GIVEN) and run.model != again.model:
         yield Difference(run, "model", run.model, again.model)
     pairs = [("", run.rows, again.rows), *((name, rows, again.references.get(name, ())) for name, rows in run.references.items())]
-    for name, rows, others in pairs:
-        known = {(row.setting, row.concept): row for row in others}
+    for name, rows, repeated in pairs:
+        known = {(row.setting, row.concept): row for row in repeated}
         for row in rows:
-            other = known.get((row.setting, row.concept))
+            repeat = known.get((row.setting, row.concept))
             for measure, value in row.measures.items():
                 where = ", ".join(filter(None, (name, row.concept, measure)))
-                if other is None or measure not in other.measures:
+                if repeat is None or measure not in repeat.measures:
                     yield Difference(run, where, value, "none")
-                elif not allowed(value, other.measures[measure], row.n, suite.is_rate(measure), alike):
-                    yield Difference(run, where, value, other.measures[measure])
+                elif not allowed(value, repeat.measures[measure], row.n, suite.is_rate(measure), alike):
+                    yield Difference(run, where, value, repeat.measures[measure])
 
 
 def recompute(
     entry: Entry, submission: Submission, suites: Mapping[str, BenchmarkSuite], share: float, salt: str
 ) -> list[Difference]:
-    """Run a part of a submission again and say what differs.
+    """Run a part of a submission again and return the differences.
 
     Raises:
-        UserError: where the method is another, or cannot be run here.
+        UserError: for another method, or one that cannot be run here.
     """
     method = load_method(entry.method)
     if method.name != submission.name:
@@ -232,17 +231,17 @@ def recompute(
         say("note: the method's code is not that of the submission", error=True)
     alike = dict(submission.machine) == machine() and submission.version == __version__
     chosen = drawn(submission, share, salt)
-    found: list[Difference] = []
+    differing: list[Difference] = []
     count, total = (sum(len(run.rows) for run in runs) for runs in (chosen, submission.runs))
     say(f"running {len(chosen)} of {len(submission.runs)} runs again, {count} of {total} rows")
     if not alike:
         say("note: another machine or version: rates may differ by three standard errors, as rounding does", error=True)
-    with temporary(entry) as own:
+    with temporary(entry) as copy:
         for run in chosen:
-            # Where the submitter was given models and nobody names others, they are those that ship.
-            same = replace(own, model=SHIPPED) if run.origin == GIVEN and not own.model else own
+            # Given models default to the shipped models.
+            same = replace(copy, model=SHIPPED) if run.origin == GIVEN and not copy.model else copy
             again = same.run(suites[run.suite], run.seed)
             differ = list(differences(run, again, suites[run.suite], alike))
             say(f"{run.suite}, seed {run.seed}: {f'{len(differ)} numbers differ' if differ else 'the same'}")
-            found += differ
-    return found
+            differing += differ
+    return differing

@@ -1,4 +1,4 @@
-"""The suites' data as files for other programs, each suite with a card and hashes."""
+"""Export of the suites' data, with a card and hashes for each suite."""
 
 import json
 from collections.abc import Sequence
@@ -15,20 +15,20 @@ PARTS = (TRAINING, VALIDATION, DEMONSTRATIONS)
 
 
 def write_data(suite: BenchmarkSuite, seeds: Sequence[int], folder: Path, form: str, root: Path | None) -> list[Path]:
-    """Write training pairs, demonstrations to tune on and those of the test, with ``README.md`` and ``hashes.json``.
+    """Write training pairs, and demonstrations for tuning and test, with ``README.md`` and ``hashes.json``.
 
     Args:
-        suite: whose data.
-        seeds: of which each has data of its own.
-        folder: to which a folder of the suite's name is written.
-        form: one of :data:`FORMATS`. Minari's data sets are where Minari keeps them, under ``benchmark/SUITE-PART-seedN-v0``.
+        suite: the suite.
+        seeds: seeds of the data.
+        folder: parent of the output folder, which has the suite's name.
+        form: one of :data:`FORMATS`. Minari's data sets go to Minari's folder, under ``benchmark/SUITE-PART-seedN-v0``.
         root: folder of the user's copy of the data.
 
     Returns:
-        What was written, without Minari's data sets.
+        Written files, without Minari's data sets.
 
     Raises:
-        UserError: for another form, data that are not the frozen ones, or a place that cannot be written.
+        UserError: for another form, data that differ from the frozen data, or a folder that cannot be written.
     """
     if form not in FORMATS:
         raise UserError(f"format: expected one of {', '.join(FORMATS)}, found {form!r}")
@@ -54,13 +54,13 @@ def _target(place: Path, suite: str, name: str, form: str) -> str:
 
 
 def card(suite: BenchmarkSuite, example: Demonstrations, seeds: Sequence[int], form: str) -> str:
-    """What the data are, in Markdown.
+    """Description of the data in Markdown.
 
     Args:
-        suite: whose.
-        example: some of them.
-        seeds: that are written.
-        form: of the files.
+        suite: the suite.
+        example: some demonstrations.
+        seeds: written seeds.
+        form: format of the files.
     """
     columns = ", ".join(f"{name} ({unit})" for name, unit in zip(example.state_names[:8], example.state_units[:8], strict=True))
     more = f" and {len(example.state_names) - 8} more" if len(example.state_names) > 8 else ""
@@ -79,7 +79,7 @@ def card(suite: BenchmarkSuite, example: Demonstrations, seeds: Sequence[int], f
             f"ftl-lightning {__version__} from the seeds {', '.join(map(str, seeds))}.",
             f"Format: {form}. `hashes.json` has the hash of each part.",
             "",
-            *(f"- `{part}-seedN`: {told}" for part, told in parts.items()),
+            *(f"- `{part}-seedN`: {content}" for part, content in parts.items()),
             "",
             f"- States: {columns}{more}; up to {example.states.shape[1]} steps.",
             f"- Observed: {observed}.",

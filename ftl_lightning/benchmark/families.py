@@ -1,6 +1,6 @@
-"""Four families of behaviour as a user's own data are: no simulator, no initial states, concepts that are words or numbers.
+"""Four families of behaviour that resemble user data: no simulator, no initial states, concepts that are words or numbers.
 
-Each is a domain. A sample is right if, of many samples of every kind, the nearest is one of the goal.
+Each family is a domain. A sample is right if the nearest of many samples of all kinds belongs to the goal.
 """
 
 import functools
@@ -21,21 +21,21 @@ from ftl_lightning.testing import more_strokes
 from ftl_lightning.testing.families import beats, pictures, reaches
 
 TEMPLATES, TEMPLATE_SEED = 80, 7_000_000
-"""Samples of each kind that a judge compares with, from a seed that nobody draws from."""
+"""Number of templates per kind for judging, and their reserved seed."""
 CHANCE, ORACLE = "random kind (chance)", "generator (oracle)"
 Draw = Callable[[str, int, int], NDArray[np.float32]]
 """``(kind, count, seed) -> (count, time, column)``."""
 Kind = Callable[[NDArray[np.float32]], Sequence[str]]
-"""The kind of each of some samples ``(sample, time, column)``."""
+"""``(samples (sample, time, column)) -> kind of each sample``."""
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """Tells of which kind samples are, by the nearest template; columns are scaled by their spread.
+    """Classify samples by the nearest template; columns are scaled by their spread.
 
     Attributes:
-        draw: makes templates.
-        kinds: that it knows.
+        draw: draws templates.
+        kinds: known kinds.
     """
 
     draw: Draw
@@ -45,46 +45,46 @@ class Nearest:
     def _templates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Templates ``(kind * template, time * column)`` in units of their spread, and the spread ``(column,)``."""
         known = np.concatenate([self.draw(kind, TEMPLATES, TEMPLATE_SEED) for kind in self.kinds]).astype(np.float64)
-        # Of single states all columns share a scale: some never change.
+        # Columns of single states share a scale, as some are constant.
         scale = known.reshape(-1, known.shape[2]).std(axis=0) if known.shape[1] > 1 else np.ones(known.shape[2])
         return (known / scale).reshape(len(known), -1), scale
 
     def __call__(self, samples: NDArray[np.float32]) -> Sequence[str]:
-        """The kind of each sample ``(sample, time, column)``; empty for one that is not finite."""
+        """The kind of each sample ``(sample, time, column)``; empty for non-finite samples."""
         templates, scale = self._templates
         flat = (samples / scale).reshape(len(samples), -1)
-        return [self._nearest(templates, one) if np.isfinite(one).all() else "" for one in flat]
+        return [self._nearest(templates, row) if np.isfinite(row).all() else "" for row in flat]
 
-    def _nearest(self, templates: NDArray[np.float64], one: NDArray[np.float64]) -> str:
-        return self.kinds[int(np.square(templates - one).sum(axis=1).argmin()) // TEMPLATES]
+    def _nearest(self, templates: NDArray[np.float64], sample: NDArray[np.float64]) -> str:
+        return self.kinds[int(np.square(templates - sample).sum(axis=1).argmin()) // TEMPLATES]
 
 
 @dataclass(frozen=True)
 class Strokes:
-    """Tells of which kind pen strokes are, whatever their place and size."""
+    """Classify pen strokes, invariant to position and size."""
 
     @functools.cached_property
     def _judge(self) -> more_strokes.Judge:
         return more_strokes.Judge.of()
 
     def __call__(self, samples: NDArray[np.float32]) -> Sequence[str]:
-        """The kind of each stroke ``(sample, 40, 2)``; empty for one that is not finite."""
-        finite = [bool(np.isfinite(one).all()) for one in samples]
-        found = self._judge.kind(np.nan_to_num(samples, nan=0, posinf=0, neginf=0))
-        return [kind if good else "" for kind, good in zip(found, finite, strict=True)]
+        """The kind of each stroke ``(sample, 40, 2)``; empty for non-finite strokes."""
+        finite = [bool(np.isfinite(stroke).all()) for stroke in samples]
+        kinds = self._judge.kind(np.nan_to_num(samples, nan=0, posinf=0, neginf=0))
+        return [kind if good else "" for kind, good in zip(kinds, finite, strict=True)]
 
 
 def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequence[str], Sequence[str]], judge: Kind) -> Domain:
     """The domain of a family.
 
     Args:
-        name: of the domain.
-        plans: columns and horizon of what ``draw`` makes.
-        draw: makes behaviour of a kind.
-        kinds: of training, of validation and of the test.
-        judge: of which kind samples are.
+        name: name of the domain.
+        plans: columns and horizon of the behaviour.
+        draw: draws behaviour of a kind.
+        kinds: kinds for training, for validation and for the test.
+        judge: classifies samples by kind.
     """
-    training, validation, test = (tuple(some) for some in kinds)
+    training, validation, test = (tuple(names) for names in kinds)
     every = (*training, *validation, *test)
 
     def right(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
@@ -94,7 +94,7 @@ def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequ
         return torch.from_numpy(draw(kind, count, seed))
 
     def chance(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-        # As many of each kind as possible, so that the line is no draw of luck.
+        # Balanced over kinds, to reduce variance.
         return torch.cat([tensor(every[index % len(every)], 1, FRESH_SEED + seed + index) for index in range(count)])
 
     def oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
@@ -115,7 +115,7 @@ def family(name: str, plans: Plans, draw: Draw, kinds: tuple[Sequence[str], Sequ
 
 
 def _numbered(name: str, word: str, plans: Plans, draw: Draw) -> Domain:
-    """Eight kinds for training, four to tune on and four for the test."""
+    """A family of eight kinds for training, four for validation and four for the test."""
     training, validation, test = (
         [f"{word} {number}" for number in numbers] for numbers in (range(8), range(200, 204), range(100, 104))
     )

@@ -1,4 +1,4 @@
-"""The leaderboard: a page made of a folder of submissions, and of nothing else."""
+"""Leaderboard page from a folder of submissions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ each of which passes `benchmark --check`. [The protocol](benchmark.md) says what
 
 
 def suite_table() -> str:
-    """What the suites are, in Markdown, without their hashes."""
+    """Markdown table of suites, without hashes."""
     head = ["suite", "to pretrain on", "to tune on", "in the test", "demonstrations of each", "measures", "needs"]
     lines = []
     for suite in map(load_suite, suite_names()):
@@ -40,35 +40,37 @@ def suite_table() -> str:
 
 
 def read_submissions(folder: Path) -> list[Submission]:
-    """Every submission of a folder, checked, in the order of names.
+    """Read and check the submissions of a folder, sorted by name.
 
     Raises:
-        UserError: naming the first file that does not pass, or two that are of the same method; or for a folder without any.
+        UserError: for the first invalid file, two submissions of a method, or a folder without submissions.
     """
     files = visible(folder, "*.json") if folder.is_dir() else []
     if not files:
         raise UserError(f"{folder}: expected a folder of submissions (.json), found none")
-    found: dict[str, Submission] = {}
+    known: dict[str, Submission] = {}
     for path in files:
         submission, _ = expect_submission(path)
-        if submission.name in found:
+        if submission.name in known:
             raise UserError(f"{path}: expected one submission of {submission.name!r}, found two; remove one")
-        found[submission.name] = submission
-    return [found[name] for name in sorted(found)]
+        known[submission.name] = submission
+    return [known[name] for name in sorted(known)]
 
 
 def leaderboard(submissions: Sequence[Submission]) -> str:
     """The page, in Markdown."""
     suites = [load_suite(name) for name in suite_names()]
-    asked = [suite for suite in suites if any(suite.name in one.suites for one in submissions)]
-    parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in asked)]
-    if missing := [suite.title for suite in suites if suite not in asked]:
+    chosen = [suite for suite in suites if any(suite.name in entry.suites for entry in submissions)]
+    parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in chosen)]
+    if missing := [suite.title for suite in suites if suite not in chosen]:
         parts.append(f"No submission has these suites yet: {', '.join(map(markdown, missing))}.\n")
     return "\n".join((*parts, END))
 
 
 def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
-    runs = {one.name: [run for run in one.runs if run.suite == suite.name] for one in submissions if suite.name in one.suites}
+    runs = {
+        entry.name: [run for run in entry.runs if run.suite == suite.name] for entry in submissions if suite.name in entry.suites
+    }
     measures = [name if kind == "rate" else f"{name} (less is better)" for name, kind in suite.measures.items()]
     head = ["method", *measures, "model", "pretraining, s", "learning and evaluation, s"]
     lines = sorted(_lines(suite, runs), key=lambda line: -line[0])
@@ -77,30 +79,30 @@ def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
 
 
 def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]]) -> Iterator[tuple[float, list[str]]]:
-    """Cells of each line with its score: methods, then reference lines of the first submission that has them."""
+    """Score and cells of each line: methods, then reference lines of the first submission with them."""
     others = [name for name in suite.measures if name != suite.headline]
-    for name, some in runs.items():
-        rows = [run.rows for run in some]
-        own = score(suite, rows)
-        model = "given" if some[0].origin == GIVEN else "pretrained"
-        times = [f"{sum(getattr(run, key) for run in some) / len(some):.0f}" for key in ("pretraining_seconds", "seconds")]
-        times[0] = "-" if some[0].origin == GIVEN else times[0]
+    for name, group in runs.items():
+        rows = [run.rows for run in group]
+        main = score(suite, rows)
+        model = "given" if group[0].origin == GIVEN else "pretrained"
+        times = [f"{sum(getattr(run, key) for run in group) / len(group):.0f}" for key in ("pretraining_seconds", "seconds")]
+        times[0] = "-" if group[0].origin == GIVEN else times[0]
         yield (
-            own.mean,
-            [f"**{markdown(name)}**", _shown(own), *(_shown(score(suite, rows, other)) for other in others), model, *times],
+            main.mean,
+            [f"**{markdown(name)}**", _shown(main), *(_shown(score(suite, rows, measure)) for measure in others), model, *times],
         )
     lines: dict[str, Sequence[Sequence[Row]]] = {}
-    for found in references_of(runs).values():
-        lines = found | lines
+    for references in references_of(runs).values():
+        lines = references | lines
     for name, known in lines.items():
-        own = score(suite, known)
+        main = score(suite, known)
         measured = set.intersection(*({*row.measures} for rows_of_seed in known for row in rows_of_seed))
-        cells = [_shown(score(suite, known, other)) if other in measured else "-" for other in others]
-        yield own.mean, [f"*{markdown(name)}*", _shown(own), *cells, "-", "-", "-"]
+        cells = [_shown(score(suite, known, measure)) if measure in measured else "-" for measure in others]
+        yield main.mean, [f"*{markdown(name)}*", _shown(main), *cells, "-", "-", "-"]
 
 
-def _shown(one: Score) -> str:
-    return f"{one.mean:.2f} ± {one.error:.2f}" if one.concepts > 1 else f"{one.mean:.2f}"
+def _shown(value: Score) -> str:
+    return f"{value.mean:.2f} ± {value.error:.2f}" if value.concepts > 1 else f"{value.mean:.2f}"
 
 
 def _row(cells: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Running a method through suites: pretraining, learning and evaluation by the same cells as an ablation."""
+"""Run a method through suites: pretraining, learning and evaluation by the cells of ablations."""
 
 import tempfile
 import time
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SHIPPED = "shipped"
-"""In place of a folder: the models that the method's configurations name."""
+"""Value of ``model`` for the models that the method's configurations name."""
 OURS = Path(__file__).parent / "configurations"
-"""Configurations of our methods for suites of which ``conf`` has none: the families."""
+"""Configurations of our methods for the families, which ``conf`` lacks."""
 KEPT_CONFIGURATION = "configuration.yaml"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What is run.
+    """A method with its models and configurations.
 
     Attributes:
-        method: the name under which its package offers it.
-        model: folder of the pretrained models, in which ``{suite}`` and ``{seed}`` stand for these; :data:`SHIPPED`; or empty to
+        method: registered name of the method.
+        model: folder of the pretrained models, with placeholders ``{suite}`` and ``{seed}``; :data:`SHIPPED`; or empty to
             pretrain.
-        configurations: folder with a file ``SUITE.yaml`` for each suite, or ``suites.yaml`` for all others; empty for those of the
+        configurations: folder with ``SUITE.yaml`` for each suite, or ``suites.yaml`` for all others; empty for those of the
             method's package.
         root: folder of the user's recordings; ``None`` for none.
         work: folder for models and logs.
@@ -58,29 +58,29 @@ class Entry:
 
     @property
     def declared(self) -> Method:
-        """What its package says it is."""
+        """The method's declaration."""
         return load_method(self.method)
 
     def configuration(self, suite: BenchmarkSuite) -> Path:
-        """The file that configures ``fit`` and ``invert`` for a suite; written where the method brings none.
+        """The file that configures ``fit`` and ``invert`` for a suite; written if the method has none.
 
         Raises:
-            UserError: for a folder that does not hold one.
+            UserError: for a folder without such a file.
         """
         folder = self.configurations or self.declared.configurations
         places = [Path(folder) / f"{suite.name}.yaml", Path(folder) / "suites.yaml"] if folder else []
         places += [] if self.configurations else [OURS / f"{self.method}.yaml"]
-        if (found := next((path for place in places if (path := shipped(place)).is_file()), None)) is not None:
-            return found
+        if (file := next((path for place in places if (path := shipped(place)).is_file()), None)) is not None:
+            return file
         if self.configurations:
             raise UserError(f"configurations: expected {suite.name}.yaml or suites.yaml in {short(folder, 80)}, found neither")
         return self._written(suite)
 
     def configurations_of(self, suite: BenchmarkSuite) -> tuple[str, ...]:
-        """The files of a suite, in the order in which they are added to one another.
+        """The configuration files of a suite, in the order of merging.
 
         Raises:
-            UserError: where none of them names the method's way to learn.
+            UserError: if no file names the method's adaptation class.
         """
         path, added = self.configuration(suite), shipped(f"conf/method/{self.method}.yaml")
         expected = self.declared.adaptation.rpartition(":")[2]
@@ -91,7 +91,7 @@ class Entry:
         raise UserError(f"{path}: invert: expected model.class_path {expected}, as {self.method} learns, found another")
 
     def _written(self, suite: BenchmarkSuite) -> Path:
-        """The defaults of the method's classes."""
+        """Write a configuration with the defaults of the method's classes."""
         method, path = self.declared, self.work / f"{suite.name}-{KEPT_CONFIGURATION}"
         content: dict[str, Any] = {
             "defaults": ["conf/verb.yaml"],
@@ -106,10 +106,10 @@ class Entry:
         return path
 
     def trained(self, suite: BenchmarkSuite, seed: int) -> Path:
-        """Where the model of a suite and a seed is, or will be.
+        """Folder of the model of a suite and a seed.
 
         Raises:
-            UserError: for a place where no model is that should be there.
+            UserError: if a given model is missing.
         """
         if not self.model:
             return self.work / "models" / f"{suite.name}-seed{seed}"
@@ -125,7 +125,7 @@ class Entry:
         return pretrained_folder(place)
 
     def cells(self, suite: BenchmarkSuite, seed: int) -> tuple[Cell | None, Cell]:
-        """``fit``, unless a model is given, and ``invert``. What the suite freezes is not the method's to choose."""
+        """The cells ``fit``, unless a model is given, and ``invert``; frozen values of the suite override the method's."""
         method = self.declared
         if not method.pretraining and not self.model:
             raise UserError(f"model: expected models of kind {method.kind}, which {method.name} does not pretrain, found none")
@@ -145,7 +145,7 @@ class Entry:
             shared["data.root"] = str(self.root)
         fit = {"model.output": str(model), "data.samples_per_concept": str(suite.training.count), "data.more": "null"}
         fit |= {"data.recoveries": str(suite.training.recoveries), "evaluation.samples": "10"}
-        # Rows of the domain table are there for texts that it knows; families have none.
+        # Families have no domain table of embeddings.
         fit |= {} if load_domain(suite.domain).concepts.table else {"data.encoder": "hashing"}
         invert = {
             "model.pretrained": str(model),
@@ -166,7 +166,7 @@ class Entry:
         """Run a suite with a seed.
 
         Raises:
-            UserError: for data that are not the frozen ones, and for whatever keeps the method from being run.
+            UserError: if the data differ from the frozen data, or the method cannot be run.
         """
         parts = ASKED if self.model else (TRAINING, *ASKED)
         if not suite.expect_data(seed, self.root, parts):
@@ -180,49 +180,49 @@ class Entry:
         if outcome.error or outcome.rows is None:
             raise UserError(f"suite {suite.name}, seed {seed}: {outcome.error or 'expected rows, found none'}")
         rows = outcome.rows
-        own = rows[rows["role"] == METHOD]
-        measured = _rows(suite, own)
-        asked = {(task.setting, task.concept) for task in suite.test}
+        method_rows = rows[rows["role"] == METHOD]
+        measured = _rows(suite, method_rows)
+        tasks = {(task.setting, task.concept) for task in suite.test}
         return Run(
             suite=suite.name,
             seed=seed,
-            model=str(own["model_hash"].iloc[0]),
+            model=str(method_rows["model_hash"].iloc[0]),
             origin=GIVEN if self.model else PRETRAINED,
-            data={part: one.hash for part, one in suite.data.get(str(seed), {}).items() if part in parts},
-            configuration=str(own["config_hash"].iloc[0]),
+            data={part: known.hash for part, known in suite.data.get(str(seed), {}).items() if part in parts},
+            configuration=str(method_rows["config_hash"].iloc[0]),
             pretraining_seconds=0.0 if fit is None else round(fitted - start, 1),
             seconds=round(time.monotonic() - fitted, 1),
             rows=measured,
             references={
-                str(name): _rows(suite, some, suite.headline)
-                for name, some in rows[rows["role"] == REFERENCE].groupby("method", sort=True)
-                if asked <= _measured(some, suite.headline)
+                str(name): _rows(suite, group, suite.headline)
+                for name, group in rows[rows["role"] == REFERENCE].groupby("method", sort=True)
+                if tasks <= _measured(group, suite.headline)
             },
         )
 
 
 def _measured(table: "pd.DataFrame", measure: str) -> set[tuple[str, str]]:
-    """Settings and concepts of which a measure is there; some reference lines are there for some settings alone."""
-    own = table[table["metric"] == measure]
-    return {*zip(own["setting"], own["task"], strict=True)}
+    """Settings and concepts with a measure; some reference lines exist for some settings only."""
+    rows = table[table["metric"] == measure]
+    return {*zip(rows["setting"], rows["task"], strict=True)}
 
 
 def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *least: str) -> list[Row]:
-    """Rows of the test's concepts; of a reference line those measures that it has, if it has at least some.
+    """Rows of the test's concepts; of the suite's measures only ``least`` are required, by default all.
 
     Raises:
-        UserError: naming a concept or a measure that is missing.
+        UserError: naming the missing concept and measure.
     """
-    found = []
+    rows = []
     for task in suite.test:
-        own = table[(table["setting"] == task.setting) & (table["task"] == task.concept)]
+        group = table[(table["setting"] == task.setting) & (table["task"] == task.concept)]
         values = {
-            str(name): float(value) for name, value in zip(own["metric"], own["value"], strict=True) if name in suite.measures
+            str(name): float(value) for name, value in zip(group["metric"], group["value"], strict=True) if name in suite.measures
         }
         if missing := [name for name in (least or suite.measures) if name not in values]:
             raise UserError(f"suite {suite.name}, concept {task.concept!r}: expected the measure {missing[0]}, found none")
-        n = int(own["n"].iloc[0])
-        found.append(
+        n = int(group["n"].iloc[0])
+        rows.append(
             Row(
                 setting=task.setting,
                 concept=task.concept,
@@ -230,14 +230,14 @@ def _rows(suite: BenchmarkSuite, table: "pd.DataFrame", *least: str) -> list[Row
                 measures={name: values[name] for name in suite.measures if name in values},
             )
         )
-    return found
+    return rows
 
 
 def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Path) -> Submission:
-    """Run all suites and seeds of a submission that it does not have yet; the file is written after each.
+    """Run the missing suites and seeds of a submission; the file is written after each run.
 
     Raises:
-        UserError: at the end, naming suite and seed of the first that could not be run; what was done is in the file.
+        UserError: at the end, with the first failed suite and seed; completed runs are in the file.
     """
     submission = begun
     failed: list[str] = []
@@ -246,7 +246,7 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
         for number, (suite, seed) in enumerate(missing, 1):
             try:
                 run = entry.run(suite, seed)
-            except UserError as error:  # the other suites are run all the same
+            except UserError as error:  # other suites still run
                 failed.append(str(error))
                 say(f"[{number}/{len(missing)}] failed: {error}")
                 continue
@@ -261,24 +261,24 @@ def run_benchmark(entry: Entry, begun: Submission, names: Sequence[str], out: Pa
 
 
 def scored(submission: Submission) -> Submission:
-    """With the scores of the suites that are complete."""
-    found = {}
+    """Add the scores of complete suites."""
+    scores = {}
     for name in submission.suites:
         runs = [run for seed in submission.seeds if (run := submission.run(name, seed)) is not None]
         if len(runs) == len(submission.seeds):
-            found[name] = score(load_suite(name), [run.rows for run in runs])
-    return replace(submission, scores=found)
+            scores[name] = score(load_suite(name), [run.rows for run in runs])
+    return replace(submission, scores=scores)
 
 
 @contextmanager
 def temporary(entry: Entry) -> Iterator[Entry]:
-    """The same in a folder that is removed afterwards."""
+    """The entry with a temporary work folder."""
     with tempfile.TemporaryDirectory() as folder:
         yield replace(entry, work=Path(folder))
 
 
 def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> str:
-    """Why a suite cannot be run here, by a method if one is named, in words; empty if it can be."""
+    """Why a suite cannot be run here (by a method, if named); empty if it can."""
     if suite.recordings and root is None:
         return f"suite {suite.name}: needs your own copy of the recordings (--root FOLDER)"
     try:
@@ -292,9 +292,9 @@ def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> st
 
 
 def references_of(runs: Mapping[str, Sequence[Run]]) -> dict[str, dict[str, Sequence[Sequence[Row]]]]:
-    """Rows of the reference lines of each seed, by suite and name, where all seeds have them."""
-    found: dict[str, dict[str, Sequence[Sequence[Row]]]] = {}
-    for suite, some in runs.items():
-        names = set.intersection(*({*run.references} for run in some)) if some else set()
-        found[suite] = {name: [run.references[name] for run in some] for name in sorted(names)}
-    return found
+    """Rows of the reference lines of each seed, by suite and name, if all seeds have them."""
+    references: dict[str, dict[str, Sequence[Sequence[Row]]]] = {}
+    for suite, suite_runs in runs.items():
+        names = set.intersection(*({*run.references} for run in suite_runs)) if suite_runs else set()
+        references[suite] = {name: [run.references[name] for run in suite_runs] for name in sorted(names)}
+    return references

@@ -1,4 +1,4 @@
-"""What a submission file holds, and the scores that are formed from its rows."""
+"""Submission files, and scores from their rows."""
 
 import dataclasses
 import json
@@ -17,18 +17,18 @@ from ftl_lightning.version import __version__
 
 KIND, FORMAT = "few-shot concepts", 1
 MOST = 4 * 2**20
-"""Bytes of a file; nine suites with three seeds come to a twentieth."""
+"""Maximum size of a file in bytes; nine suites with three seeds need a twentieth."""
 PRETRAINED, GIVEN = "pretrained", "given"
-"""Where a model is from: pretrained in the run, or given to it."""
+"""Origins of a model: pretrained in the run, or given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What was measured of one concept.
+    """Measurements of a concept.
 
     Attributes:
-        setting, concept: what was asked.
-        n: samples or episodes.
+        setting, concept: the test task.
+        n: number of samples or episodes.
         measures: values by name, rounded to six decimals.
     """
 
@@ -40,17 +40,17 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One suite with one seed.
+    """A run of a suite with a seed.
 
     Attributes:
-        suite, seed: which.
+        suite, seed: suite and seed.
         model: hash of the pretrained model.
         origin: ``pretrained`` in this run, or ``given``.
-        data: hashes of the data that were drawn, by part.
-        configuration: hash of everything that was configured.
-        pretraining_seconds, seconds: of pretraining, 0 for a model that was given, and of learning with evaluation.
-        rows: of the method, one for each concept of the test.
-        references: rows of the reference lines by name; the suite says whether there are some.
+        data: hashes of the drawn data, by part.
+        configuration: hash of the whole configuration.
+        pretraining_seconds, seconds: duration of pretraining (0 for a given model), and of learning with evaluation.
+        rows: rows of the method, one for each concept of the test.
+        references: rows of the reference lines by name, if the suite has them.
     """
 
     suite: str
@@ -67,12 +67,12 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Of a suite: the mean of its first measure over concepts, each of which is a mean over seeds.
+    """Score of a suite: its first measure, averaged over seeds, then over concepts.
 
     Attributes:
-        mean: over concepts.
-        error: standard error of this mean over concepts; 0 where there is a single one.
-        concepts: how many.
+        mean: mean over concepts.
+        error: standard error of the mean over concepts; 0 for a single concept.
+        concepts: number of concepts.
     """
 
     mean: float
@@ -82,19 +82,19 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True)
 class Submission:
-    """A method's numbers.
+    """Results of a method.
 
     Attributes:
-        kind, format: of the file.
-        method: the name under which its package offers it.
-        name: in tables.
-        code: hash of the package that offers the method; empty for the methods of ftl-lightning itself.
-        version: of ftl-lightning.
-        machine: what it ran on.
-        seeds: that every suite was asked with.
+        kind, format: kind and format of the file.
+        method: registered name of the method.
+        name: name in tables.
+        code: hash of the package with the method; empty for methods of ftl-lightning.
+        version: version of ftl-lightning.
+        machine: description of the machine.
+        seeds: seeds of every suite.
         suites: hashes of the suites' definitions by name.
         runs: one for each suite and seed.
-        scores: by suite; none of a suite that is not complete.
+        scores: scores of complete suites.
     """
 
     kind: str = KIND
@@ -110,24 +110,24 @@ class Submission:
     scores: Mapping[str, Score] = field(default_factory=dict)
 
     def run(self, suite: str, seed: int) -> Run | None:
-        """That of a suite and a seed, if it is there."""
+        """The run of a suite and a seed, or ``None``."""
         return next((run for run in self.runs if (run.suite, run.seed) == (suite, seed)), None)
 
     @property
     def hash(self) -> str:
-        """16-digit hash of all that it says."""
+        """16-digit hash of the content."""
         return content_hash(dataclasses.asdict(self))
 
     def save(self, path: Path) -> None:
-        """Write it, whole or not at all."""
+        """Write the file atomically."""
         write_text(path, json.dumps(dataclasses.asdict(self), indent=1, ensure_ascii=False) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> "Submission":
-        """Read one; nothing that it names is imported or opened.
+        """Read a file; nothing that it names is imported or opened.
 
         Raises:
-            UserError: naming the file and the key, for one that is none.
+            UserError: for an invalid file, naming file and key.
         """
         expect_readable(path, "submission", MOST)
         with about(path):
@@ -135,7 +135,7 @@ class Submission:
 
 
 def machine() -> dict[str, str]:
-    """What numbers depend on besides the code: processor, system, Python, torch and threads. No computer or person is named."""
+    """Processor, system, Python, torch and threads, on which numbers depend; no name of a computer or person."""
     import torch
 
     return {
@@ -149,7 +149,7 @@ def machine() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Its name, where the system tells it."""
+    """Name of the processor, if known."""
     about_it = Path("/proc/cpuinfo")
     lines = about_it.read_text("utf-8", errors="replace").splitlines() if about_it.is_file() else []
     named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
@@ -157,22 +157,22 @@ def _processor() -> str:
 
 
 def by_concept(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str) -> list[float]:
-    """The mean over seeds of a measure of each concept of the test, in the suite's order.
+    """Mean of a measure over seeds for each concept of the test, in the suite's order.
 
     Args:
-        suite: whose test it is.
-        rows: of each seed, all concepts.
-        measure: its name.
+        suite: the suite.
+        rows: rows of all concepts, by seed.
+        measure: name of the measure.
     """
-    found: dict[tuple[str, str], list[float]] = {(row.setting, row.concept): [] for row in rows[0]} if rows else {}
-    for some in rows:
-        for row in some:
-            found[row.setting, row.concept].append(row.measures[measure])
-    return [sum(values) / len(values) for task in suite.test if (values := found[task.setting, task.concept])]
+    values: dict[tuple[str, str], list[float]] = {(row.setting, row.concept): [] for row in rows[0]} if rows else {}
+    for seed_rows in rows:
+        for row in seed_rows:
+            values[row.setting, row.concept].append(row.measures[measure])
+    return [sum(known) / len(known) for task in suite.test if (known := values[task.setting, task.concept])]
 
 
 def score(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str = "") -> Score:
-    """The score of a suite from the rows of each seed; of its first measure, or of another."""
+    """Score of a suite from the rows of each seed, for its first measure by default."""
     values = by_concept(suite, rows, measure or suite.headline)
     count, mean = len(values), sum(values) / len(values)
     variance = sum((value - mean) ** 2 for value in values) / (count - 1) if count > 1 else 0.0

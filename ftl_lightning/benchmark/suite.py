@@ -1,4 +1,4 @@
-"""Frozen suites: what is given, what is asked and how it is measured, as data, with hashes of all that is generated."""
+"""Frozen suites: training data, test tasks and measures, with hashes of all generated data."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,18 +18,18 @@ from ftl_lightning.tensor_file import bytes_hash, file_hash
 
 FOLDER = Path(__file__).parent / "suites"
 SEEDS = (0, 1, 2)
-"""Of the protocol."""
+"""Seeds of the protocol."""
 CLOSE = 1e-3
-"""Data whose mean and mean square differ by less, relatively, are those of another processor, which rounds in another way."""
+"""Maximum relative difference of mean and mean square that is due to rounding on another processor."""
 TRAINING, DEMONSTRATIONS, VALIDATION, STARTS = "training", "demonstrations", "validation", "starts"
 """Parts of a suite's data."""
 ASKED = (DEMONSTRATIONS, STARTS)
-"""Those that a run draws whether it pretrains or not."""
+"""Parts that every run draws, also without pretraining."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is asked: a setting and a concept, as the domain's suite of the test has them."""
+    """A test task: a setting and a concept of the domain's test suite."""
 
     setting: str
     concept: str
@@ -37,12 +37,12 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """What a method may be pretrained on.
+    """Pretraining data.
 
     Attributes:
-        concepts: with a text each.
-        count: demonstrations of each.
-        recoveries: demonstrations more of each concept that has some, which begin where behaviour went wrong.
+        concepts: texts of the concepts.
+        count: demonstrations per concept.
+        recoveries: additional demonstrations per concept, if it has any, which start from failures.
     """
 
     concepts: Sequence[str]
@@ -52,7 +52,7 @@ class Training:
 
 @dataclass(frozen=True, kw_only=True)
 class Print:
-    """What data are known by: the hash of their bytes and, for processors that round in another way, mean and mean square."""
+    """Fingerprint of data: the hash of their bytes and, as rounding differs between processors, mean and mean square."""
 
     hash: str
     mean: float
@@ -60,12 +60,12 @@ class Print:
 
     @classmethod
     def of(cls, tensors: Sequence[Tensor], known_by: str) -> "Print":
-        """That of some numbers, with the hash that they have."""
+        """The fingerprint of tensors with a known hash."""
         every = torch.cat([tensor.double().flatten() for tensor in tensors])
         return cls(hash=known_by, mean=float(f"{every.mean():.8g}"), square=float(f"{every.square().mean():.8g}"))
 
     def is_near(self, other: "Print") -> bool:
-        """Whether the numbers are the same but for rounding, as far as mean and mean square tell."""
+        """Whether mean and mean square are equal up to rounding."""
         size = max(self.square**0.5, 1e-12)
         return abs(self.mean - other.mean) <= CLOSE * size and abs(self.square - other.square) <= CLOSE * size**2
 
@@ -75,22 +75,22 @@ class BenchmarkSuite:
     """A suite.
 
     Attributes:
-        name: of its file.
-        title: in words.
+        name: name of its file.
+        title: title in words.
         domain: name of the domain, or ``module:ATTRIBUTE`` of this package.
-        needs: extra whose simulator it takes; empty for none.
-        recordings: whether data are read from the user's own copy.
-        training: what a method may be pretrained on.
+        needs: extra with the simulator; empty for none.
+        recordings: whether data are read from the user's copy.
+        training: pretraining data.
         validation: concepts on which a method may be tuned.
-        test: what is asked, and never tuned on.
-        test_suite: the domain's suite that holds the test.
-        demonstrations: that each new concept is learned from.
-        samples: of each concept, or episodes.
+        test: test tasks, never tuned on.
+        test_suite: name of the test suite in the domain.
+        demonstrations: demonstrations per new concept.
+        samples: samples or episodes per concept.
         closed_loop: whether plans are executed.
-        references: whether reference lines are measured, too; somewhere they take long.
-        measures: by name, what each is: a ``rate`` of right samples, an ``error rate`` or a ``distance``, of both of which less is
-            better; the first is the suite's score.
-        data: prints of the parts, by seed.
+        references: whether reference lines are measured, too; some are slow.
+        measures: kind of each measure by name: a ``rate`` of right samples, or an ``error rate`` or a ``distance``, for which less
+            is better; the first measure is the suite's score.
+        data: fingerprints of the parts, by seed.
     """
 
     name: str
@@ -120,21 +120,21 @@ class BenchmarkSuite:
 
     @property
     def hash(self) -> str:
-        """16-digit hash of the file that defines it."""
+        """16-digit hash of the suite's file."""
         return file_hash(FOLDER / f"{self.name}.json")
 
     def loaded(self) -> Domain:
-        """Its domain, which has to have the concepts that the suite says.
+        """Its domain, checked for the concepts of the suite.
 
         Raises:
-            UserError: for another version of the domain, or one whose simulator is missing.
+            UserError: for another version of the domain, or a missing simulator.
         """
         domain = load_domain(self.domain)
         with about(f"suite {self.name}"):
-            asked = {(task.setting, task.name) for task in domain.concepts.suites[self.test_suite].tasks}
+            tasks = {(task.setting, task.name) for task in domain.concepts.suites[self.test_suite].tasks}
             if (
                 tuple(self.training.concepts) != domain.concepts.training
-                or not {(t.setting, t.concept) for t in self.test} <= asked
+                or not {(t.setting, t.concept) for t in self.test} <= tasks
             ):
                 raise UserError(f"expected the concepts of the frozen suite, found others in domain {domain.name}; it was changed")
             if self.closed_loop and domain.closed_loop is not None:
@@ -142,28 +142,28 @@ class BenchmarkSuite:
         return domain
 
     def prints(self, seed: int, root: Path | None, parts: Sequence[str]) -> dict[str, Print]:
-        """Prints of what is generated from a seed, by the parts' names; of initial states only where there are some."""
+        """Fingerprints of the data of a seed by part, without initial states where there are none."""
         domain = self.loaded()
-        found = {}
+        prints = {}
         for part in parts:
             if part == STARTS:
                 source = domain.source(root)
                 starts = [source.starts(task.concept, self.samples, EVALUATION_SEED + seed) for task in self.test]
-                tensors = [tensor for one in starts if one is not None for tensor in one.observed.values()]
+                tensors = [tensor for states in starts if states is not None for tensor in states.observed.values()]
                 if tensors:
                     known_by = bytes_hash(b"".join(tensor.contiguous().numpy().tobytes() for tensor in tensors))
-                    found[part] = Print.of(tensors, known_by)
+                    prints[part] = Print.of(tensors, known_by)
             else:
                 drawn = self.drawn(part, seed, root)
-                found[part] = Print.of([drawn.states], drawn.hash)
-        return found
+                prints[part] = Print.of([drawn.states], drawn.hash)
+        return prints
 
     def drawn(self, part: str, seed: int, root: Path | None) -> Demonstrations:
         """The demonstrations of a part.
 
         Args:
-            part: ``training``, ``demonstrations`` of the test's concepts, or ``validation``: those of the concepts to tune on.
-            seed: decides them.
+            part: ``training``, ``demonstrations`` of the test's concepts, or ``validation`` for the concepts to tune on.
+            seed: seed of the data.
             root: folder of the user's copy of the data.
         """
         source = self.loaded().source(root)
@@ -173,46 +173,46 @@ class BenchmarkSuite:
         return concatenate([source.draw(concept, self.demonstrations, DEMONSTRATION_SEED + seed) for concept in concepts])
 
     def _training(self, source: Source, seed: int) -> Demonstrations:
-        found = source.split("train", self.training.count, seed)
+        demonstrations = source.split("train", self.training.count, seed)
         if self.training.recoveries and isinstance(source, Recoveries):
-            found = concatenate([found, source.recoveries("train", self.training.recoveries, seed)])
-        return found
+            demonstrations = concatenate([demonstrations, source.recoveries("train", self.training.recoveries, seed)])
+        return demonstrations
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """New concepts, each once, in the order of the domain's suite."""
+        """Distinct new concepts, in the order of the domain's suite."""
         return load_domain(self.domain).concepts.suites[self.test_suite].learned
 
     def expect_data(self, seed: int, root: Path | None, parts: Sequence[str]) -> bool:
-        """Refuse data that are not those of the frozen suite. Parts whose print the suite does not have are not looked at.
+        """Compare data with the frozen suite. Parts without a fingerprint are skipped.
 
         Returns:
-            Whether they are the same to the last bit; else they are rounded in another way.
+            Whether the data are bit-identical; else they differ by rounding.
 
         Raises:
-            UserError: naming suite, seed, part and both hashes.
+            UserError: for other data, with suite, seed, part and both hashes.
         """
         known = self.data.get(str(seed), {})
-        found = self.prints(seed, root, [part for part in parts if part in known])
-        for part, one in found.items():
-            if one.hash != known[part].hash and not one.is_near(known[part]):
+        prints = self.prints(seed, root, [part for part in parts if part in known])
+        for part, value in prints.items():
+            if value.hash != known[part].hash and not value.is_near(known[part]):
                 raise UserError(
-                    f"suite {self.name}, seed {seed}, {part}: expected data with the hash {known[part].hash}, found {one.hash}: "
+                    f"suite {self.name}, seed {seed}, {part}: expected data with the hash {known[part].hash}, found {value.hash}: "
                     "the generator was changed; take the version of ftl-lightning that the suite was frozen in"
                 )
-        return all(one.hash == known[part].hash for part, one in found.items())
+        return all(value.hash == known[part].hash for part, value in prints.items())
 
 
 def suite_names() -> tuple[str, ...]:
-    """Names of the suites that ship, in alphabetical order."""
+    """Sorted names of the suites."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
 
 
 def load_suite(name: str) -> BenchmarkSuite:
-    """A suite by its name.
+    """Load a suite.
 
     Raises:
-        UserError: for a name that is none, or a damaged file.
+        UserError: for an unknown name or a damaged file.
     """
     if name not in suite_names():
         raise UserError(f"suites: expected some of {', '.join(suite_names())}, found {short(name)!r}")
@@ -222,5 +222,5 @@ def load_suite(name: str) -> BenchmarkSuite:
 
 
 def suites() -> Iterator[BenchmarkSuite]:
-    """All that ship."""
+    """All suites."""
     return (load_suite(name) for name in suite_names())

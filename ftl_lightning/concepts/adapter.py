@@ -1,4 +1,4 @@
-"""Low-rank adapters (LoRA, Hu et al., 2022): what a concept changes of the denoiser, in its own branch of the formula."""
+"""Low-rank adapters (LoRA, Hu et al., 2022), which modify the denoiser in the branch of a concept."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ class LowRank:
     """Adds ``up @ down`` to some weights of a network.
 
     Attributes:
-        factors: ``up (outputs, rank)`` and ``down (rank, everything else)`` of each weight, by the parameter's name.
-        everywhere: whether all other branches of a composition are changed too, as by fine-tuning the network.
+        factors: ``up (outputs, rank)`` and ``down (rank, everything else)`` of each weight, by parameter name.
+        everywhere: also modify all other branches of a composition, as fine-tuning does.
     """
 
     factors: Mapping[str, tuple[Tensor, Tensor]]
     everywhere: bool = False
 
     def __call__(self, denoiser: Denoiser) -> Denoiser:
-        """The network with changed weights; its own stay as they are, and gradients reach the factors.
+        """Apply the adapter without changing the network's weights; gradients reach the factors.
 
         Raises:
-            TypeError: for a denoiser that is no network.
+            TypeError: if ``denoiser`` is not a network.
         """
         if not isinstance(denoiser, nn.Module):
             raise TypeError(f"expected a network, whose weights can be changed, found {type(denoiser).__name__}")
@@ -35,15 +35,15 @@ class LowRank:
         return lambda *inputs: torch.func.functional_call(denoiser, changed, inputs)
 
     def changed(self, name: str, weight: Tensor) -> Tensor:
-        """A weight with what is added to it."""
+        """Weight plus its low-rank update."""
         up, down = (factor.to(weight.device) for factor in self.factors[name])
         return weight + (up @ down).reshape(weight.shape)
 
     def expect_fits(self, network: nn.Module) -> None:
-        """Refuse factors of weights that a network does not have.
+        """Check that every factor fits a weight of a network.
 
         Raises:
-            UserError: naming the first.
+            UserError: naming the first factor that does not fit.
         """
         known = adaptable(network)
         for name, (up, down) in self.factors.items():
@@ -51,35 +51,35 @@ class LowRank:
                 raise UserError(f"key 'adapter/{short(name)}': expected the sizes {known.get(name, 'of no weight')}, found {sizes}")
 
     def __len__(self) -> int:
-        """How many numbers it holds."""
+        """Number of parameters."""
         return sum(up.numel() + down.numel() for up, down in self.factors.values())
 
     def detached(self) -> "LowRank":
-        """The same without gradients."""
+        """Detach all factors from the graph."""
         return LowRank({name: (up.detach(), down.detach()) for name, (up, down) in self.factors.items()}, self.everywhere)
 
     def copied(self) -> "LowRank":
-        """The same on the processor, apart from what is being learned, without factors that add nothing."""
-        apart = {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
-        return LowRank({name: (up, down) for name, (up, down) in apart.items() if up.any()}, self.everywhere)
+        """Detached copy on the CPU without zero updates."""
+        copies = {name: (up.detach().cpu().clone(), down.detach().cpu().clone()) for name, (up, down) in self.factors.items()}
+        return LowRank({name: (up, down) for name, (up, down) in copies.items() if up.any()}, self.everywhere)
 
     def tensors(self) -> dict[str, Tensor]:
-        """For a file, by name."""
+        """Tensors of a file, by name."""
         return {f"{name}/{kind}": factor for name, both in self.factors.items() for kind, factor in zip(KINDS, both, strict=True)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], everywhere: bool = False) -> "LowRank":
-        """The inverse of :meth:`tensors`.
+        """Inverse of :meth:`tensors`.
 
         Raises:
-            UserError: for a factor without its other, or two whose shapes do not go together.
+            UserError: for a missing factor, inconsistent shapes or a wrong dtype.
         """
         names = dict.fromkeys(name.rpartition("/")[0] for name in tensors)
         for name in names:
             up, down = (tensors.get(f"{name}/{kind}") for kind in KINDS)
             if up is None or down is None or not up.dim() == down.dim() == 2 or up.shape[1] != down.shape[0]:
-                told = " and ".join("none" if factor is None else str(tuple(factor.shape)) for factor in (up, down))
-                raise UserError(f"key 'adapter/{short(name)}': expected shapes (outputs, rank) and (rank, inputs), found {told}")
+                shapes = " and ".join("none" if factor is None else str(tuple(factor.shape)) for factor in (up, down))
+                raise UserError(f"key 'adapter/{short(name)}': expected shapes (outputs, rank) and (rank, inputs), found {shapes}")
             if not up.dtype == down.dtype == torch.float32:
                 raise UserError(f"key 'adapter/{short(name)}': expected float32, found {up.dtype} and {down.dtype}")
         if unknown := set(tensors) - {f"{name}/{kind}" for name in names for kind in KINDS}:
@@ -91,7 +91,7 @@ KINDS = ("up", "down")
 
 
 def adaptable(network: nn.Module) -> dict[str, tuple[int, int]]:
-    """The weights that an adapter changes, all matrices and convolutions, with the sizes ``(outputs, everything else)`` of each."""
+    """Sizes ``(outputs, everything else)`` of the adaptable weights, which are all matrices and convolutions, by name."""
     weights = {name: weight for name, weight in network.named_parameters() if weight.dim() > 1}
     return {name: (len(weight), weight[0].numel()) for name, weight in weights.items()}
 
@@ -105,31 +105,31 @@ def adapted_branches(
     concepts: Tensor,
     index: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The branches of a composition with adapters, each evaluated by the denoiser or by what its concept's adapter makes of it.
+    """Evaluate the branches of a composition with adapters.
 
-    An adapter that acts everywhere also takes the branches of its composition that have no adapter, the empty one among them. An
-    empty branch that no adapter changes is evaluated without gradient.
+    An adapter with ``everywhere`` also modifies the unconditional branch and the branches of its composition without an adapter.
+    The unmodified unconditional branch is evaluated without gradient.
 
     Args:
-        denoiser: that adapters change.
-        noised: plans.
+        denoiser: unmodified denoiser.
+        noised: noisy plans.
         composition: ``(composition, K, ...)`` with adapters.
-        row: each plan's composition ``(batch,)``.
-        empty: the empty concept ``(1, knots, n)``.
-        concepts: of all compositions ``(composition * K, knots, n)``.
-        index: where those of each plan are among them ``(K, batch)``.
+        row: composition of each plan ``(batch,)``.
+        empty: unconditional embedding ``(1, knots, n)``.
+        concepts: concepts of all compositions ``(composition * K, knots, n)``.
+        index: rows of ``concepts`` for each plan ``(K, batch)``.
 
     Returns:
-        Noise of the empty branch ``(batch, horizon, state)`` and of the concepts' ``(K, batch, horizon, state)``.
+        Noise of the unconditional branch ``(batch, horizon, state)`` and of the concepts' ``(K, batch, horizon, state)``.
     """
     adapters, number = composition.adapters, composition.adapter_number[row]  # (batch, K)
     everywhere = number.new_tensor([0, *(n * adapter.everywhere for n, adapter in enumerate(adapters, start=1))])
-    others = everywhere[number].amax(dim=1)  # (batch,), of the branches that have none
-    number = torch.where(number == 0, others[:, None], number)
+    default = everywhere[number].amax(dim=1)  # (batch,): adapter of the branches without one
+    number = torch.where(number == 0, default[:, None], number)
     conditional = branches(_by_adapter(denoiser, adapters, number.T.flatten()), noised, concepts, index)
     first = torch.zeros_like(row)[None]
-    if others.any():
-        unconditional = branches(_by_adapter(denoiser, adapters, others), noised, empty, first)
+    if default.any():
+        unconditional = branches(_by_adapter(denoiser, adapters, default), noised, empty, first)
     else:
         with torch.no_grad():
             unconditional = branches(denoiser, noised, empty, first)
@@ -137,9 +137,7 @@ def adapted_branches(
 
 
 def _by_adapter(denoiser: Denoiser, adapters: Sequence[Adapter], number: Tensor) -> Denoiser:
-    """A denoiser that estimates each sample by the adapter of its ``number (sample,)`` from 1, or by the one that is given for 0;
-    one call of the network for each that occurs.
-    """
+    """Denoiser that applies adapter ``number (sample,)`` to each sample, from 1; 0 for none. One forward pass per adapter."""
 
     def estimate(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
         by_number = number.argsort(stable=True)

@@ -1,4 +1,4 @@
-"""What a denoiser is, and how it estimates the noise of plans for several concepts, the branches of the formula, in one call."""
+"""Denoiser interface, and noise estimates for several concepts (branches of the guidance formula) in a single forward pass."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,19 +6,19 @@ from typing import NamedTuple
 from torch import Tensor
 
 Context = tuple[Tensor, ...]
-"""What a condition encoder read from the observed features, each ``(batch, ...)``; empty where nothing is observed."""
+"""Output of a condition encoder's ``observe``, each ``(batch, ...)``; empty without observed features."""
 Denoiser = Callable[[Tensor, Tensor, Tensor, Tensor, Context], Tensor]
 """``(x (batch, horizon, state), t (batch,), concepts (concept, knots, n), index (batch,), context) -> noise like x``, where
 ``index`` is each sample's row of ``concepts``."""
 
 
 class Noised(NamedTuple):
-    """Plans whose noise is estimated.
+    """Noisy plans.
 
     Attributes:
         x: noisy plans ``(batch, horizon, state)``.
         t: timesteps ``(batch,)``.
-        context: what was read from the observed features of each.
+        context: encoded observed features of each plan.
     """
 
     x: Tensor
@@ -26,23 +26,23 @@ class Noised(NamedTuple):
     context: Context
 
     def repeated(self, count: int) -> "Noised":
-        """All plans so many times, one time after the other."""
+        """Tile the batch ``count`` times."""
         context = tuple(part.repeat(count, *(1,) * (part.dim() - 1)) for part in self.context)
         return Noised(self.x.repeat(count, 1, 1), self.t.repeat(count), context)
 
     def at(self, samples: Tensor) -> "Noised":
-        """Some plans, by their numbers ``(sample,)``."""
+        """Select plans by index ``(sample,)``."""
         return Noised(self.x[samples], self.t[samples], tuple(part[samples] for part in self.context))
 
 
 def branches(denoiser: Denoiser, noised: Noised, concepts: Tensor, index: Tensor) -> Tensor:
-    """Noise of every plan in every branch, in one call of the network.
+    """Estimate the noise of every plan in every branch, in a single forward pass.
 
     Args:
-        denoiser: estimates noise for one concept a sample.
-        noised: the plans.
+        denoiser: noise estimate with a single concept per sample.
+        noised: noisy plans.
         concepts: ``(concept, knots, n)``.
-        index: each plan's row of ``concepts`` in each branch ``(branch, batch)`` int64.
+        index: row of ``concepts`` for each branch and plan ``(branch, batch)`` int64.
 
     Returns:
         ``(branch, batch, horizon, state)``.

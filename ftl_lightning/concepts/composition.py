@@ -1,4 +1,4 @@
-"""Compositions of concepts: what is learned and generated, and the algebra that adds, multiplies and batches it."""
+"""Compositions of concepts: addition, scaling by weights, and batching."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
@@ -16,47 +16,45 @@ from ftl_lightning.representation import Shown, counted, numbers
 
 
 class Adapter(Protocol):
-    """Changes a denoiser for the branches of its own concept, see :mod:`ftl_lightning.concepts.adapter`."""
+    """Modifies the denoiser in the branches of a concept, see :mod:`ftl_lightning.concepts.adapter`."""
 
     @property
     def everywhere(self) -> bool:
-        """Whether it changes all other branches of a composition too, of concepts without an adapter and of the empty one."""
+        """Whether it also modifies the unconditional branch and the branches of concepts without an adapter."""
 
     def __call__(self, denoiser: Denoiser, /) -> Denoiser:
-        """The changed denoiser."""
+        """The modified denoiser."""
 
 
 def space_of(domain: str, model_hash: str) -> str:
-    """The concept space of a model, in words.
+    """Description of a model's concept space.
 
     Args:
         domain: name of the model's domain.
-        model_hash: of the model.
+        model_hash: hash of the model.
     """
     return f"{domain} (hash {model_hash})"
 
 
 @dataclass(frozen=True, repr=False)
 class Composition(Shown):
-    """Concepts and the guidance weights with which they are composed; sums, differences and multiples are
-    compositions too.
+    """Concepts with their guidance weights. Sums, differences and multiples are compositions too.
 
     Attributes:
-        embeddings: ``(..., K, knots, n)``: of every concept one embedding or several at even times of the plan, its knots, between
-            which the denoiser interpolates.
+        embeddings: ``(..., K, knots, n)``: for each concept a single embedding, or several at evenly spaced times of the plan
+            (knots), between which the denoiser interpolates.
         weights: ``(..., K)``, omega.
-        modes: what samples are generated from. Where a concept is composed they are left out and its embeddings are used, unless it
-            varies over the plan: what demonstrations show at different times has no mean. Two concepts' modes are combined each
-            with each.
-        columns: share of its weight that a concept has on each column of a state ``(..., K, state)``, usually 0 or 1; ``None`` for
-            all of it on every column.
-        adapters: changes of the denoiser, each for the concepts that ``adapter`` says.
-        adapter: ``(..., K)`` int64, the number from 1 of each concept's adapter, 0 for the denoiser as it is; ``None`` for zeros.
-        alone: what samples are generated from where the concept is not composed; ``None`` for the same as where it is.
-        space: of which model's concepts it is made, see :func:`space_of`; empty where nobody said.
+        modes: several sets of embeddings for sampling. Composing uses ``embeddings`` instead, unless the concept varies over the
+            plan: the mean of behaviour at different times is no behaviour. The modes of two such concepts are combined pairwise.
+        columns: share of each concept's weight on each column of a state ``(..., K, state)``, usually 0 or 1; ``None`` for the full
+            weight on every column.
+        adapters: modifications of the denoiser, assigned to concepts by ``adapter``.
+        adapter: ``(..., K)`` int64, number of each concept's adapter, from 1; 0 for the unmodified denoiser; ``None`` for zeros.
+        alone: composition for sampling the concept alone; ``None`` for this composition.
+        space: concept space, see :func:`space_of`; empty if unknown.
 
     Raises:
-        UserError: at construction, for embeddings and weights whose shapes do not go together.
+        UserError: at construction, for inconsistent shapes of embeddings and weights.
     """
 
     embeddings: Tensor
@@ -78,7 +76,7 @@ class Composition(Shown):
 
     @property
     def knots(self) -> int:
-        """Embeddings of each concept."""
+        """Number of embeddings per concept."""
         return self.embeddings.shape[-2]
 
     def _words(self) -> Iterator[str]:
@@ -98,11 +96,11 @@ class Composition(Shown):
         yield f"of {self.space or 'any model'}"
 
     def __add__(self, other: "Composition") -> "Composition":
-        """Both; concepts that do not vary over the plan are said at every knot of those that do.
+        """Compose two compositions; concepts with a single knot are repeated at every knot of the others.
 
         Raises:
-            UserError: for concepts of different numbers of knots, neither of which is 1; for two adapters that change all; for
-                concepts of two models, or what is no concept.
+            UserError: for two different numbers of knots, neither of which is 1; for two adapters that modify all branches; for
+                concepts of two models; for an operand that is not a composition.
         """
         if not isinstance(other, Composition):
             raise UserError(f"compose: expected a concept on each side of '+' and '-', found {shown(other)}; model[text] is one")
@@ -118,7 +116,7 @@ class Composition(Shown):
         knots, state = _common([part.knots for part in parts]), _columns_of(parts)
         after = torch.where(other.adapter_number > 0, other.adapter_number + len(self.adapters), 0)
         return Composition(
-            torch.cat([part._said_at(knots) for part in parts], dim=-3),
+            torch.cat([part._at_knots(knots) for part in parts], dim=-3),
             torch.cat([part.weights for part in parts], dim=-1),
             modes=_summed_modes(self, other),
             columns=None if state is None else torch.cat([part.shares(state) for part in parts], dim=-2),
@@ -128,10 +126,10 @@ class Composition(Shown):
         )
 
     def __mul__(self, factor: float) -> "Composition":
-        """The same with its guidance weights multiplied.
+        """Multiply the guidance weights.
 
         Raises:
-            UserError: for what is no finite number.
+            UserError: if ``factor`` is not a finite number.
         """
         if not isinstance(factor, Real | Tensor) or isinstance(factor, bool):
             raise UserError(f"compose: expected a number to multiply a concept with, found {shown(factor)}")
@@ -148,30 +146,30 @@ class Composition(Shown):
         return self + (-other if isinstance(other, Composition) else other)
 
     def on(self, columns: Sequence[int], state: int) -> "Composition":
-        """The same with weight on some columns of a state alone, of ``state`` columns."""
+        """Restrict the weights to some columns of a state with ``state`` columns."""
         chosen = torch.zeros(state, device=self.weights.device)
         chosen[list(columns)] = 1
         return self._with(columns=self.shares(state) * chosen, alone=self.alone and self.alone.on(columns, state))
 
     def shares(self, state: int) -> Tensor:
-        """The share of its weight that each concept has on each column of a state ``(..., K, state)``, of ``state`` columns."""
+        """Share of each concept's weight on each of the ``state`` columns of a state ``(..., K, state)``."""
         return self.weights.new_ones((*self.weights.shape, state)) if self.columns is None else self.columns
 
     @property
     def adapter_number(self) -> Tensor:
-        """The number from 1 of each concept's adapter ``(..., K)`` int64; 0 for none."""
+        """Number of each concept's adapter ``(..., K)`` int64, from 1; 0 for none."""
         return self.weights.new_zeros(self.weights.shape, dtype=torch.int64) if self.adapter is None else self.adapter
 
     def _with(self, **changes: Any) -> "Composition":
-        """A composition, of whatever class this one is, with some fields changed."""
+        """Replace some fields; the result is a plain :class:`Composition`."""
         return Composition(**({field.name: getattr(self, field.name) for field in fields(Composition)} | changes))
 
-    def _said_at(self, knots: int) -> Tensor:
-        """Embeddings ``(..., K, knots, n)`` of so many knots; a concept of one knot is said alike at all of them."""
+    def _at_knots(self, knots: int) -> Tensor:
+        """Embeddings ``(..., K, knots, n)``; a single knot is repeated."""
         return self.embeddings.expand(*self.weights.shape, knots, -1)
 
     def to(self, device: torch.device) -> "Composition":
-        """The same on a device; adapters follow the denoiser that they change."""
+        """Move all tensors to a device; adapters follow their denoiser."""
         return self._with(
             embeddings=self.embeddings.to(device),
             weights=self.weights.to(device),
@@ -183,13 +181,13 @@ class Composition(Shown):
 
     @property
     def uncomposed(self) -> "Composition":
-        """What samples are generated from where nothing is added to it."""
+        """Composition for sampling the concept alone."""
         return self if self.alone is None else self.alone
 
     def draw(self, count: int, generator: torch.Generator) -> tuple["Composition", Tensor]:
-        """What ``count`` samples are generated from: a composition ``(row, K, ...)``, and each sample's row ``(count,)``.
+        """Draw the modes of ``count`` samples: a composition ``(row, K, ...)`` and the row of each sample ``(count,)``.
 
-        Where there are no modes the generator stays as it is. To be called on what is :attr:`uncomposed`.
+        Without modes the generator is not advanced. Call on :attr:`uncomposed`.
         """
         if self.modes is None:
             embeddings, weights = self.embeddings[None], self.weights[None]
@@ -201,7 +199,7 @@ class Composition(Shown):
         return self._with(embeddings=embeddings, weights=weights, modes=None, columns=columns, adapter=adapter), row
 
     def row(self, number: int) -> "Composition":
-        """One ``(K, ...)`` of several compositions ``(row, K, ...)`` without modes, by its number from 0."""
+        """Row ``(K, ...)`` of compositions ``(row, K, ...)`` without modes; ``number`` counts from 0."""
         return self._with(
             embeddings=self.embeddings[number],
             weights=self.weights[number],
@@ -210,7 +208,7 @@ class Composition(Shown):
         )
 
     def drawn(self, generator: torch.Generator) -> "Composition":
-        """The composition ``(K, ...)`` of a single sample, without modes; of several modes the generator draws one."""
+        """Draw the composition ``(K, ...)`` of a single sample, without modes."""
         if self.uncomposed.modes is None:
             return self.uncomposed
         rows, row = self.uncomposed.draw(1, generator)
@@ -218,24 +216,22 @@ class Composition(Shown):
 
 
 def _summed_modes(first: Composition, second: Composition) -> Modes | None:
-    """What samples of a sum are generated from: the modes of what varies over the plan, each of one part with each of the other;
-    ``None`` where neither part has such.
-    """
+    """Modes of a sum: pairwise combinations of the modes that vary over the plan; ``None`` if neither part has such modes."""
     if not any(part.modes is not None and part.knots > 1 for part in (first, second)):
         return None
     knots = max(first.knots, second.knots)
     sets = [
-        part.modes if part.modes is not None and part.knots > 1 else Modes(part._said_at(knots)[None], part.weights[None])
+        part.modes if part.modes is not None and part.knots > 1 else Modes(part._at_knots(knots)[None], part.weights[None])
         for part in (first, second)
     ]
     return sets[0].with_each(sets[1])
 
 
 def _common(knots: Sequence[int]) -> int:
-    """The number of knots of concepts that are composed.
+    """Common number of knots of composed concepts.
 
     Raises:
-        UserError: where two of them differ and neither is 1.
+        UserError: if two numbers differ and neither is 1.
     """
     if len(several := sorted(set(knots) - {1})) > 1:
         raise UserError(f"compose: expected concepts of one number of knots (or of one knot), found {several[0]} and {several[1]}")
@@ -243,27 +239,27 @@ def _common(knots: Sequence[int]) -> int:
 
 
 def _columns_of(compositions: Sequence[Composition]) -> int | None:
-    """Columns of a state, where any composition says so."""
+    """Number of state columns; ``None`` if no composition has ``columns``."""
     return next((part.columns.shape[-1] for part in compositions if part.columns is not None), None)
 
 
 def batched(compositions: Sequence[Composition], count: int, generators: Sequence[torch.Generator]) -> tuple[Composition, Tensor]:
-    """Everything that is generated together.
+    """Collate compositions into a batch.
 
     Args:
-        compositions: ``(K, ...)`` each, of maybe different K.
-        count: samples of each.
-        generators: of each composition's draws of modes.
+        compositions: ``(K, ...)`` each; K may differ.
+        count: samples per composition.
+        generators: generator of each composition's mode draws.
 
     Returns:
-        One composition ``(row, most K, ...)``, padded with weights of zero, and each sample's row ``(composition * count,)``.
+        Composition ``(row, max K, ...)``, padded with zero weights, and the row of each sample ``(composition * count,)``.
 
     Raises:
-        UserError: for concepts of different numbers of knots, neither of which is 1.
+        UserError: for two different numbers of knots, neither of which is 1.
     """
     compositions = [composition.uncomposed for composition in compositions]
     knots, state = _common([composition.knots for composition in compositions]), _columns_of(compositions)
-    # Episodes that are run side by side ask for one composition many times: it has its adapters once.
+    # Parallel episodes repeat a composition: keep each adapter once.
     adapters = tuple(dict.fromkeys(adapter for composition in compositions for adapter in composition.adapters))
     drawn, numbers, rows, first = [], [], [], 0
     for composition, draw in zip(compositions, generators, strict=True):
@@ -278,7 +274,7 @@ def batched(compositions: Sequence[Composition], count: int, generators: Sequenc
         return nn.utils.rnn.pad_sequence([row for part in each for row in part], batch_first=True)
 
     batch = Composition(
-        padded(part._said_at(knots) for part in drawn),
+        padded(part._at_knots(knots) for part in drawn),
         padded(part.weights for part in drawn),
         columns=None if state is None else padded(part.shares(state) for part in drawn),
         adapters=adapters,

@@ -23,26 +23,26 @@ KIND = "concept"
 VERSION = 5
 """Version of the file format."""
 MODES = ("mode_embeddings", "mode_weights")
-"""Tensors of the modes, with the header's key ``mixed``; only in files of concepts that have modes."""
+"""Tensors of the modes, with the header's key ``mixed``; only in files of concepts with modes."""
 COMPOSING = ("composing_embeddings", "composing_weights")
-"""Tensors of the set that a concept is composed from; only in files of concepts that have one."""
+"""Tensors that replace all others when composing; only in files of concepts with such a set."""
 ADAPTER = "adapter/"
 """Prefix of the tensors of an adapter."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a concept comes from.
+    """Provenance of a concept.
 
     Attributes:
-        name: the task it was learned from.
+        name: name of the task.
         domain: name of the domain.
-        encoder: identity of the text encoder behind the model's concept space.
+        encoder: identity of the model's text encoder.
         pretrained: hash of the pretrained model.
         demonstrations: hash of the demonstrations.
         count: number of demonstrations.
         weights: ``'fixed'`` or ``'learned'``.
-        loss: composed denoising loss on the demonstrations at the end of learning.
+        loss: final composed denoising loss on the demonstrations.
     """
 
     name: str
@@ -57,12 +57,12 @@ class Origin:
 
 @dataclass(frozen=True)
 class Choice:
-    """How the form of a concept was chosen, see :mod:`ftl_lightning.learning.forms`.
+    """Selection of a concept's form, see :mod:`ftl_lightning.learning.forms`.
 
     Attributes:
-        form: its name.
-        because: why, in a sentence.
-        numbers: what was measured, by name.
+        form: name of the form.
+        because: reason, as a sentence.
+        numbers: measurements by name.
     """
 
     form: str
@@ -75,16 +75,16 @@ class Choice:
 
 @dataclass(frozen=True)
 class QualityRecord:
-    """What samples of a concept were like when somebody looked, see :mod:`ftl_lightning.learning.quality`.
+    """Quality of a concept's samples, see :mod:`ftl_lightning.learning.quality`.
 
     Attributes:
-        samples: how many were looked at.
-        novelty, spread, roughness: beside the demonstrations, as shares, 0 or more.
-        metric: name of the domain's metric that tells how many are right; empty where none can.
-        right: share of right samples by that metric, 0 to 1; ``None`` where none can tell.
+        samples: number of evaluated samples.
+        novelty, spread, roughness: relative to the demonstrations, 0 or more.
+        metric: name of the domain's success metric; empty without such a metric.
+        right: share of right samples by ``metric``, 0 to 1; ``None`` without a metric.
 
     Raises:
-        UserError: at construction, for a number out of its range.
+        UserError: at construction, for a value out of range.
     """
 
     samples: int
@@ -106,21 +106,20 @@ class Concept(Shown):
     """K embeddings and their guidance weights.
 
     Attributes:
-        embeddings: ``(K, knots, n)`` float32 in the concept space of the pretrained model: of each component one, which is the
-            paper's form, or several at even times of the plan.
+        embeddings: ``(K, knots, n)`` float32 in the pretrained model's concept space. Each component has a single embedding (the
+            paper's form) or several at evenly spaced times of the plan.
         weights: ``(K,)`` float32, omega.
-        origin: where it comes from.
-        modes: several sets of embeddings, which samples are generated from where the concept stands alone; ``None`` for the paper's
-            form. Composing uses ``embeddings``, unless the concept has several knots.
-        adapter: what it changes of the denoiser; ``None`` for the paper's form.
-        choice: how its form was chosen; ``None`` where it was told.
-        composing: embeddings ``(K, knots, n)`` and weights ``(K,)`` that take the place of all others, and of the adapter, where
-            the concept is composed; ``None`` for the same as alone.
-        quality: what its samples were like; ``None`` where nobody looked. It is a key of the file's header that is written only
-            where it is there, and that readers who do not know it pass by.
+        origin: provenance.
+        modes: several sets of embeddings for sampling the concept alone; ``None`` for the paper's form. Composing uses
+            ``embeddings``, unless the concept has several knots.
+        adapter: low-rank change of the denoiser; ``None`` for the paper's form.
+        choice: how the form was selected; ``None`` if the user set it.
+        composing: embeddings ``(K, knots, n)`` and weights ``(K,)`` that replace all others, and the adapter, when composing;
+            ``None`` to compose the concept as it is alone.
+        quality: quality of the samples; ``None`` if not measured. Optional key of the file's header.
 
     Raises:
-        UserError: at construction, for tensors of other shapes or types.
+        UserError: at construction, for wrong shapes or dtypes.
     """
 
     embeddings: Tensor
@@ -137,17 +136,17 @@ class Concept(Shown):
 
     @property
     def _sets(self) -> dict[str, Tensor]:
-        """Embeddings and weights, by the names of a file's tensors."""
-        found = {"embeddings": self.embeddings, "weights": self.weights}
+        """Embeddings and weights by tensor name."""
+        sets = {"embeddings": self.embeddings, "weights": self.weights}
         if self.modes is not None:
-            found |= dict(zip(MODES, (self.modes.embeddings, self.modes.weights), strict=True))
+            sets |= dict(zip(MODES, (self.modes.embeddings, self.modes.weights), strict=True))
         if self.composing is not None:
-            found |= dict(zip(COMPOSING, self.composing, strict=True))
-        return found
+            sets |= dict(zip(COMPOSING, self.composing, strict=True))
+        return sets
 
     @property
     def knots(self) -> int:
-        """Embeddings of a component, at even times of the plan; 1 is the paper's form."""
+        """Number of embeddings per component, at evenly spaced times of the plan; 1 is the paper's form."""
         return self.embeddings.shape[1]
 
     def _words(self) -> Iterator[str]:
@@ -166,7 +165,7 @@ class Concept(Shown):
 
     @property
     def composition(self) -> Composition:
-        """What it is generated from, alone or composed with others."""
+        """The concept as a composition, to sample alone or to compose."""
         space = space_of(self.origin.domain, self.origin.pretrained)
         plain = Composition(self.embeddings, self.weights, modes=self.modes, space=space)
         if self.adapter is not None:
@@ -174,13 +173,13 @@ class Concept(Shown):
         return plain if self.composing is None else Composition(*self.composing, alone=plain, space=space)
 
     def component(self, number: int) -> Composition:
-        """One of its components alone, by its number from 1."""
-        chosen = slice(number - 1, number)
-        one = replace(self, embeddings=self.embeddings[chosen], weights=self.weights[chosen], modes=None, composing=None)
-        return one.composition
+        """A single component; ``number`` counts from 1."""
+        rows = slice(number - 1, number)
+        component = replace(self, embeddings=self.embeddings[rows], weights=self.weights[rows], modes=None, composing=None)
+        return component.composition
 
     def parts(self) -> dict[str, Part]:
-        """Every knot of every component, and those of every mode, by their names."""
+        """All knots of all components, including those of the modes, by name."""
         sets: list[tuple[int | None, Tensor, Tensor]] = [(None, self.weights, self.embeddings)]
         if self.modes is not None:
             modes = zip(self.modes.weights, self.modes.embeddings, strict=True)
@@ -195,18 +194,18 @@ class Concept(Shown):
 
     @property
     def weighted_sum(self) -> Tensor:
-        """Its components added up by their weights ``(knots, n)``."""
+        """Weighted sum of the components ``(knots, n)``."""
         return (self.weights @ self.embeddings.flatten(1)).unflatten(0, self.embeddings.shape[1:])
 
     def at_knots(self, component: Tensor) -> dict[str, Tensor]:
-        """The embeddings ``(n,)`` of a component ``(knots, n)`` by the end of a name: empty of a single one, else ', knot 3'."""
+        """Embeddings ``(n,)`` of a component ``(knots, n)`` by name suffix: empty for a single knot, else ', knot 3'."""
         return {"" if self.knots == 1 else f", knot {knot}": embedding for knot, embedding in enumerate(component, start=1)}
 
     def expect_finite(self, where: str) -> None:
-        """Refuse a concept of numbers that are none or too large, or of such a loss.
+        """Check that all tensors and the loss are finite and the tensors not too large.
 
         Raises:
-            UserError: naming ``where`` and the first of them.
+            UserError: naming ``where`` and the first offending value.
         """
         expect_finite(self.numbers, where, "lower model.budget.learning_rate")
         for name, value in self.numbers.items():
@@ -215,7 +214,7 @@ class Concept(Shown):
 
     @property
     def numbers(self) -> dict[str, Tensor]:
-        """All that it holds, by name."""
+        """Loss and all tensors by name."""
         factors = {} if self.adapter is None else self.adapter.tensors()
         return {"loss": torch.tensor(float(self.origin.loss)), **self._sets, **factors}
 
@@ -223,10 +222,10 @@ class Concept(Shown):
         """Write a safetensors file with a JSON header.
 
         Args:
-            path: of the file; it is written whole or not at all.
+            path: output file, written atomically.
 
         Raises:
-            UserError: for numbers that are not finite.
+            UserError: for non-finite or too large values.
         """
         self.expect_finite(str(path))
         header = {**asdict(self.origin), "components": len(self.weights)}
@@ -248,7 +247,7 @@ class Concept(Shown):
         """Read a concept.
 
         Args:
-            path: of its file; ``pretrained/...`` is looked for in the current folder, then among the files that ship.
+            path: input file; ``pretrained/...`` is searched in the current folder, then among the shipped files.
 
         Raises:
             UserError: for a file that is missing, damaged or not a concept.
@@ -283,18 +282,18 @@ class Concept(Shown):
 
 
 def file_name(concept: str) -> str:
-    """A concept's name as a file name: letters, digits and dots kept, the rest underscores."""
+    """File name of a concept: letters, digits and dots are kept, all else becomes underscores."""
     return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
 
 
 def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
-    """Check that the tensors of a concept are float32 and that their shapes go together.
+    """Check that the tensors of a concept are float32 with consistent shapes.
 
     Args:
-        tensors: ``embeddings`` ``(K, knots, n)``, ``weights`` ``(K,)``; maybe :data:`MODES` and :data:`COMPOSING`.
+        tensors: ``embeddings`` ``(K, knots, n)``, ``weights`` ``(K,)``; optionally :data:`MODES` and :data:`COMPOSING`.
 
     Raises:
-        UserError: naming the first tensor of another shape or type.
+        UserError: naming the first tensor with a wrong shape or dtype.
     """
     shape = tuple(tensors["embeddings"].shape)
     if len(shape) != 3 or not all(shape):
@@ -305,5 +304,5 @@ def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
     expected |= {COMPOSING[0]: composing, COMPOSING[1]: composing[:1]}
     for name, values in tensors.items():
         if values.shape != expected[name] or values.dtype != torch.float32:
-            told = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
-            raise UserError(f"key {name!r}: expected float32 of shape {expected[name]}, found {told}")
+            actual = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
+            raise UserError(f"key {name!r}: expected float32 of shape {expected[name]}, found {actual}")

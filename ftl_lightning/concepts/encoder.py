@@ -1,4 +1,4 @@
-"""Text to embedding: the shipped table, or any T5 or BERT-like language model."""
+"""Text encoders: the shipped table, or any T5 or BERT-like language model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
 EMPTY = ""
-"""The text of the empty concept."""
+"""Text of the empty (unconditional) concept."""
 KIND = "concept embeddings"
 MINILM = "minilm"
-"""Name of the language model that the extra ``minilm`` installs (all-MiniLM-L6-v2)."""
+"""Name of the language model in the extra ``minilm`` (all-MiniLM-L6-v2)."""
 AUTO, HASHING = "auto", "hashing"
 TABLE = "table"
-"""Name of the table of embeddings that ships with each domain."""
+"""Name of the table of embeddings shipped with each domain."""
 
 
 class Encoder(Protocol):
-    """Maps texts to embeddings ``(text, n)``. ``identity`` tells two encoders apart: name, revision, hash of the weights."""
+    """Maps texts to embeddings ``(text, n)``."""
 
     @property
     def identity(self) -> str:
-        """Name, revision and hash of the weights in one text."""
+        """Unique name: name, revision and hash of the weights."""
         ...
 
     def __call__(self, texts: Sequence[str]) -> Tensor: ...
@@ -39,13 +39,13 @@ class Encoder(Protocol):
 
 @dataclass(frozen=True)
 class TableEncoder:
-    """Looks embeddings up in a file made by :func:`write_table`. Needs neither a network nor a language model."""
+    """Looks up embeddings in a file from :func:`write_table`. Needs neither internet access nor a language model."""
 
     path: Path
 
     @property
     def identity(self) -> str:
-        """Of the encoder that made the table."""
+        """Identity of the encoder behind the table."""
         return str(load_tensors(self.path, KIND)[1]["encoder"])
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
@@ -64,10 +64,10 @@ class TransformerEncoder:
     """Mean of the last hidden state over a text's tokens (as the paper's flan-t5-base).
 
     Attributes:
-        name: a Hugging Face name or the path of a folder.
-        revision: of the Hugging Face repository.
-        cache: folder in which embeddings are kept, keyed by encoder and revision; ``None`` for no cache.
-        label: what a folder's model is called in its identity.
+        name: Hugging Face name or path of a folder.
+        revision: revision of the Hugging Face repository.
+        cache: folder of cached embeddings, keyed by encoder and revision; ``None`` for no cache.
+        label: model name in the identity of a folder.
     """
 
     name: str
@@ -77,19 +77,19 @@ class TransformerEncoder:
 
     @property
     def identity(self) -> str:
-        """The Hub's name with its revision, or the folder's label with a hash of its weights."""
+        """Hub name with revision, or label of the folder with a hash of its weights."""
         folder = Path(self.name)
         weights = visible(folder, "*.safetensors") if folder.is_dir() else []
-        # A folder is known by its weights, so that the same model at another path is the same encoder.
+        # Hash the weights of a folder: the same model at another path is the same encoder.
         return f"{self.label}@{file_hash(weights[0])}" if weights else f"{self.name}@{self.revision}"
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
         cached = self.cache and self.cache / f"{content_hash([self.identity, list(texts)])}.safetensors"
         if cached and cached.is_file():
-            found = load_tensors(cached, KIND)[0].get("embeddings")
-            if found is None or found.dim() != 2 or len(found) != len(texts) or not found.isfinite().all():
+            loaded = load_tensors(cached, KIND)[0].get("embeddings")
+            if loaded is None or loaded.dim() != 2 or len(loaded) != len(texts) or not loaded.isfinite().all():
                 raise UserError(f"{cached}: expected {len(texts)} embeddings, found others; delete the file")
-            return found
+            return loaded
         embeddings = self._embed(texts)
         if cached:
             save_tensors(cached, KIND, {"embeddings": embeddings}, {"encoder": self.identity, "texts": list(texts)})
@@ -97,7 +97,7 @@ class TransformerEncoder:
 
     @torch.no_grad()
     def _embed(self, texts: Sequence[str]) -> Tensor:
-        from transformers import AutoTokenizer  # seconds of import that the table does not need
+        from transformers import AutoTokenizer  # slow import, not needed for the table
 
         model = self._load()
         try:
@@ -115,37 +115,36 @@ class TransformerEncoder:
         try:
             config = AutoConfig.from_pretrained(self.name, revision=self.revision, trust_remote_code=False)
             kind = T5EncoderModel if config.model_type == "t5" else AutoModel
-            read: Any = kind.from_pretrained  # its annotation leaves out what it returns with the option
-            model, told = read(
+            read: Any = kind.from_pretrained  # the annotation omits output_loading_info
+            model, info = read(
                 self.name, revision=self.revision, use_safetensors=True, output_loading_info=True, trust_remote_code=False
             )
-        except Exception as error:  # transformers and safetensors raise many kinds for a folder that is damaged
+        except Exception as error:  # many types, for a damaged folder
             raise UserError(
                 f"encoder: expected a folder or a Hugging Face name of a T5 or BERT-like model with safetensors weights, found "
                 f"{short(self.name)!r} ({short(str(error), 100)})"
             ) from error
-        # What a file lacks is drawn at random; the pooling layer alone is not used.
-        if missing := [name for name in told["missing_keys"] if not name.startswith("pooler.")]:
+        # Missing weights would be random; only the pooling layer is unused.
+        if missing := [name for name in info["missing_keys"] if not name.startswith("pooler.")]:
             raise UserError(
                 f"encoder: {self.name}: expected all weights of the model, found none of {len(missing)}, such as "
                 f"{short(min(missing))!r}; download it again"
             )
-        found: PreTrainedModel = model.eval()
-        return found
+        network: PreTrainedModel = model.eval()
+        return network
 
 
 def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encoder:
-    """An encoder by name.
+    """Load an encoder by name.
 
     Args:
-        name: ``'table'`` (a domain's shipped embeddings), ``'minilm'`` (the extra), ``'hashing'`` (no language model: it knows
-            words and letters, not what they mean), ``'auto'`` (``'minilm'`` where it is installed, else ``'hashing'``), or a
-            Hugging Face name or path.
-        table: the file that ``'table'`` means; ``None`` where a domain ships none.
-        revision: of a Hugging Face model.
+        name: ``'table'`` (the domain's shipped embeddings), ``'minilm'`` (the extra), ``'hashing'`` (no language model: words and
+            letters without meanings), ``'auto'`` (``'minilm'`` if installed, else ``'hashing'``), or a Hugging Face name or path.
+        table: file for ``'table'``; ``None`` if the domain ships none.
+        revision: revision of a Hugging Face model.
 
     Raises:
-        UserError: if ``'minilm'`` is asked for and the extra is not installed, or ``'table'`` where there is none.
+        UserError: for ``'minilm'`` without the extra, or ``'table'`` without a table.
     """
     if name == TABLE:
         if table is None:
@@ -173,6 +172,6 @@ def load_encoder(name: str, table: Path | None, revision: str = "main") -> Encod
 
 
 def write_table(path: Path, encoder: Encoder, texts: Sequence[str]) -> None:
-    """Embed texts, and the empty one, into a file that :class:`TableEncoder` reads."""
+    """Write the embeddings of texts and of the empty text, for :class:`TableEncoder`."""
     texts = tuple(dict.fromkeys((EMPTY, *texts)))
     save_tensors(path, KIND, {"embeddings": encoder(texts)}, {"encoder": encoder.identity, "texts": texts})

@@ -1,4 +1,4 @@
-"""What a learned concept is made of, in the words of the training concepts."""
+"""Explanation of a learned concept by training concepts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,25 +7,25 @@ import numpy as np
 from torch import Tensor
 
 ROUNDING = 1e-4
-"""Weights below this share of the largest are rounding and the penalty's doing."""
-MOST_TOLD = 12
-"""Parts of a combination that are told one by one, the largest."""
+"""Smallest reported weight, as a share of the largest; smaller weights come from rounding and the penalty."""
+MOST_TERMS = 12
+"""Maximum number of listed parts of a combination."""
 RIDGE = 1e-4
-"""Penalty of weights, as a share of the training embeddings' largest singular value: well above their rounding (1e-7 of that value
-in float32) and well below the singular values of what tells concepts apart (2e-2 of it and more in the shipped models).
+"""Penalty of weights, relative to the largest singular value of the training embeddings: well above float32 rounding (1e-7) and
+well below the singular values that distinguish concepts (2e-2 and more in the shipped models).
 """
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """An embedding in words.
+    """Explanation of an embedding.
 
     Attributes:
-        nearest: training concepts with the cosine of their angle to the embedding, the nearest first.
-        combination: the non-negative combination of training concepts that is nearest to the embedding, with the smallest weights:
-            those with a weight, the largest first.
-        explained: share of the embedding's squared length that the combination holds, from 0 to 1. The combination is the nearest
-            point of a cone, so what is left is at right angles to it and the two squared lengths add up to the embedding's.
+        nearest: training concepts with their cosine similarity to the embedding, the nearest first.
+        combination: best non-negative combination of training concepts with minimal weights: concepts with non-zero weights, the
+            largest first.
+        explained: share of the embedding's squared length that the combination explains, 0 to 1. The combination is a projection
+            onto a cone: the residual is orthogonal to it and their squared lengths add up to the embedding's.
     """
 
     nearest: tuple[tuple[str, float], ...]
@@ -34,14 +34,14 @@ class Explanation:
 
     @property
     def unexplained(self) -> float:
-        """Share of the embedding's squared length that no non-negative combination of training concepts holds."""
+        """Share of the embedding's squared length outside all non-negative combinations of training concepts."""
         return 1 - self.explained
 
     def __str__(self) -> str:
         near = ", ".join(f"{text} ({cosine:.2f})" for text, cosine in self.nearest)
-        told = [f"{weight:.2f} {text}" for text, weight in self.combination[:MOST_TOLD]]
-        rest = len(self.combination) - len(told)
-        parts = " + ".join([*told, *([f"{rest} smaller ones"] if rest else [])]) or "nothing"
+        terms = [f"{weight:.2f} {text}" for text, weight in self.combination[:MOST_TERMS]]
+        rest = len(self.combination) - len(terms)
+        parts = " + ".join([*terms, *([f"{rest} smaller ones"] if rest else [])]) or "nothing"
         return (
             f"nearest: {near}; best combination: {parts} (explains {self.explained:.2f}); not explained: "
             f"{100 * self.unexplained:.0f} % of its squared length, which no non-negative combination of training concepts holds"
@@ -49,22 +49,21 @@ class Explanation:
 
 
 def explain(embedding: Tensor, names: Sequence[str], training: Tensor, nearest: int = 3) -> Explanation:
-    """An embedding in terms of the training concepts.
+    """Explain an embedding by training concepts.
 
-    The combination minimises ``|B^T w - c|^2`` over ``w >= 0``, with the training embeddings as the rows of B. Only the nearest
-    point ``B^T w`` is unique, not ``w``: the concept space's origin is the mean of the training concepts, so ``1^T B = 0``, and
-    adding a constant to all weights changes nothing. Of the equivalent weights the smallest are taken, those of least ``|w|``.
-    They are the limit of the minimisers of ``|B^T w - c|^2 + r^2 |w|^2`` as r goes to 0, which are unique for r > 0; r is
-    :data:`RIDGE` times B's largest singular value. Where the sum of all rows is their only dependence, this subtracts the
-    smallest weight from all weights, so that at least one concept has none.
+    The combination minimises ``|B^T w - c|^2`` over ``w >= 0``, with the training embeddings as the rows of B. Only the projection
+    ``B^T w`` is unique, not ``w``: the concept space's origin is the mean of the training concepts, so ``1^T B = 0``, and adding a
+    constant to all weights changes nothing. The weights of minimal norm ``|w|`` are chosen. They are the limit of the minimisers of
+    ``|B^T w - c|^2 + r^2 |w|^2`` as r goes to 0, which are unique for r > 0; r is :data:`RIDGE` times B's largest singular value.
+    If ``1^T B = 0`` is the only dependence of the rows, the smallest weight is 0.
 
     Args:
         embedding: ``(n,)`` in a model's concept space, whose origin is the mean of the training concepts.
-        names: of the training concepts.
-        training: their embeddings ``(training concept, n)``.
-        nearest: how many of the nearest are told.
+        names: names of the training concepts.
+        training: embeddings of the training concepts ``(training concept, n)``.
+        nearest: number of nearest concepts.
     """
-    from scipy.optimize import nnls  # half a second of import, for what is explained later
+    from scipy.optimize import nnls  # slow import
 
     target, basis = embedding.double().numpy(), training.double().numpy()
     lengths = np.linalg.norm(basis, axis=1) * np.linalg.norm(target)

@@ -1,4 +1,4 @@
-"""The composed denoiser, Eq. 2 of the paper: learning, sampling and composing all go through it."""
+"""The composed denoiser, Eq. 2 of the paper, for learning, sampling and composing."""
 
 import torch
 from torch import Tensor
@@ -17,19 +17,19 @@ def composed_epsilon(
     context: Context = (),
     row: Tensor | None = None,
 ) -> Tensor:
-    """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, all branches in one call of the network.
+    """``eps(x, empty) + sum_k w_k (eps(x, c_k) - eps(x, empty))``, with all branches in a single forward pass.
 
-    While learning, the empty branch, which depends on nothing that is learned, is evaluated apart, without gradient. Where a
-    concept has an adapter, the network that evaluates its branch is the one that the adapter makes of the denoiser.
+    With gradients enabled, the unconditional branch ``eps(x, empty)`` is evaluated separately and without gradient. The branch of
+    a concept with an adapter is evaluated by the modified denoiser.
 
     Args:
-        denoiser: estimates noise for one concept a sample.
+        denoiser: noise estimate with a single concept per sample.
         x: noisy plans ``(batch, horizon, state)``.
         t: timesteps ``(batch,)``.
         composition: ``(composition, K, ...)``; K may be 0.
-        empty: the empty concept ``(n,)``.
-        context: of each sample.
-        row: each sample's composition ``(batch,)`` int64; ``None`` for equally many samples of each, one after another.
+        empty: unconditional embedding ``(n,)``.
+        context: context of each sample.
+        row: composition of each sample ``(batch,)`` int64; ``None`` for equally sized consecutive groups.
 
     Returns:
         ``(batch, horizon, state)``.
@@ -50,11 +50,11 @@ def composed_epsilon(
 
 
 def weighted_sum(composition: Composition, row: Tensor, differences: Tensor) -> Tensor:
-    """``sum_k w_k differences_k``, where a weight may differ between the columns of a state.
+    """``sum_k w_k differences_k`` with weights that may differ between the columns of a state.
 
     Args:
         composition: ``(composition, K, ...)``.
-        row: each sample's composition ``(batch,)``.
+        row: composition of each sample ``(batch,)``.
         differences: ``(K, batch, horizon, state)``.
 
     Returns:
@@ -67,15 +67,13 @@ def weighted_sum(composition: Composition, row: Tensor, differences: Tensor) -> 
 
 
 def _in_turn(composition: Composition, x: Tensor) -> Tensor:
-    """Rows ``(batch,)`` of equally many samples of each composition, one composition after another."""
+    """Rows ``(batch,)`` for equally sized consecutive groups of samples."""
     count = len(composition.weights)
     return torch.arange(count, device=x.device).repeat_interleave(len(x) // count)
 
 
 def _flat(composition: Composition, row: Tensor) -> tuple[Tensor, Tensor]:
-    """The concepts of all compositions ``(composition * K, knots, n)``, and where among them those of each sample are
-    ``(K, batch)``.
-    """
+    """Concepts of all compositions ``(composition * K, knots, n)``, and their rows for each sample ``(K, batch)``."""
     components = composition.weights.shape[1]
     index = components * row + torch.arange(components, device=row.device)[:, None]
     return composition.embeddings.flatten(0, 1), index

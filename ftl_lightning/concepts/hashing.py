@@ -1,4 +1,4 @@
-"""Text to embedding without a language model: words and pieces of words, hashed into a fixed number of columns."""
+"""Text encoder without a language model: words and pieces of words, hashed into a fixed number of columns."""
 
 import hashlib
 import itertools
@@ -10,38 +10,38 @@ import torch
 from torch import Tensor
 
 DIMENSION = 384
-"""Columns of an embedding."""
+"""Embedding size."""
 PIECE = 3
-"""Letters of a piece of a word."""
+"""Letters per piece of a word."""
 _TOKEN = re.compile(r"\w+|[^\w\s]")
 
 
 class HashingEncoder:
-    """Signed feature hashing (Weinberger et al., 2009). Needs no data, no network and no language model.
+    """Signed feature hashing (Weinberger et al., 2009). Needs no data, no internet access and no language model.
 
-    Features of a text are its words, pairs of neighbouring words, and the pieces of :data:`PIECE` letters of each word with its
-    ends marked, so that 'circle' and 'circles' are near each other. Each adds +1 or -1 to one column, which SHA-256 decides, so
-    that embeddings are the same on every machine. It knows no meanings: 'big' and 'large' have nothing in common.
+    Features of a text are its words, pairs of neighbouring words, and the pieces of :data:`PIECE` letters of each word with marked
+    ends, so that 'circle' and 'circles' are near each other. Each feature adds +1 or -1 to a column. SHA-256 decides sign and
+    column, so embeddings are the same on every machine. Meanings are unknown: 'big' and 'large' have nothing in common.
     """
 
     @property
     def identity(self) -> str:
-        """What tells it apart from other encoders."""
+        """Unique name of the encoder."""
         return f"hashing-{DIMENSION}"
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Embeddings ``(text, 384)`` float32 of length 1; zeros for a text that is empty or blank."""
-        found = torch.zeros(len(texts), DIMENSION, dtype=torch.float64)
+        """Embeddings ``(text, 384)`` float32 of unit length; zeros for an empty or blank text."""
+        sums = torch.zeros(len(texts), DIMENSION, dtype=torch.float64)
         for row, text in enumerate(texts):
             for feature in _features(text):
                 digest = hashlib.sha256(feature.encode()).digest()
-                found[row, int.from_bytes(digest[:8], "big") % DIMENSION] += 1 if digest[8] & 1 else -1
-        length = found.norm(dim=1, keepdim=True)
-        return torch.where(length > 0, found / length.clamp(min=1e-12), 0).float()
+                sums[row, int.from_bytes(digest[:8], "big") % DIMENSION] += 1 if digest[8] & 1 else -1
+        length = sums.norm(dim=1, keepdim=True)
+        return torch.where(length > 0, sums / length.clamp(min=1e-12), 0).float()
 
 
 def _features(text: str) -> Iterator[str]:
-    """Words, pairs and pieces, each with its kind in front; capitals and forms of the same letter do not matter."""
+    """Words, pairs and pieces, each prefixed by its kind; case and Unicode form do not matter."""
     words = _TOKEN.findall(unicodedata.normalize("NFKC", text).casefold())
     for word in words:
         yield f"word {word}"

@@ -1,4 +1,4 @@
-"""Modes of a concept: several sets of embeddings, for behaviours that are right in different ways."""
+"""Modes of a concept: several sets of embeddings for multimodal behaviour."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -9,28 +9,28 @@ from torch import Tensor
 from ftl_lightning.representation import Shown, counted
 
 STRETCH = 1.5
-"""Mixtures of modes lie so much farther from the modes' mean than convex combinations: these alone vary less than the modes do."""
+"""Default factor by which mixtures are moved away from the modes' mean: convex combinations vary less than the modes."""
 
 
 def even_stretch(modes: int) -> float:
-    """The stretch with which mixtures of so many modes vary as much as the behaviour that the modes were drawn from.
+    """Stretch with which mixtures have the variance of the behaviour that the modes were drawn from.
 
-    Shares even on the simplex have 1 / (modes + 1) of the variance of single modes, which have (modes - 1) / modes of that of what
-    they are a sample of.
+    Mixtures with uniform shares on the simplex have 1 / (modes + 1) of the variance of the modes. The variance of the modes is
+    (modes - 1) / modes of the behaviour's.
     """
     return ((modes + 1) * modes / (modes - 1)) ** 0.5 if modes > 1 else 1.0
 
 
 @dataclass(frozen=True, repr=False)
 class Modes(Shown):
-    """Several sets of embeddings of one concept: behaviours that are right in different ways.
+    """Several sets of embeddings of a concept with multimodal behaviour.
 
     Attributes:
         embeddings: ``(mode, K, knots, n)``.
         weights: ``(mode, K)``, omega.
-        mixed: whether a sample is generated from a random mixture of the modes, which suits concepts of which one set of embeddings
-            says enough, or from one mode, drawn at random.
-        stretch: of mixtures: how much farther from the modes' mean they lie than convex combinations.
+        mixed: whether a sample uses a random mixture of the modes, for concepts that a single set of embeddings describes well,
+            or a single random mode.
+        stretch: factor by which mixtures are moved away from the modes' mean, relative to convex combinations.
     """
 
     embeddings: Tensor
@@ -51,13 +51,11 @@ class Modes(Shown):
         return replace(self, weights=factor * self.weights)
 
     def to(self, device: torch.device) -> "Modes":
-        """The same on a device."""
+        """Move all tensors to a device."""
         return replace(self, embeddings=self.embeddings.to(device), weights=self.weights.to(device))
 
     def with_each(self, other: "Modes") -> "Modes":
-        """The sum of two concepts: each of these modes with each of the other's, the other's changing first; mixed where either
-        is.
-        """
+        """Combine the modes of two concepts pairwise, the other's changing first; mixed if either is mixed."""
 
         def paired(first: Tensor, second: Tensor) -> Tensor:
             outer = first.repeat_interleave(len(second), dim=0)
@@ -68,14 +66,13 @@ class Modes(Shown):
         return Modes(embeddings, weights, mixed=self.mixed or other.mixed, stretch=max(self.stretch, other.stretch))
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """What ``count`` samples are generated from: embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and each sample's
-        row ``(count,)``.
+        """Draw modes or mixtures: embeddings ``(row, K, knots, n)``, weights ``(row, K)``, and the row of each sample ``(count,)``.
 
-        A mixture is ``mean + stretch * sum_m share_m (mode_m - mean)``, the shares even on the simplex (Dirichlet(1)).
+        A mixture is ``mean + stretch * sum_m share_m (mode_m - mean)`` with shares uniform on the simplex (Dirichlet(1)).
 
         Args:
-            count: of samples.
-            generator: decides their modes, or shares.
+            count: number of samples.
+            generator: generator of modes or shares.
         """
         if not self.mixed:
             chosen = torch.randint(len(self), (count,), generator=generator, device=generator.device)

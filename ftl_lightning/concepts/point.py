@@ -1,22 +1,22 @@
-"""Embeddings of a concept space, each with what it is."""
+"""Labelled embeddings of a concept space."""
 
 from typing import NamedTuple
 
 from torch import Tensor
 
 EMPTY_CONCEPT, TRAINING_CONCEPT, NEW_COMPONENT = "empty concept", "training concept", "new component"
-"""Sets of points."""
+"""Values of :attr:`Point.set`."""
 
 
 class Part(NamedTuple):
-    """One embedding of a learned concept, by numbers from 1.
+    """An embedding of a learned concept. Numbers count from 1.
 
     Attributes:
-        weight: of its component.
+        weight: weight of the component.
         embedding: ``(n,)``.
-        component: which component it is.
-        mode: of which mode; ``None`` for none's.
-        knot: at which time of the plan; ``None`` for all.
+        component: number of the component.
+        mode: number of the mode; ``None`` without modes.
+        knot: number of the knot; ``None`` for a single knot.
     """
 
     weight: float
@@ -27,19 +27,19 @@ class Part(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Such as ``'component 1'``, ``'mode 2, component 1'`` or ``'component 1, knot 3'``."""
+        """Name such as ``'component 1'``, ``'mode 2, component 1'`` or ``'component 1, knot 3'``."""
         mode = "" if self.mode is None else f"mode {self.mode}, "
         return f"{mode}component {self.component}{'' if self.knot is None else f', knot {self.knot}'}"
 
 
 class Point(NamedTuple):
-    """One embedding of a concept space.
+    """An embedding of a concept space.
 
     Attributes:
         text: name of the concept.
-        set: one of :data:`EMPTY_CONCEPT`, :data:`TRAINING_CONCEPT` and :data:`NEW_COMPONENT`.
+        set: :data:`EMPTY_CONCEPT`, :data:`TRAINING_CONCEPT` or :data:`NEW_COMPONENT`.
         embedding: ``(n,)``.
-        part: of a learned concept, which of its embeddings it is; ``None`` of one that is not learned.
+        part: part of a learned concept; ``None`` otherwise.
     """
 
     text: str

@@ -1,4 +1,4 @@
-"""What the file of a learned concept says of it, without its numbers: lists of many concepts read no more."""
+"""Summary of a concept's file without its tensors, for lists of many concepts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -15,12 +15,12 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Summary:
-    """A learned concept in words.
+    """Summary of a learned concept.
 
     Attributes:
-        origin: where it comes from.
+        origin: provenance.
         form: such as ``'one set'``, ``'5 modes over time'`` or ``'adapter'``.
-        quality: what its samples were like; ``None`` where nobody looked.
+        quality: quality of the samples; ``None`` if not measured.
     """
 
     origin: Origin
@@ -29,30 +29,30 @@ class Summary:
 
 
 def summary(path: str | Path) -> Summary | None:
-    """The summary of a concept's file; its tensors are not read, so that they may still be damaged.
+    """Summarise a concept's file. The tensors are neither read nor checked.
 
     Returns:
-        ``None`` for a file of this program that holds something else, such as a model.
+        ``None`` for another kind of file of this package, such as a model.
 
     Raises:
         UserError: for a file that is missing, damaged or of other software.
-        OSError: if it cannot be read.
+        OSError: if the file cannot be read.
     """
     shapes, header = load_header(path, KIND)
     if isinstance(header, dict) and isinstance(header.get("kind"), str) and header["kind"] != KIND:
         return None
     with about(path):
-        told = expect_kind(header, KIND, VERSION)
+        keys = expect_kind(header, KIND, VERSION)
         names = [field.name for field in fields(Origin)]
-        if missing := [*(key for key in names if key not in told), *({"embeddings", "weights"} - set(shapes))]:
+        if missing := [*(key for key in names if key not in keys), *({"embeddings", "weights"} - set(shapes))]:
             raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
-        origin = from_mapping(Origin, {name: told[name] for name in names}, "")
-        quality = from_mapping(QualityRecord, told["quality"], "quality") if told.get("quality") is not None else None
-        return Summary(origin, _form(shapes, told.get("mixed") is True), quality)
+        origin = from_mapping(Origin, {name: keys[name] for name in names}, "")
+        quality = from_mapping(QualityRecord, keys["quality"], "quality") if keys.get("quality") is not None else None
+        return Summary(origin, _form(shapes, keys.get("mixed") is True), quality)
 
 
 def _form(shapes: Shapes, mixed: bool) -> str:
-    """The form of a concept, by the shapes of its tensors."""
+    """Derive the form of a concept from the shapes of its tensors."""
     modes, embeddings = shapes.get(MODES[0], ()), shapes["embeddings"]
     parts = ["mixtures" if mixed else counted(modes[0], "mode")] if modes else []
     parts += ["adapter"] if any(name.startswith(ADAPTER) for name in shapes) else []

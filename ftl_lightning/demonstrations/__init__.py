@@ -1,4 +1,4 @@
-"""Demonstrations: container, file, normalisation, DataModules."""
+"""Demonstrations: container, files, normalisation, checks."""
 
 from ftl_lightning.demonstrations.container import Demonstrations
 

@@ -1,4 +1,4 @@
-"""The container of demonstrations: what there is of one or several tasks, and what is taken from it."""
+"""Container of demonstrations of one or several tasks."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,20 +23,20 @@ class Demonstrations(Shown):
     """Demonstrations of one or several tasks, in the domain's units.
 
     Attributes:
-        states: ``(demo, time, state)`` float32, padded behind each demonstration's length.
+        states: ``(demo, time, state)`` float32, padded beyond each demonstration's length.
         lengths: ``(demo,)`` int64, between 1 and ``time``.
-        domain: name of the domain, or ``''`` where the file did not say.
-        state_names, state_units: one entry a column of ``states``.
-        concepts: one text a demonstration; ``''`` where it is not known.
-        observed: observed features by name: ``(demo, time, *shape)`` of those in ``per_step``, what a plan that starts at that time
-            is conditioned on; ``(demo, *shape)`` of the others, known for the first time alone. Vectors are float32, images uint8.
+        domain: name of the domain; empty if unknown.
+        state_names, state_units: an entry for each column of ``states``.
+        concepts: a text for each demonstration; empty if unknown.
+        observed: observed features by name. Features in ``per_step`` are ``(demo, time, *shape)``, conditions of a plan that starts
+            at that time. Other features are ``(demo, *shape)``, known only at the first time. Vectors are float32, images uint8.
         per_step: names of the features that are known at every time.
-        scenes: ``(demo, scene)`` float32, what resets the environment to each demonstration's start and what a judge reads, never
-            shown to a model; ``None`` where there is nothing of the kind.
-        provenance: how they came about (generator, seed, ...), anything JSON can hold.
+        scenes: ``(demo, scene)`` float32, which reset the environment to each demonstration's initial state and serve a judge,
+            never a model; ``None`` if there are none.
+        provenance: origin of the demonstrations (generator, seed, ...), anything JSON can hold.
 
     Raises:
-        UserError: at construction, if shapes or values are not as described.
+        UserError: at construction, for other shapes or values.
     """
 
     states: Tensor
@@ -63,8 +63,8 @@ class Demonstrations(Shown):
         if self.lengths.dtype != torch.int64:
             raise UserError(f"key 'lengths': expected whole numbers (int64), found {self.lengths.dtype}")
         if self.lengths.shape != (count,) or self.lengths.min() < 1 or self.lengths.max() > time:
-            found = shown(self.lengths.flatten()[:20].tolist())
-            raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {found}")
+            lengths = shown(self.lengths.flatten()[:20].tolist())
+            raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {lengths}")
         for key, values, expected in (
             ("state_names", self.state_names, state),
             ("state_units", self.state_units, state),
@@ -77,11 +77,11 @@ class Demonstrations(Shown):
         for name, feature in self.observed.items():
             leading = (count, time) if name in self.per_step else (count,)
             if tuple(feature.shape[: len(leading)]) != leading or feature.dim() <= len(leading):
-                told = ", ".join(map(str, leading))
-                raise UserError(f"key 'observed/{name}': expected shape ({told}, ...), found {tuple(feature.shape)}")
+                axes = ", ".join(map(str, leading))
+                raise UserError(f"key 'observed/{name}': expected shape ({axes}, ...), found {tuple(feature.shape)}")
             if feature.dtype not in (torch.float32, torch.uint8):
-                found = str(feature.dtype).removeprefix("torch.")
-                raise UserError(f"key 'observed/{name}': expected float32, or uint8 for images, found {found}")
+                dtype = str(feature.dtype).removeprefix("torch.")
+                raise UserError(f"key 'observed/{name}': expected float32, or uint8 for images, found {dtype}")
         if self.scenes is not None and (self.scenes.dim() != 2 or len(self.scenes) != count):
             raise UserError(f"key 'scenes': expected shape ({count}, scene), found {tuple(self.scenes.shape)}")
         if self.scenes is not None and self.scenes.dtype != torch.float32:
@@ -110,7 +110,7 @@ class Demonstrations(Shown):
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that is one, by its key in a file."""
+        """All tensors, by their keys in a file."""
         scenes = {} if self.scenes is None else {"scenes": self.scenes}
         features = {OBSERVED + name: values for name, values in self.observed.items()}
         return {"states": self.states, "lengths": self.lengths} | features | scenes
@@ -121,11 +121,11 @@ class Demonstrations(Shown):
         return {name: Feature.of(values, leading=2 if name in self.per_step else 1) for name, values in self.observed.items()}
 
     def select(self, concept: str) -> Self:
-        """The demonstrations of one concept."""
+        """Select the demonstrations of a concept."""
         return self.rows([index for index, text in enumerate(self.concepts) if text == concept])
 
     def rows(self, chosen: Sequence[int]) -> Self:
-        """Some of the demonstrations, chosen by their numbers from 0."""
+        """Select demonstrations by their numbers from 0 (``chosen``)."""
         return replace(
             self,
             states=self.states[chosen],
@@ -136,18 +136,18 @@ class Demonstrations(Shown):
         )
 
     def starts(self, rows: Tensor, share: Tensor, exponent: float, horizon: int, at_rest: bool = True) -> Tensor:
-        """Times at which windows start ``(window,)`` int64.
+        """Start times of windows ``(window,)`` int64.
 
-        Where features are observed at every time, a plan can start at any; 0 where one is known for the first time alone. Where
-        nothing is observed, nothing tells a plan where in a behaviour it is: then windows stay within a demonstration, and one as
-        long as it starts at 0.
+        If all features are observed at every time, a plan can start at any time. If a feature is known only at the first time, all
+        windows start at 0. Without observed features, nothing tells a plan where in a behaviour it is: windows stay within a
+        demonstration, and a window of its full length starts at 0.
 
         Args:
-            rows: ``(window,)`` int64, which demonstration.
+            rows: ``(window,)`` int64, demonstration of each window.
             share: ``(window,)``, evenly spread over [0, 1).
             exponent: u of ``start = length * share^u``; 1 is uniform, with 3 half of the windows start in the first eighth.
             horizon: length of the windows.
-            at_rest: whether windows may reach past the end; else they stay within demonstrations that are long enough.
+            at_rest: whether windows may reach past the end; otherwise they stay within demonstrations that are long enough.
         """
         if set(self.observed) - set(self.per_step):
             return torch.zeros_like(rows)
@@ -156,15 +156,15 @@ class Demonstrations(Shown):
         return (share**exponent * room).long()
 
     def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Stretches of demonstrations, padded with the last state.
+        """Windows of demonstrations, padded with the last state.
 
         Args:
-            rows: ``(window,)`` int64, which demonstration.
-            starts: ``(window,)`` int64, the first time of each.
-            horizon: their length.
+            rows: ``(window,)`` int64, demonstration of each window.
+            starts: ``(window,)`` int64, first time of each window.
+            horizon: length of the windows.
 
         Returns:
-            States ``(window, horizon, state)`` and what is observed where each starts, by name ``(window, *shape)``.
+            States ``(window, horizon, state)`` and features observed at each start, by name ``(window, *shape)``.
         """
         times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
         observed = {name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()}
@@ -172,44 +172,40 @@ class Demonstrations(Shown):
 
     @property
     def initial_states(self) -> InitialStates:
-        """Where each demonstration starts."""
+        """Initial state of each demonstration."""
         first = {name: values[:, 0] if name in self.per_step else values for name, values in self.observed.items()}
         return InitialStates(first, self.scenes)
 
     @property
     def final_states(self) -> InitialStates:
-        """What is observed where each demonstration ends; what is observed once, as it is at the start.
-
-        Behaviour that goes on from there can start in it.
-        """
+        """Final states as initial states of behaviour that continues; features known only at the start are unchanged."""
         rows, last = torch.arange(len(self)), self.lengths - 1
-        found = {name: values[rows, last] if name in self.per_step else values for name, values in self.observed.items()}
-        return InitialStates(found, self.scenes)
+        observed = {name: values[rows, last] if name in self.per_step else values for name, values in self.observed.items()}
+        return InitialStates(observed, self.scenes)
 
     @property
     def every_observation(self) -> dict[str, Tensor]:
-        """What is observed at all times of all demonstrations, by name ``(observation, *shape)``."""
+        """Observed features at all times of all demonstrations, by name ``(observation, *shape)``."""
         return {name: values.flatten(0, 1) if name in self.per_step else values for name, values in self.observed.items()}
 
     def named(self, concept: str) -> Self:
-        """The same, with a name for the concept of those that have none."""
+        """Give demonstrations without a text the name ``concept``."""
         return replace(self, concepts=tuple(text or concept for text in self.concepts))
 
     @property
     def hash(self) -> str:
-        """16-digit hash of states, lengths, observed features and scenes, whatever the form of a file that holds them."""
+        """16-digit hash of states, lengths, observed features and scenes, independent of the file format."""
         return bytes_hash(serialise(KIND, self.tensors, {}))
 
     def save(self, path: str | Path) -> None:
-        """Write them, whole or not at all.
+        """Write the demonstrations, whole or not at all.
 
         Args:
-            path: a safetensors file, in which images are compressed (zlib); an ``.npz`` file, if it ends so;
-                ``'minari:NAME'`` for a Minari data set; or ``'lerobot:FOLDER'`` for a LeRobot data set. Each format holds all
-                there is but for padding, an ``.npz`` without the provenance.
+            path: a safetensors file, with compressed images (zlib); an ``.npz`` file, by its suffix; ``'minari:NAME'`` for a Minari
+                data set; or ``'lerobot:FOLDER'`` for a LeRobot data set. No format keeps padding, and ``.npz`` no provenance.
 
         Raises:
-            UserError: naming it, if it cannot be written, or an extra is not installed that it needs.
+            UserError: naming the path, if it cannot be written or needs an extra that is not installed.
         """
         kind, name = written_to(str(path))
         if kind != "file":
@@ -234,15 +230,15 @@ class Demonstrations(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote or another program did: a safetensors file, an ``.npz`` file without objects, a Minari data
-        set by its name, or the folder of a LeRobot data set.
+        """Read demonstrations from :meth:`save` or another program: a safetensors file, an ``.npz`` file without objects, a Minari
+        data set by its name, or the folder of a LeRobot data set.
 
-        An ``.npz`` needs ``states`` ``(demo, time, state)``; ``concepts`` (texts, or one for all), ``lengths`` (all full),
-        ``state_names``, ``state_units``, ``domain``, ``scenes`` and observed features as ``observed/NAME`` are optional. Names
-        listed in ``per_step`` are observed at every time.
+        An ``.npz`` file needs ``states`` ``(demo, time, state)``. Optional are ``concepts`` (texts, or a single text for all),
+        ``lengths`` (default: full), ``state_names``, ``state_units``, ``domain``, ``scenes``, and observed features as
+        ``observed/NAME``. Names listed in ``per_step`` are observed at every time.
 
         Args:
-            path: of the file or folder, or the data set's name.
+            path: path of the file or folder, or name of the data set.
 
         Raises:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
@@ -252,27 +248,27 @@ class Demonstrations(Shown):
             return cls(**contents)
 
     def fitted(self, features: Mapping[str, Feature]) -> Self:
-        """The demonstrations themselves, whose observed features are those of a domain.
+        """Return the demonstrations if their observed features are those of a domain.
 
         Args:
-            features: of the domain, by name.
+            features: features of the domain, by name.
 
         Raises:
             UserError: for a feature that is missing or has another type or shape.
         """
         for name, feature in features.items():
-            if (held := self.features.get(name)) is None or not held.fits(feature):
-                told = "none" if held is None else held.words
-                if held is not None and held.shape[1:] == feature.shape and name not in self.per_step:
-                    told += " (observed at every time? then list it in per_step)"
-                raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {told}")
+            if (given := self.features.get(name)) is None or not given.fits(feature):
+                message = "none" if given is None else given.words
+                if given is not None and given.shape[1:] == feature.shape and name not in self.per_step:
+                    message += " (observed at every time? then list it in per_step)"
+                raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {message}")
         return self
 
 
 def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
-    """Demonstrations of the same domain one after another, padded to the longest; the first one's provenance is kept.
+    """Concatenate demonstrations of a domain, padded to the longest, with the provenance of the first part.
 
-    A feature is observed at every time, and there are scenes, where that is so of all parts.
+    A feature is observed at every time, and there are scenes, only if this holds for all parts.
     """
     first = parts[0]
     longest = max(part.states.shape[1] for part in parts)
@@ -298,13 +294,13 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
 
 
 def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Behaviours of different lengths as one tensor.
+    """Pad behaviours of different lengths to a single tensor.
 
     Args:
-        behaviours: ``(time, ...)`` each, of at least one time.
+        behaviours: ``(time, ...)`` each, with at least one time.
 
     Returns:
-        ``(demo, longest time, ...)``, each padded with its last time, and the lengths ``(demo,)`` int64.
+        ``(demo, longest time, ...)``, each padded with its last time, and lengths ``(demo,)`` int64.
     """
     lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
     longest = int(lengths.max())
@@ -312,6 +308,6 @@ def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _padded(values: Tensor, time: int) -> Tensor:
-    """``(demo, time, ...)`` with its last time repeated."""
+    """Pad ``(demo, time, ...)`` with its last time."""
     last = values[:, -1:].expand(-1, time - values.shape[1], *(-1,) * (values.dim() - 2))
     return torch.cat((values, last), dim=1)

@@ -1,6 +1,6 @@
-"""Demonstrations as episodes: how other programs record behaviour, one after another, each of its own length and without padding.
+"""Demonstrations as episodes, the form of other programs: without padding, each with its length.
 
-Two things are not told by episodes alone and stand beside them, see :class:`Beside`.
+Attributes that episodes lack are stored beside them, see :class:`Beside`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,13 +20,13 @@ from ftl_lightning.limits import VARIABLE, most_bytes
 
 @dataclass(frozen=True)
 class Episode:
-    """One demonstration.
+    """A single demonstration.
 
     Attributes:
         states: ``(time, state)`` float32.
-        observed: what is observed at each time, by name ``(time, *shape)``, float32, or uint8 of images.
-        concept: its text; empty where it has none.
-        scene: ``(scene,)`` float32, what resets the environment to its start; ``None`` where there is nothing of the kind.
+        observed: features at each time, by name ``(time, *shape)``, float32, or uint8 for images.
+        concept: text of the concept; empty if unknown.
+        scene: ``(scene,)`` float32, which resets the environment to the initial state; ``None`` if there is none.
     """
 
     states: NDArray[np.float32]
@@ -37,14 +37,14 @@ class Episode:
 
 @dataclass(frozen=True)
 class Beside:
-    """What the formats of other programs have no place for. It is written beside the episodes, as JSON.
+    """Attributes that formats of other programs lack, stored beside the episodes as JSON.
 
     Attributes:
-        domain: name of the domain; empty where it is not known.
-        state_names, state_units: one a column of the states; ``None`` for numbers and no units.
-        per_step: names of the observed features that are known at every time; ``None`` for all. The others are the same at all
-            times of an episode, and known at its start alone.
-        provenance: how the demonstrations came about.
+        domain: name of the domain; empty if unknown.
+        state_names, state_units: an entry for each column of the states; ``None`` for numbers and no units.
+        per_step: names of the features that are known at every time; ``None`` for all. Other features are constant in an episode,
+            and known only at its start.
+        provenance: origin of the demonstrations.
     """
 
     domain: str = ""
@@ -54,11 +54,11 @@ class Beside:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def of(self, observed: Sequence[str], own_states: bool) -> Self:
-        """The same where a reader asked for some of the features, or for other states than those that were written.
+        """Restrict the attributes to the features and states that are read.
 
         Args:
-            observed: features that are read.
-            own_states: whether the states are those that were written; names and units are theirs.
+            observed: names of features that are read.
+            own_states: whether the states are those that were written, to which names and units belong.
         """
         per_step = None if self.per_step is None else tuple(name for name in self.per_step if name in observed)
         names, units = (self.state_names, self.state_units) if own_states else (None, None)
@@ -66,13 +66,13 @@ class Beside:
 
 
 def beside(demonstrations: Demonstrations) -> dict[str, Any]:
-    """What :class:`Beside` says of demonstrations, as JSON can hold it."""
+    """Attributes of :class:`Beside` as JSON can hold them."""
     names = ("domain", "state_names", "state_units", "per_step", "provenance")
     return asdict(Beside(**{name: getattr(demonstrations, name) for name in names}))
 
 
 def episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
-    """Each demonstration without its padding; what is observed once is repeated at each time."""
+    """Yield each demonstration without padding; features known only at the start are repeated at each time."""
     scenes = demonstrations.scenes
     for row, (length, text) in enumerate(zip(demonstrations.lengths.tolist(), demonstrations.concepts, strict=True)):
         observed = {
@@ -88,26 +88,26 @@ def episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
 
 
 def contents(found: Sequence[Episode], told: Beside) -> Contents:
-    """The inverse of :func:`episodes`, padded to the longest with the last state.
+    """Invert :func:`episodes`, padding to the longest with the last state.
 
     Args:
-        found: at least one, all with the same columns and observed features.
-        told: what stands beside them.
+        found: at least one episode, all with the same columns and observed features.
+        told: attributes beside the episodes.
 
     Returns:
-        The attributes of demonstrations; whether they fit each other is known once these are made.
+        Attributes of demonstrations, not validated yet.
 
     Raises:
-        UserError: where there is none, or padding them would need far more memory than honest data do.
+        UserError: without episodes, or if padding needs far more memory than honest data do.
     """
     if not found:
         raise UserError("expected at least one episode, found none")
-    longest = max(len(one.states) for one in found)
+    longest = max(len(episode.states) for episode in found)
     step = sum(values[0].nbytes for values in (found[0].states, *found[0].observed.values()))
     if (size := longest * len(found) * step) > (most := most_bytes()):
-        told_size = f"{len(found)} episodes, the longest of {longest} steps, which are {size} bytes padded to it"
-        raise UserError(f"expected at most {most} bytes, found {told_size}; leave out the longest, or set {VARIABLE} to more")
-    states, lengths = padded([_tensor(one.states) for one in found])
+        message = f"{len(found)} episodes, the longest of {longest} steps, which are {size} bytes padded to it"
+        raise UserError(f"expected at most {most} bytes, found {message}; leave out the longest, or set {VARIABLE} to more")
+    states, lengths = padded([_tensor(episode.states) for episode in found])
     per_step = tuple(found[0].observed) if told.per_step is None else told.per_step
     columns = states.shape[2]
     return {
@@ -116,7 +116,7 @@ def contents(found: Sequence[Episode], told: Beside) -> Contents:
         "domain": told.domain,
         "state_names": tuple(map(str, range(columns))) if told.state_names is None else told.state_names,
         "state_units": ("",) * columns if told.state_units is None else told.state_units,
-        "concepts": tuple(one.concept for one in found),
+        "concepts": tuple(episode.concept for episode in found),
         "observed": {name: _observed(found, name, name in per_step) for name in found[0].observed},
         "per_step": per_step,
         "scenes": _scenes(found),
@@ -128,9 +128,9 @@ def expect_names(demonstrations: Demonstrations, taken: str, where: str) -> None
     """Refuse names of observed features that another format cannot hold.
 
     Args:
-        demonstrations: whose names they are.
-        taken: the name under which the format holds the states.
-        where: they are written, for messages.
+        demonstrations: demonstrations to write.
+        taken: name of the states in the format.
+        where: target, for messages.
 
     Raises:
         UserError: naming the feature.
@@ -142,15 +142,15 @@ def expect_names(demonstrations: Demonstrations, taken: str, where: str) -> None
 
 
 def _tensor(values: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(np.array(values))  # a copy: what is read from files often cannot be written to
+    return torch.from_numpy(np.array(values))  # a copy: arrays from files are often read-only
 
 
-def _observed(found: Sequence[Episode], name: str, per_step: bool) -> Tensor:
+def _observed(recorded: Sequence[Episode], name: str, per_step: bool) -> Tensor:
     if per_step:
-        return padded([_tensor(one.observed[name]) for one in found])[0]
-    return torch.stack([_tensor(one.observed[name][0]) for one in found])
+        return padded([_tensor(episode.observed[name]) for episode in recorded])[0]
+    return torch.stack([_tensor(episode.observed[name][0]) for episode in recorded])
 
 
-def _scenes(found: Sequence[Episode]) -> Tensor | None:
-    scenes = [_tensor(one.scene) for one in found if one.scene is not None]
-    return torch.stack(scenes) if len(scenes) == len(found) else None
+def _scenes(recorded: Sequence[Episode]) -> Tensor | None:
+    scenes = [_tensor(episode.scene) for episode in recorded if episode.scene is not None]
+    return torch.stack(scenes) if len(scenes) == len(recorded) else None

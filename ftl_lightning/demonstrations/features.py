@@ -1,4 +1,4 @@
-"""What is observed, by name, and where behaviour starts."""
+"""Observed features by name, and initial states."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,8 +14,8 @@ from ftl_lightning.representation import Shown
 Observed = Mapping[str, Tensor]
 """Observed features by name, each ``(sample, *shape)``; empty where nothing is observed."""
 
-READ = "(read)"  # not as a feature of anybody's own is named
-"""Observed in place of images where they have been read already: what an encoder read of them ``(sample, n)``."""
+READ = "(read)"  # no user's feature has this name
+"""Key of encoded images ``(sample, n)``, in place of the images."""
 
 
 @dataclass(frozen=True)
@@ -64,51 +64,51 @@ class Feature:
 
     @classmethod
     def of(cls, values: Tensor, leading: int = 1) -> Self:
-        """What samples ``(sample, *shape)`` are, by their type and what follows the first axes."""
+        """Feature of samples ``(sample, *shape)``, by their type and the axes after the leading ones."""
         return cls(tuple(values.shape[leading:]), "image" if values.dtype == torch.uint8 else "vector")
 
     def fits(self, expected: "Feature") -> bool:
-        """Whether kind and shape are those of another feature."""
+        """Whether kind and shape equal those of another feature."""
         return (self.kind, self.shape) == (expected.kind, expected.shape)
 
 
 def take(observed: Observed, rows: Tensor | Sequence[int] | slice | int) -> dict[str, Tensor]:
-    """Some of the samples, or one."""
+    """Select samples, or a single sample."""
     return {name: values[rows] for name, values in observed.items()}
 
 
 def moved(observed: Observed, device: torch.device) -> dict[str, Tensor]:
-    """Observed features on a device."""
+    """Move observed features to a device."""
     return {name: values.to(device) for name, values in observed.items()}
 
 
 def joined(parts: Sequence[Observed]) -> dict[str, Tensor]:
-    """Samples of several batches one after another."""
+    """Concatenate samples of several batches."""
     return {name: torch.cat([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
 
 def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None:
-    """Refuse observations that lack a feature or hold one of another shape, or bytes for numbers and the other way round.
+    """Refuse observations that lack a feature, or hold it with another shape or type (bytes or numbers).
 
     Raises:
         UserError: naming the feature.
     """
     for name, feature in expected.items():
         if name not in observed:
-            found = ", ".join(observed) or "none"
-            raise UserError(f"key 'observed': expected the feature {name!r}, {feature.words}, found {found}")
+            names = ", ".join(observed) or "none"
+            raise UserError(f"key 'observed': expected the feature {name!r}, {feature.words}, found {names}")
         if not (given := Feature.of(observed[name])).fits(feature):
             raise UserError(f"key 'observed/{name}': expected {feature.words} a sample, found {given.words}")
 
 
 @dataclass(frozen=True, repr=False)
 class InitialStates(Shown):
-    """Where behaviour starts.
+    """Initial states.
 
     Attributes:
-        observed: what a model sees there.
-        scenes: ``(sample, scene)`` float32, what resets an environment and what a judge reads, never shown to a model; ``None``
-            where there is nothing of the kind.
+        observed: observed features, the inputs of a model.
+        scenes: ``(sample, scene)`` float32, which reset an environment and serve a judge, never a model; ``None`` if there are
+            none.
     """
 
     observed: Observed = field(default_factory=dict)
@@ -124,11 +124,11 @@ class InitialStates(Shown):
         return len(next(iter([*self.observed.values(), *([] if self.scenes is None else [self.scenes])]), ()))
 
     def take(self, rows: Tensor | Sequence[int] | slice) -> Self:
-        """Some of them."""
+        """Select samples."""
         return type(self)(take(self.observed, rows), None if self.scenes is None else self.scenes[rows])
 
     def require_scenes(self) -> Tensor:
-        """The scenes.
+        """Return the scenes.
 
         Raises:
             UserError: if there are none.
@@ -139,10 +139,10 @@ class InitialStates(Shown):
 
 
 def expect_starts(starts: InitialStates | None) -> InitialStates:
-    """Where behaviour starts, for what cannot do without.
+    """Return initial states.
 
     Raises:
-        UserError: if nothing says where.
+        UserError: if they are missing.
     """
     if starts is None:
         raise UserError("starts: expected initial states, found none; give what is observed where plans start")
@@ -150,6 +150,6 @@ def expect_starts(starts: InitialStates | None) -> InitialStates:
 
 
 def join(parts: Sequence[InitialStates]) -> InitialStates:
-    """Initial states of several batches one after another."""
+    """Concatenate initial states of several batches."""
     scenes = [part.scenes for part in parts if part.scenes is not None]
     return InitialStates(joined([part.observed for part in parts]), torch.cat(scenes) if scenes else None)

@@ -1,4 +1,4 @@
-"""The file of demonstrations."""
+"""File format of demonstrations."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,14 +18,13 @@ from ftl_lightning.schema import expect_type
 from ftl_lightning.tensor_file import load_tensors, save_tensors
 
 VERSION = 4
-"""Version of the file format. Images are compressed (zlib), 1-D uint8 under their keys; the header has their shapes by key as
-``compressed``."""
+"""Version of the file format. Images are compressed (zlib) to 1-D uint8; the header has their shapes by key as ``compressed``."""
 
 
 class Contents(TypedDict):
-    """What a file says, by the attributes of :class:`~ftl_lightning.demonstrations.container.Demonstrations`.
+    """Content of a file, by the attributes of :class:`~ftl_lightning.demonstrations.container.Demonstrations`.
 
-    Types are as annotated here; whether shapes and values fit each other is known once the container is made.
+    Types are as annotated; shapes and values are validated by the container.
     """
 
     states: Tensor
@@ -41,15 +40,15 @@ class Contents(TypedDict):
 
 
 def write(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write one safetensors file with a JSON header, or an ``.npz``, whole or not at all.
+    """Write a safetensors file with a JSON header, or an ``.npz`` file, whole or not at all.
 
     Args:
-        path: the file; what ends in ``.npz`` is one, and says nothing of how the demonstrations came about.
-        tensors: by key; what is of uint8 is images and is compressed, see :data:`VERSION`.
-        header: what else there is to say, by key.
+        path: the file; the suffix ``.npz`` selects that format, which has no provenance.
+        tensors: tensors by key; uint8 tensors are images and are compressed, see :data:`VERSION`.
+        header: other attributes by key.
 
     Raises:
-        UserError: where the file cannot be written.
+        UserError: if the file cannot be written.
     """
     if Path(path).suffix == ".npz":
         return write_npz(path, tensors, header)
@@ -60,10 +59,10 @@ def write(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, 
 
 
 def read(path: str | Path) -> Contents:
-    """Read what :func:`write` wrote, an ``.npz`` file without objects, or a data set.
+    """Read a file of :func:`write`, an ``.npz`` file without objects, or a data set.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, of another kind, or says something of another type.
+        UserError: naming the file, if it is missing, damaged, of another kind, or holds a value of another type.
     """
     kind, name = read_from(str(path))
     if kind == "lerobot":
@@ -80,8 +79,8 @@ def read(path: str | Path) -> Contents:
     tensors, header = read_npz(path) if path.suffix == ".npz" else load_tensors(path, KIND, VERSION)
     with about(path):
         if "states" not in tensors:
-            told = short(", ".join(tensors)) or "nothing"
-            raise UserError(f"key 'states': expected (demo, time, state), found only {told}")
+            names = short(", ".join(tensors)) or "nothing"
+            raise UserError(f"key 'states': expected (demo, time, state), found only {names}")
         states = tensors["states"]
         demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
         texts = {key: _texts(key, header[key]) for key in TEXTS if key in header}

@@ -1,8 +1,8 @@
-"""Names under which files hold demonstrations, the same in safetensors and npz."""
+"""Keys of demonstrations in files, the same in safetensors and npz."""
 
 KIND = "demonstrations"
-"""What a safetensors file says that it is."""
+"""Kind of a safetensors file of demonstrations."""
 OBSERVED = "observed/"
-"""Before the names of observed features."""
+"""Prefix of observed features."""
 TEXTS = ("state_names", "state_units", "concepts", "per_step")
-"""Keys that hold lists of texts."""
+"""Keys of lists of texts."""

@@ -1,4 +1,4 @@
-"""What a check found in some demonstrations."""
+"""Findings of checks of demonstrations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,18 +6,18 @@ from typing import Literal, Self
 
 Severity = Literal["note", "warning", "error"]
 MOST_NAMED = 6
-"""Demonstrations that are named one by one."""
+"""Maximum number of demonstrations to list individually."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a check found.
+    """Finding of a check.
 
     Attributes:
-        text: one sentence without a full stop, which goes on after the demonstrations' numbers where there are any.
-        severity: ``'note'`` for what is good to know, ``'warning'`` for what is likely a fault, ``'error'`` for what nothing can be
-            learned from.
-        rows: which demonstrations, from 0; empty where it is about all of them. Texts count from 1.
+        text: a sentence without a full stop, which follows the demonstrations' numbers if there are any.
+        severity: ``'note'`` for information, ``'warning'`` for a likely fault, ``'error'`` for data that nothing can be learned
+            from.
+        rows: demonstrations, from 0; empty for all. Texts count from 1.
     """
 
     text: str
@@ -28,11 +28,11 @@ class Finding:
         return f"{numbered(self.rows)}: {self.text}" if self.rows else self.text
 
     def among(self, rows: Sequence[int]) -> Self:
-        """The same of demonstrations that are these rows of more."""
+        """Map rows of a selection to all demonstrations; ``rows`` is the selection."""
         return replace(self, rows=tuple(rows[row] for row in self.rows))
 
     def within(self, rows: Sequence[int]) -> Self:
-        """The inverse of :meth:`among`."""
+        """Invert :meth:`among`."""
         return replace(self, rows=tuple(rows.index(row) for row in self.rows))
 
 

@@ -1,4 +1,4 @@
-"""Images of observed features as files hold them: compressed by zlib."""
+"""Compression of observed images in files, by zlib."""
 
 import math
 import zlib
@@ -13,26 +13,26 @@ from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.limits import expect_unpacked
 
 MOST_SHRUNK = 1032
-"""zlib makes one byte of so many at most."""
+"""Maximum compression ratio of zlib."""
 
 
 def compressed(images: Tensor) -> Tensor:
-    """Images ``(demo, ...)`` uint8, compressed as one ``(byte,)``."""
+    """Compress images ``(demo, ...)`` uint8 to ``(byte,)``."""
     return torch.frombuffer(bytearray(zlib.compress(images.detach().cpu().numpy().tobytes())), dtype=torch.uint8)
 
 
 def decompressed_images(tensors: Mapping[str, Tensor], shapes: object, per_step: Sequence[str]) -> dict[str, Tensor]:
-    """The images of a file whose header names their shapes, by key.
+    """Decompress images of a file, by key, with the shapes in its header.
 
-    What they need in memory is bounded: their shapes begin as that of the states, and nothing beyond them is decompressed.
+    Memory is bounded: shapes must begin like that of the states, and nothing beyond them is decompressed.
 
     Args:
-        tensors: as they are in the file; states ``(demo, time, state)`` among them.
-        shapes: by key, as the header says.
+        tensors: tensors of the file, with states ``(demo, time, state)``.
+        shapes: shapes by key, from the header.
         per_step: names of features that are known at every time.
 
     Raises:
-        UserError: naming the key, if its shape is none that it can have, or its bytes are damaged.
+        UserError: naming the key, for an impossible shape or damaged bytes.
     """
     if not isinstance(shapes, dict):
         raise UserError(f"key 'compressed': expected shapes of images by key, found {shown(shapes)}")
@@ -40,9 +40,9 @@ def decompressed_images(tensors: Mapping[str, Tensor], shapes: object, per_step:
     for key, shape in shapes.items():
         packed = tensors.get(key)
         if packed is None or not key.startswith(OBSERVED) or packed.dtype != torch.uint8 or packed.dim() != 1:
-            told = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"
+            actual = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"
             expected = "compressed images, uint8 of shape (byte,) under 'observed/NAME'"
-            raise UserError(f"key {short(key)!r}: expected {expected}, found {told}")
+            raise UserError(f"key {short(key)!r}: expected {expected}, found {actual}")
         leading = list(tensors["states"].shape[: 2 if key.removeprefix(OBSERVED) in per_step else 1])
         numbers = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
         if not numbers or shape[: len(leading)] != leading or math.prod(shape) > MOST_SHRUNK * len(packed):
@@ -61,11 +61,11 @@ def decompressed_images(tensors: Mapping[str, Tensor], shapes: object, per_step:
 def _decompressed(key: str, packed: bytes, size: int) -> bytearray:
     reader = zlib.decompressobj()
     try:
-        content = bytearray(reader.decompress(packed, size + 1))  # one more: room to meet the end
+        content = bytearray(reader.decompress(packed, size + 1))  # one more, to reach the end
     except zlib.error as error:
         raise UserError(f"key {key!r}: expected compressed images, found damaged bytes ({error}); take another copy") from error
     if len(content) != size or not reader.eof or reader.unused_data:
         more = len(content) > size or reader.unused_data
-        told = "more" if more else f"{len(content)}{'' if reader.eof else ' and no end'}"
-        raise UserError(f"key {key!r}: expected {size} bytes of images, found {told}; the file is damaged: take another copy")
+        actual = "more" if more else f"{len(content)}{'' if reader.eof else ' and no end'}"
+        raise UserError(f"key {key!r}: expected {size} bytes of images, found {actual}; the file is damaged: take another copy")
     return content

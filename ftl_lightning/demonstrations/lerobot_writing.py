@@ -1,4 +1,4 @@
-"""Writing demonstrations as LeRobot data sets, see :mod:`ftl_lightning.demonstrations.lerobot`."""
+"""Write demonstrations as LeRobot data sets, see :mod:`ftl_lightning.demonstrations.lerobot`."""
 
 import json
 import shutil
@@ -24,33 +24,32 @@ from ftl_lightning.targets import expect_new_folder
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _DATA = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _CHUNK, _MEGABYTES = 1000, 100
-"""Files in a folder, and the size of one: LeRobot's own numbers."""
+"""Files in a folder, and megabytes of a file, as in LeRobot."""
 
 
 def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int = 10) -> None:
-    """Write a data set that LeRobot and :func:`read_lerobot` read, whole or not at all.
+    """Write a data set for LeRobot and :func:`read_lerobot`, whole or not at all.
 
-    Demonstrations are states without actions. As an action each frame has the state that follows, the last its own: what a robot
-    that is driven by positions would be told. What is known at the start alone, and scenes, are repeated in each frame.
+    Demonstrations have no actions. The action of a frame is the next state, of the last frame its state, as for a robot controlled
+    by positions. Scenes and features known only at the start are repeated in each frame.
 
     Args:
-        demonstrations: what is written. Padding is not.
-        folder: that is not there yet, or empty.
-        fps: frames a second, which demonstrations do not know.
+        demonstrations: written without padding.
+        folder: a new or empty folder.
+        fps: frames per second, which demonstrations do not record.
 
     Raises:
-        UserError: if the folder cannot be written or holds something, or an observed feature has a name that cannot be a
-            feature's.
+        UserError: if the folder cannot be written or is not empty, or the name of an observed feature is not allowed.
     """
     if not isinstance(fps, int) or fps < 1:
         raise UserError(f"fps: expected a whole number from 1, found {shown(fps)}")
     expect_names(demonstrations, STATE.removeprefix(OBSERVED), str(folder))
     texts = {text: number for number, text in enumerate(dict.fromkeys(demonstrations.concepts))}
-    frames = [_frame_columns(one, number, texts[one.concept], fps) for number, one in enumerate(episodes(demonstrations))]
+    frames = [_frame_columns(episode, index, texts[episode.concept], fps) for index, episode in enumerate(episodes(demonstrations))]
     first = 0
-    for one in frames:
-        one["index"] = first + one["frame_index"]
-        first += len(one["index"])
+    for columns in frames:
+        columns["index"] = first + columns["frame_index"]
+        first += len(columns["index"])
     with _new_folder(Path(folder)) as root:
         places = _write_data(root, frames)
         _write_episodes(root, frames, places, demonstrations.concepts)
@@ -70,13 +69,13 @@ def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int =
             "video_path": None,
             "features": {key: _described(demonstrations, key, values) for key, values in frames[0].items()},
         }
-        every = {key: np.concatenate([one[key] for one in frames]) for key in frames[0]}
+        every = {key: np.concatenate([columns[key] for columns in frames]) for key in frames[0]}
         for name, content in ((INFO, info), (Path("meta") / "stats.json", _statistics(every)), (BESIDE, beside(demonstrations))):
             (root / name).write_text(json.dumps(content, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
 def _frame_columns(episode: Episode, number: int, task: int, fps: int) -> dict[str, NDArray[Any]]:
-    """Of an episode, by feature ``(frame, *shape)``."""
+    """Columns of an episode by feature, ``(frame, *shape)``."""
     time = len(episode.states)
     scene = {} if episode.scene is None else {SCENE: np.repeat(episode.scene[None], time, axis=0)}
     steps = np.arange(time)
@@ -99,13 +98,13 @@ def _described(demonstrations: Demonstrations, key: str, values: NDArray[Any]) -
 
 
 def _write_data(root: Path, frames: Sequence[Mapping[str, NDArray[Any]]]) -> list[tuple[int, int]]:
-    """Write the frames, one row group an episode, and say in which chunk and file each episode is."""
+    """Write frames, a row group for each episode; return the chunk and file of each episode."""
     places: list[tuple[int, int]] = []
     writer: pq.ParquetWriter | None = None
     size, file = 0, 0
     try:
-        for one in frames:
-            table = pa.table({key: _arrow(values) for key, values in one.items()})
+        for columns in frames:
+            table = pa.table({key: _arrow(values) for key, values in columns.items()})
             if writer is not None and size + table.nbytes > _MEGABYTES * 2**20:
                 writer.close()
                 writer, size, file = None, 0, file + 1
@@ -127,16 +126,16 @@ def _write_episodes(
     root: Path, frames: Sequence[Mapping[str, NDArray[Any]]], places: Sequence[tuple[int, int]], texts: Sequence[str]
 ) -> None:
     columns: dict[str, list[Any]] = {}
-    for number, (one, (chunk, file), text) in enumerate(zip(frames, places, texts, strict=True)):
+    for number, (episode, (chunk, file), text) in enumerate(zip(frames, places, texts, strict=True)):
         row = {
             EPISODE: number,
             "tasks": [text],
-            LENGTH: len(one["index"]),
+            LENGTH: len(episode["index"]),
             "data/chunk_index": chunk,
             "data/file_index": file,
-            "dataset_from_index": int(one["index"][0, 0]),
-            "dataset_to_index": int(one["index"][-1, 0]) + 1,
-            **{f"stats/{key}/{name}": value for key, own in _statistics(one).items() for name, value in own.items()},
+            "dataset_from_index": int(episode["index"][0, 0]),
+            "dataset_to_index": int(episode["index"][-1, 0]) + 1,
+            **{f"stats/{key}/{name}": value for key, values in _statistics(episode).items() for name, value in values.items()},
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
@@ -146,7 +145,7 @@ def _write_episodes(
 
 
 def _task_table(texts: Mapping[str, int]) -> pa.Table:
-    """As pandas writes a table whose index is the texts, which is how LeRobot reads it."""
+    """Table with the texts as pandas' index, which LeRobot expects."""
     import pandas as pd
 
     frame = pd.DataFrame({TASK: list(texts.values())}, index=pd.Index(list(texts), name="task", dtype=object))
@@ -159,7 +158,7 @@ def _write_parquet(path: Path, table: pa.Table) -> None:
 
 
 def _arrow(values: NDArray[Any]) -> pa.Array:
-    """``(frame, *shape)`` as LeRobot has it: a vector of one number is the number, others are lists, of one size if not nested."""
+    """Convert ``(frame, *shape)``: shape (1,) to numbers, vectors to lists of fixed size, others to nested lists."""
     shape = values.shape[1:]
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
     if shape == (1,):
@@ -173,27 +172,27 @@ def _arrow(values: NDArray[Any]) -> pa.Array:
 
 
 def _statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[Any]]]:
-    """What LeRobot normalises by, of each feature that is no image, as lists of the feature's shape."""
-    found: dict[str, dict[str, list[Any]]] = {}
+    """Statistics of each feature but images, by which LeRobot normalises, as lists of its shape."""
+    statistics: dict[str, dict[str, list[Any]]] = {}
     for key, values in columns.items():
         if values.dtype == np.uint8 or not values.size:
             continue
         exact = values.astype(np.float64)
         quantiles = np.quantile(exact, list(_QUANTILES.values()), axis=0)
-        found[key] = {
+        statistics[key] = {
             "min": values.min(axis=0).tolist(),
             "max": values.max(axis=0).tolist(),
             "mean": exact.mean(axis=0).tolist(),
             "std": exact.std(axis=0).tolist(),
             "count": [len(values)],
-            **{name: one.tolist() for name, one in zip(_QUANTILES, quantiles, strict=True)},
+            **{name: quantile.tolist() for name, quantile in zip(_QUANTILES, quantiles, strict=True)},
         }
-    return found
+    return statistics
 
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside, which becomes the folder when the block ends well and is removed when it does not."""
+    """Yield a temporary folder, which is renamed to ``folder`` on success and removed on failure."""
     expect_new_folder(folder)
     temporary: Path | None = None
     try:

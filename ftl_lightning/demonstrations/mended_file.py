@@ -1,4 +1,4 @@
-"""A file of demonstrations some of whose numbers are missing, read to say which."""
+"""Read files of demonstrations with missing numbers."""
 
 from pathlib import Path
 
@@ -12,21 +12,21 @@ from ftl_lightning.errors import about
 
 
 def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
-    """Demonstrations of a file, those without a text named after it, with states that are not finite mended.
+    """Read demonstrations with states that are not finite mended; those without a text are named after the file.
 
     Args:
         path: ``.npz``, safetensors, or a data set.
 
     Returns:
-        Demonstrations, and where states were not finite.
+        Demonstrations, and findings for states that were not finite.
 
     Raises:
         UserError: naming the file, for every other mistake in it.
     """
     contents = read(path)
-    found: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     states, lengths = contents["states"], contents["lengths"]
     if states.dim() == 3 and states.dtype == torch.float32 and lengths.shape == states.shape[:1]:
-        contents["states"], found = mended(states, lengths)
+        contents["states"], findings = mended(states, lengths)
     with about(path):
-        return Demonstrations(**contents).named(Path(path).stem), found
+        return Demonstrations(**contents).named(Path(path).stem), findings

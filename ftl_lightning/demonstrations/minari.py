@@ -1,12 +1,12 @@
 """Demonstrations as Minari data sets, and back. Needs the extra ``minari``.
 
-An episode is a demonstration and its observations, flattened, are the states. Where an observation is a dictionary, one part of it
-is the states and its other vectors are observed features, known at every time. A demonstration's text is the first that is found of
-``concept`` in the episode's ``infos`` (of its first step, if there is one a step), in the episode's metadata, and in the data set's
-metadata; where there is none, the data set's name stands for it.
+An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, one part holds the
+states, and its other vectors are observed features that are known at every time. A demonstration's text is the first ``concept`` in
+the episode's ``infos`` (of its first step, if there is one for each step), the episode's metadata, or the data set's metadata; by
+default, the data set's name.
 
-What Minari has no place for is kept in the data set's metadata: the domain, names and units of the columns, which features are
-known at the start alone, and where the demonstrations come from. Scenes are ``scene`` in an episode's ``infos``.
+Metadata of the data set hold what Minari cannot: the domain, names and units of columns, names of features that are known only at
+the start, and provenance. Scenes are ``scene`` in an episode's ``infos``.
 """
 
 import warnings
@@ -28,24 +28,24 @@ from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.schema import from_mapping
 
 CONCEPT = "concept"
-"""Where an episode's text is, see this module."""
+"""Key of an episode's text, see this module."""
 SCENE = "scene"
-"""Where its scene is."""
+"""Key of an episode's scene."""
 _HEADER = "ftl_lightning"
-"""Key of the data set's metadata for what only :func:`write_minari` knows."""
+"""Metadata key of attributes that only :func:`write_minari` knows."""
 
 
 def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None) -> Demonstrations:
-    """Demonstrations of an installed data set; nothing is downloaded.
+    """Read demonstrations of an installed data set; nothing is downloaded.
 
     Args:
-        name: such as ``strokes/test-v0``. Minari looks in ``MINARI_DATASETS_PATH``, by default ``~/.minari/datasets``.
-        part: of observations that are dictionaries, the key of the states; empty for ``'observation'`` or the only vector.
-        observed: other keys that are observed features; ``None`` for all vectors. Images are read from data sets that
-            :func:`write_minari` made, and else left out.
+        name: name such as ``strokes/test-v0``. Minari looks in ``MINARI_DATASETS_PATH``, by default ``~/.minari/datasets``.
+        part: key of the states in dictionaries; empty for ``'observation'`` or the only vector.
+        observed: keys of observed features; ``None`` for all other vectors. Images are read only from data sets of
+            :func:`write_minari`.
 
     Returns:
-        Padded to the longest episode with the last state. An episode of n steps has n + 1 states.
+        Demonstrations, padded to the longest episode with the last state. An episode of n steps has n + 1 states.
 
     Raises:
         UserError: naming the data set, if it is not installed, damaged or empty, or its observations are no vectors.
@@ -55,50 +55,50 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
 
 
 def read_contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """The same before it is looked at whether values fit each other, see :func:`read_minari`, with the same arguments.
+    """Read the attributes of demonstrations without validating them. Arguments as in :func:`read_minari`.
 
     Raises:
-        UserError: naming the data set, if it is none, is damaged or has other parts.
+        UserError: naming the data set, if it is foreign, damaged or has other parts.
     """
     try:
-        found = minari.load_dataset(name)
-        metadata = found.storage.metadata
+        dataset = minari.load_dataset(name)
+        metadata = dataset.storage.metadata
         with about(name):
-            told = from_mapping(Beside, metadata.get(_HEADER, {}), _HEADER)
-        own = _HEADER in metadata
+            extra = from_mapping(Beside, metadata.get(_HEADER, {}), _HEADER)
+        written = _HEADER in metadata
         with about(name):
-            part = states_part(found.observation_space, part)
-            features = feature_parts(found.observation_space, part, observed, images=own)
+            part = states_part(dataset.observation_space, part)
+            features = feature_parts(dataset.observation_space, part, observed, images=written)
         if observed is not None or part not in ("", PART):
-            told = told.of(features, part in ("", PART))
-        texts = [_text(one) for one in found.storage.get_episode_metadata(found.episode_indices)]
+            extra = extra.of(features, part in ("", PART))
+        texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
         whole = _text(metadata) or name
-        read = [_read(one, part, features, other or whole, own) for one, other in zip(found, texts, strict=True)]
+        read = [_read(episode, part, features, text or whole, written) for episode, text in zip(dataset, texts, strict=True)]
     except FileNotFoundError as error:
         raise UserError(
             f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
         ) from error
     except (ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
-        told_error = short(str(error), 100)
-        raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({told_error})") from error
+        message = short(str(error), 100)
+        raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
     with about(name):
-        made = contents(read, told)
-    return {**made, "provenance": made["provenance"] or {"minari": name}}
+        attributes = contents(read, extra)
+    return {**attributes, "provenance": attributes["provenance"] or {"minari": name}}
 
 
 def write_minari(demonstrations: Demonstrations, name: str) -> None:
-    """Write a data set that Minari and :func:`read_minari` read, one episode a demonstration.
+    """Write a data set for Minari and :func:`read_minari`, with an episode for each demonstration.
 
-    Where features are observed, an observation is a dictionary: the states as ``'observation'``, and each feature by its name.
-    Demonstrations are states without actions: the actions that Minari asks for are a single 0, and so are the rewards.
+    With observed features, an observation is a dictionary: the states as ``'observation'``, and each feature by its name.
+    Demonstrations have no actions: the actions and rewards that Minari requires are 0.
 
     Args:
-        demonstrations: of two states or more each, since n steps have n + 1 observations.
-        name: such as ``strokes/test-v0``, of a data set that is not there yet.
+        demonstrations: at least two states each, since n steps have n + 1 observations.
+        name: name of a new data set, such as ``strokes/test-v0``.
 
     Raises:
-        UserError: naming the data set, if it is there already or cannot be written, a demonstration is too short, or an observed
-            feature has a name that cannot be a key.
+        UserError: naming the data set, if it exists or cannot be written, a demonstration is too short, or the name of an observed
+            feature cannot be a key.
     """
     if int(demonstrations.lengths.min()) < 2:
         raise UserError(f"{name}: expected demonstrations of two states or more, found one of 1, which makes no step")
@@ -111,7 +111,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
         with warnings.catch_warnings(action="ignore"):  # advice about author, permalink and so on
             written = minari.create_dataset_from_buffers(
                 name,
-                [_buffer(one) for one in episodes(demonstrations)],
+                [_buffer(episode) for episode in episodes(demonstrations)],
                 observation_space=space,
                 action_space=Box(0, 0, (1,), np.float32),
             )
@@ -140,25 +140,25 @@ def _buffer(episode: Episode) -> EpisodeBuffer:
     )
 
 
-def _read(found: Any, part: str, features: Sequence[str], text: str, own: bool) -> Episode:
-    observations = found.observations
+def _read(episode: Any, part: str, features: Sequence[str], text: str, written: bool) -> Episode:
+    observations = episode.observations
     states = np.asarray(observations[part] if part else observations, dtype=np.float32)
-    infos = found.infos or {}
+    infos = episode.infos or {}
     return Episode(
         states.reshape(len(states), -1),
         {key: _numbers(observations[key]) for key in features},
         _text(infos) or text,
-        np.asarray(infos[SCENE], dtype=np.float32)[0] if own and SCENE in infos else None,
+        np.asarray(infos[SCENE], dtype=np.float32)[0] if written and SCENE in infos else None,
     )
 
 
 def _numbers(values: Any) -> NDArray[Any]:
-    found = np.asarray(values)
-    return found if found.dtype == np.uint8 else found.astype(np.float32)
+    array = np.asarray(values)
+    return array if array.dtype == np.uint8 else array.astype(np.float32)
 
 
 def _text(where: Mapping[str, Any] | None) -> str:
-    """The concept's text, or the first of several; empty where there is none."""
-    found = np.ravel((where or {}).get(CONCEPT, ""))
-    first = found[0] if len(found) else ""
+    """Text of the concept, or the first of several; empty if there is none."""
+    texts = np.ravel((where or {}).get(CONCEPT, ""))
+    first = texts[0] if len(texts) else ""
     return first.decode("utf-8") if isinstance(first, bytes) else str(first)

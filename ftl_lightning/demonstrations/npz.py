@@ -1,4 +1,4 @@
-"""Demonstrations as an ``.npz`` file of plain arrays, which other software writes."""
+"""Demonstrations as an ``.npz`` file of plain arrays, the form of other software."""
 
 import lzma
 import math
@@ -20,14 +20,14 @@ from ftl_lightning.limits import MOST_TENSORS, expect_readable, expect_unpacked
 from ftl_lightning.tensor_file import atomic
 
 _DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)
-"""What numpy and zipfile raise for files that are damaged or none of theirs."""
+"""Exceptions of numpy and zipfile for damaged or foreign files."""
 
 
 def read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Numbers by key, and texts by key as the header of a safetensors file holds them.
+    """Read numbers by key, and texts by key as in the header of a safetensors file.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, holds objects, or an array of another type than its key's.
+        UserError: naming the file, if it is missing, damaged, holds objects, or an array of another type than its key requires.
     """
     size = expect_readable(path, "demonstrations")
     try:
@@ -37,23 +37,23 @@ def read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
         "".join(text for value in texts.values() for text in np.ravel(value)).encode()
     except (*_DAMAGED, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError) as error:
-        told = short(str(error), 100)
-        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({told})") from error
+        message = short(str(error), 100)
+        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({message})") from error
     tensors = {}
     for name, array in arrays.items():
         measured = name.startswith(OBSERVED) or name in ("states", "lengths", "scenes")
         if (measured and array.dtype.kind not in "fiub") or (name in (*TEXTS, "domain") and array.dtype.kind != "U"):
-            told = "numbers" if measured else "texts"
-            raise UserError(f"{path}: key {short(name)!r}: expected an array of {told}, found one of {short(str(array.dtype))}")
+            expected = "numbers" if measured else "texts"
+            raise UserError(f"{path}: key {short(name)!r}: expected an array of {expected}, found one of {short(str(array.dtype))}")
         if array.dtype.kind in "fiub":
-            # Images stay bytes; everything else that is measured is float32.
+            # Images stay uint8; all other measurements become float32.
             image = array.dtype == np.uint8 and name.startswith(OBSERVED)
             kind = np.uint8 if image else np.int64 if name == "lengths" and array.dtype.kind in "iu" else np.float32
-            with np.errstate(over="ignore"):  # what is too large for float32 is told as no finite number
+            with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
                 tensors[name] = torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
     for name, value in texts.items():
         if isinstance(value, str):
-            # One text stands for all demonstrations.
+            # A single text is that of all demonstrations.
             several = name == "concepts" and "states" in tensors and tensors["states"].dim()
             texts[name] = [value] * len(tensors["states"]) if several else [value]
     header: dict[str, Any] = dict(texts)
@@ -63,15 +63,15 @@ def read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def write_npz(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write what :func:`read_npz` reads, without compression, whole or not at all.
+    """Write a file for :func:`read_npz`, without compression, whole or not at all.
 
     Args:
         path: the file.
         tensors: numbers by key.
-        header: of it the domain and the lists of texts are written; an array has no place for the rest.
+        header: only the domain and lists of texts are written; arrays have no place for the rest.
 
     Raises:
-        UserError: where the file cannot be written.
+        UserError: if the file cannot be written.
     """
     arrays: dict[str, Any] = {key: values.detach().cpu().numpy() for key, values in tensors.items()}
     arrays |= {key: np.array(header[key], dtype=np.str_) for key in ("domain", *TEXTS) if key in header}
@@ -80,10 +80,10 @@ def write_npz(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[s
 
 
 def expect_arrays(path: Path, size: int) -> None:
-    """Refuse an archive that is much larger than its file, or holds an array whose header names another size than its bytes have.
+    """Refuse an archive that is much larger than its file, or an array whose header contradicts its size in bytes.
 
     Raises:
-        ValueError: saying so.
+        ValueError: naming the mismatch.
     """
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()

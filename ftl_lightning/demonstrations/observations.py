@@ -1,7 +1,7 @@
-"""Which parts of a Gymnasium observation are the states of a demonstration, and which are observed features.
+"""Parts of a Gymnasium observation: the states of a demonstration, and observed features.
 
-Where an observation is a dictionary, its part ``'observation'`` is the states, or its only vector, and its other vectors are
-observed features. Needs the package ``gymnasium``, which every environment brings.
+In a dictionary, the part ``'observation'`` or the only vector holds the states, and other vectors are observed features. Needs the
+package ``gymnasium``, which every environment brings.
 """
 
 from collections.abc import Sequence
@@ -14,29 +14,29 @@ from gymnasium.spaces import Box
 from ftl_lightning.errors import UserError, short
 
 PART = "observation"
-"""Part of an observation that holds the states where it has several, as in Gymnasium's environments with goals."""
+"""Part with the states in observations of several parts, as in Gymnasium's environments with goals."""
 
 
 def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
-    """Which part of an observation holds the states.
+    """Key of the states in an observation.
 
     Args:
-        space: of the observations.
-        part: the key that is asked for; empty for :data:`PART` or the only vector.
+        space: observation space.
+        part: requested key; empty for :data:`PART` or the only vector.
 
     Returns:
-        A key; empty where an observation is a vector itself.
+        A key; empty if an observation is itself a vector.
 
     Raises:
-        UserError: where that is no vector, or not clear.
+        UserError: if the part is no vector or ambiguous.
     """
     if not isinstance(space, gymnasium.spaces.Dict):
         vectors = [""] if _is_vector(space) else []
         expected = "observations that are vectors (a Box of numbers)"
     else:
-        vectors = [key for key, own in space.spaces.items() if _is_vector(own)]
-        told = ", ".join(vectors) or "none"
-        expected = f"observations with one vector or {PART!r}, or the key of the states, one of {told}"
+        vectors = [key for key, box in space.spaces.items() if _is_vector(box)]
+        keys = ", ".join(vectors) or "none"
+        expected = f"observations with one vector or {PART!r}, or the key of the states, one of {keys}"
     if not part and (PART in vectors or len(vectors) == 1):
         return PART if PART in vectors else vectors[0]
     if not part or part not in vectors:
@@ -47,19 +47,19 @@ def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
 def feature_parts(
     space: gymnasium.Space[Any], states: str, observed: Sequence[str] | None = None, *, images: bool = False
 ) -> tuple[str, ...]:
-    """Keys of an observation's parts that are observed features.
+    """Keys of the observed features in an observation.
 
     Args:
-        space: of the observations.
-        states: the part that holds the states, which is none unless it is asked for.
-        observed: keys that are asked for; ``None`` for every other vector.
-        images: whether images (uint8) count as vectors do.
+        space: observation space.
+        states: key of the states, which is excluded unless requested.
+        observed: requested keys; ``None`` for all other vectors.
+        images: whether to include images (uint8).
 
     Raises:
-        UserError: for a key that no such part has.
+        UserError: for a key without such a part.
     """
     parts = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {}
-    known = [key for key, one in parts.items() if _is_vector(one) or (images and isinstance(one, Box))]
+    known = [key for key, box in parts.items() if _is_vector(box) or (images and isinstance(box, Box))]
     if observed is None:
         return tuple(key for key in known if key != states)
     for key in observed:
@@ -69,4 +69,4 @@ def feature_parts(
 
 
 def _is_vector(space: gymnasium.Space[Any]) -> bool:
-    return isinstance(space, Box) and space.dtype != np.uint8  # which images are
+    return isinstance(space, Box) and space.dtype != np.uint8  # the type of images

@@ -1,4 +1,4 @@
-"""Demonstrations recorded where they are given: a wrapper of any Gymnasium environment."""
+"""Record demonstrations by a wrapper of any Gymnasium environment."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,33 +14,33 @@ from ftl_lightning.demonstrations.observations import feature_parts, states_part
 from ftl_lightning.errors import UserError
 
 Part = str | Callable[[Any], ArrayLike]
-"""What is taken from an observation: a key of it, or what a function makes of it."""
+"""Part of an observation: a key, or a function of the observation."""
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Record every episode of an environment as a demonstration, whoever acts in it: a person, a script or a policy.
 
-    An episode of n steps has n + 1 states. It ends where the environment terminates or truncates it; what is stepped after that is
-    not recorded. The environment behaves as it does without the wrapper.
+    An episode of n steps has n + 1 states. It ends when the environment terminates or truncates it; later steps are not recorded.
+    The wrapper does not change the environment's behaviour.
 
     Args:
-        env: of which observations are vectors or dictionaries; with functions, anything.
-        state: which part of an observation is the state, a key or a function that returns a vector; empty for the observation
-            itself, or of a dictionary its part ``'observation'`` or only vector.
-        observed: parts that are observed features, known at every time: keys, or by name a key or a function. Images (uint8,
+        env: environment whose observations are vectors or dictionaries; with functions, anything.
+        state: part of an observation that is the state, a key or a function that returns a vector; empty for the observation
+            itself, or for the part ``'observation'`` or the only vector of a dictionary.
+        observed: parts that are observed features, known at every time: keys, or keys or functions by name. Images (uint8,
             ``(height, width, channel)``) are stored with their channels first.
-        concept: text of the episodes. Set the attribute to change it for those that begin afterwards.
-        keep_unfinished: whether episodes that were reset before their end, and the one that still runs, are kept where they have a
-            step. By default they are dropped: who resets early mostly does it because something went wrong.
-        state_names, state_units: of the state's columns; by default they are numbered and without units.
-        domain: name of the domain that these are demonstrations of; empty for none.
+        concept: text of the episodes. Set the attribute to change it for later episodes.
+        keep_unfinished: whether to keep episodes that were reset before their end, and the running episode, if they have a step. By
+            default they are dropped: an early reset mostly means that something went wrong.
+        state_names, state_units: names and units of the state's columns; by default numbers and no units.
+        domain: name of the demonstrations' domain; empty for none.
 
     Attributes:
-        concept: text of the episode that begins next.
-        dropped: episodes that were dropped.
+        concept: text of the next episode.
+        dropped: number of dropped episodes.
 
     Raises:
-        UserError: for a part that observations do not have, or where it is not clear which one is the state.
+        UserError: for a part that observations lack, or if the state is ambiguous.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._state = states_part(space, state) if isinstance(state, str) else state
         self._observed: dict[str, Part] = dict(observed if isinstance(observed, Mapping) else zip(observed, observed, strict=True))
         feature_parts(space, "", [part for part in self._observed.values() if isinstance(part, str)], images=True)
-        names, units = (None if told is None else tuple(told) for told in (state_names, state_units))
-        self._told = Beside(domain, names, units, None, {"environment": str(env)})
+        names, units = (None if labels is None else tuple(labels) for labels in (state_names, state_units))
+        self._beside = Beside(domain, names, units, None, {"environment": str(env)})
         self._keep_unfinished = keep_unfinished
         self.concept = concept
         self.dropped = 0
@@ -70,7 +70,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._text = concept
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment, which begins an episode. One that still runs is kept or dropped."""
+        """Reset the environment and begin an episode. A running episode is kept or dropped."""
         observation, info = super().reset(seed=seed, options=options)
         if (left := self._unfinished()) is not None:
             self._done.append(left)
@@ -81,7 +81,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and record what is seen then."""
+        """Step the environment and record the observation."""
         observation, reward, terminated, truncated, info = super().step(action)
         if self._running:
             self._running.append(self._taken(observation))
@@ -91,10 +91,10 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def demonstrations(self) -> Demonstrations:
-        """What was recorded so far, padded to the longest with the last state.
+        """Demonstrations recorded so far, padded to the longest with the last state.
 
         Raises:
-            UserError: if that is nothing, states have no fixed number of columns, or numbers are not finite.
+            UserError: if there are none, the number of columns varies, or numbers are not finite.
         """
         left = self._unfinished()
         every = [*self._done, *([] if left is None else [left])]
@@ -102,17 +102,17 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             unfinished = self.dropped + bool(self._running)
             advice = "step the environment to its end, or give keep_unfinished=True"
             raise UserError(f"recorder: expected an episode that ended, found none, and {unfinished} that did not; {advice}")
-        return Demonstrations(**contents(every, self._told))
+        return Demonstrations(**contents(every, self._beside))
 
     def save(self, path: str | Path) -> None:
-        """Write them in any known format, see :meth:`ftl_lightning.demonstrations.container.Demonstrations.save`."""
+        """Write the demonstrations in any known format, see :meth:`ftl_lightning.demonstrations.container.Demonstrations.save`."""
         self.demonstrations().save(path)
 
     def _taken(self, observation: Any) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
         state = _numbers(_of(observation, self._state)).reshape(-1)
         features = {name: _numbers(_of(observation, part)) for name, part in self._observed.items()}
         if self._running or self._done:
-            # A function may return what it likes; padding would fail later, and not say where.
+            # A function may return any shape; padding would fail later without naming it.
             first, before = self._running[0] if self._running else (self._done[0].states[0], _first(self._done[0]))
             for name, now, then in [("state", state, first), *((key, features[key], before[key]) for key in features)]:
                 if now.shape != then.shape:
@@ -139,8 +139,8 @@ def _first(episode: Episode) -> dict[str, NDArray[Any]]:
 
 
 def _numbers(values: Any) -> NDArray[Any]:
-    """A copy, since environments may change what they returned: float32, or images with their channels first."""
-    found = np.array(values)
-    if found.dtype != np.uint8:
-        return np.atleast_1d(found.astype(np.float32))
-    return np.moveaxis(found, -1, 0) if found.ndim == 3 else found
+    """Copy values, since environments may change them: to float32, or images with their channels first."""
+    array = np.array(values)
+    if array.dtype != np.uint8:
+        return np.atleast_1d(array.astype(np.float32))
+    return np.moveaxis(array, -1, 0) if array.ndim == 3 else array

@@ -1,4 +1,4 @@
-"""Forward process, samplers and the denoisers that a configuration can name."""
+"""Forward process, samplers, and denoisers for configurations."""
 
 from ftl_lightning.diffusion.mlp import MLPDenoiser
 from ftl_lightning.diffusion.temporal_unet import TemporalUNet
@@ -9,4 +9,4 @@ PAPER_SIZE: dict[str, dict[str, int]] = {
     "MLPDenoiser": {"hidden_dim": 1024, "depth": 4, "condition_dim": 768, "time_dim": 128},
     "TemporalUNet": {"width": 128},
 }
-"""Arguments of each denoiser that make it the paper's full size."""
+"""Arguments of each denoiser for the paper's full size."""

@@ -1,7 +1,6 @@
-"""Condition encoders: what a denoiser reads from observed features.
+"""Condition encoders of observed features.
 
-Each has two halves: ``observe`` reads the features once a plan, ``attend`` brings in the concept at every step of denoising. The
-paper's encoder takes vectors as one, and so does another that sees the concept, too; two treat exchangeable entities alike.
+Each encoder has two halves: ``observe`` reads the features once per plan, ``attend`` adds the concept at every denoising step.
 """
 
 from abc import ABC, abstractmethod
@@ -18,27 +17,27 @@ from ftl_lightning.errors import UserError
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """What every condition encoder offers."""
+    """Base class of condition encoders."""
 
     @abstractmethod
     def observe(self, vector: Tensor) -> Context:
-        """What is read of the observed vectors ``(batch, m)``, one after another and normalised, whatever the concept."""
+        """Encode the concatenated, normalised observed vectors ``(batch, m)`` independently of the concept."""
 
     @abstractmethod
     def attend(self, context: Context, concept: Tensor) -> Tensor:
-        """Features ``(batch, width)`` of that for ``concept (batch, n)``."""
+        """Features ``(batch, width)`` of a context for ``concept (batch, n)``."""
 
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
-        """A unit vector ``(batch, 2)``, from which directions in a plan are told; ``None`` where they are told as they are."""
+        """Unit vector ``(batch, 2)`` of the plan's x axis; ``None`` for unrotated plans."""
         return None
 
 
 class FlatEncoder(ConditionEncoder):
-    """All vectors through one network, as in the paper; it does not see the concept.
+    """MLP of all vectors, as in the paper, independent of the concept.
 
     Args:
-        sizes: of which the observed vectors' is used.
-        width: of the features.
+        sizes: size of the observed vectors.
+        width: number of features.
     """
 
     def __init__(self, sizes: Sizes, width: int) -> None:
@@ -53,11 +52,11 @@ class FlatEncoder(ConditionEncoder):
 
 
 class JointEncoder(ConditionEncoder):
-    """All vectors and the concept through one network. The paper does not say where the two meet.
+    """MLP of all vectors and the concept. The paper does not specify where they are combined.
 
     Args:
-        sizes: of which the observed vectors' and the concept's are used.
-        width: of the features.
+        sizes: sizes of the observed vectors and the concept.
+        width: number of features.
     """
 
     def __init__(self, sizes: Sizes, width: int) -> None:
@@ -74,30 +73,28 @@ class JointEncoder(ConditionEncoder):
 
 
 def _entity_columns(name: str, sizes: Sizes) -> tuple[Tensor, Tensor]:
-    """Columns of each entity ``(entity, columns)`` and those that belong to none."""
+    """Columns of each entity ``(entity, columns)`` and the columns of no entity."""
     if not sizes.entities:
         raise UserError(f"denoiser_args.initial_encoder: expected flat, found {name}: this domain does not name its entities")
     columns = torch.tensor(sizes.entities)
-    own = {column for entity in sizes.entities for column in entity}
-    # Columns that say which entity is which (one-hot types) would tell alike entities apart; they are constant, and constant
-    # columns are 0 after normalisation.
-    shared = [column for column in range(sizes.vector_dim) if column not in own]
+    used = {column for entity in sizes.entities for column in entity}
+    # One-hot entity types would break the symmetry, but they are constant, and constant columns are normalised to 0.
+    shared = [column for column in range(sizes.vector_dim) if column not in used]
     return columns, torch.tensor(shared, dtype=torch.int64)
 
 
 class EntityEncoder(ConditionEncoder):
-    """Every entity through the same network; the concept attends to them by their attributes, not by their places.
+    """Attention over entities: the concept attends to their attributes, not to their positions.
 
-    The concept is turned into a weight for each column of an entity's attributes, and their sum decides which entity is attended
-    to: what makes red and what makes a bowl add up in a red bowl that was never seen. There is one head: several can disagree about
-    where to go, which traps concepts that are learned through them. What is read from the attended entity is all but its
-    attributes, so that a red bowl is reached like any other. Exchanging two entities changes nothing. What belongs to no entity
-    goes to each of them, and into the features.
+    The concept determines a weight for each attribute column, and the weighted sum is the attention logit of an entity: the weights
+    for red and for bowl add up to an unseen red bowl. There is a single head: several heads can disagree about the target, which
+    traps concepts learned through them. The values exclude the attributes, so a red bowl is reached like any other. The encoder is
+    invariant to exchanging entities. Columns of no entity are appended to every entity and to the features.
 
     Args:
-        sizes: of the observed vectors and their entities, of whose columns those a concept asks for are not read; where none are
-            named, all are asked for and all are read.
-        width: of the features.
+        sizes: sizes of the observed vectors and their entities. Attribute columns are keys only; without named attributes all
+            columns are keys and values.
+        width: number of features.
     """
 
     columns: Tensor
@@ -112,18 +109,18 @@ class EntityEncoder(ConditionEncoder):
         self.register_buffer("shared", shared, persistent=False)
         inner = 2 * width
         self.entity = nn.Sequential(nn.Linear(len(self.rest) + len(shared), inner), nn.Mish(), nn.Linear(inner, inner), nn.Mish())
-        # Attention that is sure of the wrong entity stays so: it starts unsure, and as the concept comes in with norm 1, a step of
-        # Adam turns the query a little (with norm 20, as it is, it would flip it).
+        # Saturated attention on the wrong entity gets stuck: start with small weights and scale the concept to norm 1, so that a
+        # step of Adam changes the query a little (at the original norm of 20 it would flip the query).
         self.query = nn.Linear(sizes.concept_dim, len(self.attributes))
-        if not self.query.weight.is_meta:  # where there are sizes alone, torch would import its compiler to draw nothing
+        if not self.query.weight.is_meta:  # on the meta device torch would import its compiler
             nn.init.normal_(self.query.weight, std=0.2)
         self.value = nn.Linear(inner + len(self.rest), inner)
         self.out = nn.Sequential(nn.Linear(inner + len(shared), inner), nn.Mish(), nn.Linear(inner, width))
-        # Where the attended entity is gets through without a bend: a plan ends there.
+        # Linear path for the position of the attended entity, where a plan ends.
         self.direct = nn.Linear(inner + len(shared), width)
 
     def observe(self, vector: Tensor) -> Context:
-        """What tells the entities apart, what is read from each, and what belongs to none."""
+        """Keys (attributes) and values of the entities, and the columns of no entity."""
         shared = vector[:, self.shared]
         each = vector[:, self.columns]  # (batch, entity, columns)
         rest = each[..., self.rest]
@@ -140,13 +137,13 @@ class EntityEncoder(ConditionEncoder):
 
 
 class SetEncoder(ConditionEncoder):
-    """Every entity through the same network, of whose features the largest and the mean are read (deep sets, Zaheer et al., 2017).
+    """Max and mean pooling over the features of entities (deep sets, Zaheer et al., 2017), independent of the concept.
 
-    What belongs to no entity goes to each of them, and into the features. The concept is not seen.
+    Columns of no entity are appended to every entity and to the features.
 
     Args:
-        sizes: of the observed vectors and their entities.
-        width: of the features.
+        sizes: sizes of the observed vectors and their entities.
+        width: number of features.
     """
 
     columns: Tensor
@@ -172,20 +169,20 @@ class SetEncoder(ConditionEncoder):
 
 
 class PointEncoder(ConditionEncoder):
-    """Points that were read of images: the concept chooses some, of which is read how they lie to each other and to the origin.
+    """Attention over image points: the concept chooses points and reads their positions relative to each other and to the origin.
 
-    Each of :data:`CHOSEN` choices is a mean of the points that are seen, weighed by the concept alone (attention whose keys are the
-    points' names), so that another concept may mean another thing by the same plan. Of every chosen point, and of every difference
-    between two, the network is given the vector, its direction and the logarithm of its length: what is near and what is far
-    differ in scale. All points stand beside them as they are. Where plans have a plane, all vectors are told from the direction
-    from the first chosen point to the second, and so is the plan: whatever is learned holds in every direction.
+    Each of :data:`CHOSEN` choices is a mean of the visible points. Its weights depend on the concept alone (attention whose keys
+    are the points' numbers), so the same plan may refer to different objects. The inputs for every chosen point, and for every
+    difference between two, are the vector, its direction and the logarithm of its length, as near and far differ in scale. All
+    points are additional inputs. If plans have a plane, all vectors and the plan are rotated into the direction from the first
+    chosen point to the second: the encoder is equivariant to rotation.
 
     Args:
-        sizes: with the numbers that are read of images, which have to be points.
-        width: of the features.
+        sizes: sizes with the number of image features, which must be points.
+        width: number of features.
 
     Raises:
-        UserError: for an encoder of images that does not read points.
+        UserError: for an image encoder without points.
     """
 
     def __init__(self, sizes: Sizes, width: int) -> None:
@@ -194,8 +191,8 @@ class PointEncoder(ConditionEncoder):
             raise UserError("denoiser_args.initial_encoder: expected flat, found points: no points are read of images")
         self.count, self.turns = sizes.image_dim // POINT, bool(sizes.plane)
         self.choice = nn.Linear(sizes.concept_dim, CHOSEN * self.count)
-        with torch.no_grad():  # every choice starts with a favourite of its own
-            # The device is said, wherever a network is being made: arithmetic on none (meta) makes torch import its compiler.
+        with torch.no_grad():  # every choice starts with a different preferred point
+            # Explicit CPU: arithmetic on the meta device makes torch import its compiler.
             favourites = functional.one_hot(torch.arange(CHOSEN, device="cpu") % self.count, self.count)
             self.choice.bias.copy_(favourites.flatten())
         vectors = CHOSEN * (CHOSEN + 1) // 2
@@ -203,13 +200,13 @@ class PointEncoder(ConditionEncoder):
         self.net = nn.Sequential(nn.Linear(inputs, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
 
     def observe(self, vector: Tensor) -> Context:
-        """What was measured, and x, y, height and probability of being seen of each point ``(batch, point, 4)``."""
+        """Measured vectors, and x, y, height and visibility of each point ``(batch, point, 4)``."""
         measured, points = vector.split((vector.shape[1] - POINT * self.count, POINT * self.count), dim=1)
         points = points.unflatten(1, (POINT, self.count)).transpose(1, 2)
         return measured, torch.cat((points[..., :3], points[..., 3:].sigmoid()), dim=-1)
 
     def _chosen(self, points: Tensor, concept: Tensor) -> Tensor:
-        """x, y, height, and how much of what is asked for is seen ``(batch, choice, 4)``."""
+        """x, y, height and visibility of each choice ``(batch, choice, 4)``."""
         logits = SHARPNESS * self.choice(concept / concept.shape[-1] ** 0.5)
         weights = logits.unflatten(1, (CHOSEN, self.count)).softmax(dim=-1) * points[:, None, :, 3]
         seen = weights.sum(dim=-1, keepdim=True)
@@ -218,7 +215,7 @@ class PointEncoder(ConditionEncoder):
     def direction(self, context: Context, concept: Tensor) -> Tensor | None:
         if not self.turns:
             return None
-        # The direction between points that are close to each other is steep in where they are: no gradient goes there.
+        # No gradient to the points: it is large for two close points.
         first, second = self._chosen(context[1].detach(), concept)[:, :2, :2].unbind(dim=1)
         return functional.normalize(second - first + 1e-6, dim=-1)
 
@@ -239,29 +236,29 @@ class PointEncoder(ConditionEncoder):
 
 
 CHOSEN = 4
-"""Points that a concept chooses."""
+"""Number of points that a concept chooses."""
 SHARPNESS = 4.0
-"""Factor of the numbers that decide a choice: a mean of several points is where none of them is."""
+"""Inverse temperature of a choice: the mean of several points is at none of them."""
 SMALLEST = 0.02
-"""Length of a vector below which its direction counts less and less."""
+"""Length of a vector below which its direction is scaled down."""
 
 
 def turned(values: Tensor, direction: Tensor, plane: Sequence[int], back: bool) -> Tensor:
-    """Vectors told from a direction, or, back, told as they are.
+    """Rotate vectors into the frame whose x axis is a direction, or back.
 
     Args:
         values: ``(batch, ..., column)``.
         direction: unit vectors ``(batch, 2)``.
-        plane: the two columns of x and y.
-        back: whether they are told from the direction.
+        plane: columns of x and y.
+        back: apply the inverse rotation.
     """
     x, y = (values[..., column] for column in plane)
     cos, sin = (part.reshape(-1, *(1,) * (x.dim() - 1)) for part in direction.unbind(dim=1))
     if back:
         sin = -sin
-    found = list(values.unbind(dim=-1))
-    found[plane[0]], found[plane[1]] = cos * x + sin * y, cos * y - sin * x
-    return torch.stack(found, dim=-1)
+    columns = list(values.unbind(dim=-1))
+    columns[plane[0]], columns[plane[1]] = cos * x + sin * y, cos * y - sin * x
+    return torch.stack(columns, dim=-1)
 
 
 ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {
@@ -274,10 +271,10 @@ ENCODERS: dict[str, Callable[[Sizes, int], ConditionEncoder]] = {
 
 
 def condition_encoder(name: str, sizes: Sizes, width: int) -> ConditionEncoder | None:
-    """An encoder by its name in a configuration; ``None`` where no vector is observed.
+    """Build an encoder by its configuration name; ``None`` without observed vectors.
 
     Raises:
-        UserError: for a name that is none, or one that needs entities in a domain without them.
+        UserError: for an unknown name, or an encoder of entities in a domain without entities.
     """
     if name not in ENCODERS:
         raise UserError(f"denoiser_args.initial_encoder: expected one of {', '.join(ENCODERS)}, found {name!r}")

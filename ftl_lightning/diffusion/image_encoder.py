@@ -1,4 +1,4 @@
-"""What a network reads of an image: a few numbers, trained with the rest of it."""
+"""Image encoders, trained jointly with the rest of the network."""
 
 import itertools
 import math
@@ -17,16 +17,16 @@ from ftl_lightning.schema import from_mapping
 
 MOST_POINTS = 1000
 MOST_PIXELS = 100_000_000
-"""Numbers of an image."""
+"""Maximum number of values of an image."""
 GROUPS = 8
-"""Of group normalisation, which replaces batch normalisation: that keeps statistics beside the weights, which no running average
-of weights holds (Chi et al., 2023)."""
+"""Groups of group normalisation. It replaces batch normalisation, whose statistics a running average of the weights omits (Chi et
+al., 2023)."""
 STRIDES = (2, 4)
 RESNET18 = "resnet18"
 NETWORKS = ("small", RESNET18)
 KEYPOINTS, POINTS, GRID = HEADS = ("keypoints", "points", "grid")
 POINT = 4
-"""Numbers of a point: x, y, height, and the logit of being seen."""
+"""Values per point: x, y, height, and the visibility logit."""
 
 
 class ResidualBlock(nn.Module):
@@ -34,7 +34,7 @@ class ResidualBlock(nn.Module):
 
     Args:
         inputs, outputs: channels.
-        stride: of the first convolution.
+        stride: stride of the first convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
@@ -52,11 +52,11 @@ class ResidualBlock(nn.Module):
 
 
 class SpatialSoftmax(nn.Module):
-    """Where in the image each channel is largest, and how large (Levine et al., 2016).
+    """Spatial softmax: position and value of the maximum of each channel (Levine et al., 2016).
 
     Args:
-        channels: of the feature map.
-        keypoints: how many.
+        channels: channels of the feature map.
+        keypoints: number of keypoints.
     """
 
     def __init__(self, channels: int, keypoints: int) -> None:
@@ -70,17 +70,17 @@ class SpatialSoftmax(nn.Module):
         grid = torch.stack((columns.repeat(height), rows.repeat_interleave(width)), dim=-1)
         maps = self.maps(x).flatten(2)
         share = maps.softmax(dim=-1)
-        column, row = (share @ grid).unbind(dim=-1)  # one product: sums over maps of many pixels take most of the time
+        column, row = (share @ grid).unbind(dim=-1)  # a single product: sums over large maps dominate the time
         return torch.cat((column, row, (share * maps).sum(dim=-1).tanh()), dim=-1)
 
 
 class Points(nn.Module):
-    """Where some things are, told by all keypoints together; what they are, pretraining teaches (``model.privileged``).
+    """Locations of objects from all keypoints; pretraining defines the objects (``model.privileged``).
 
     Args:
-        channels: of the feature map.
-        keypoints: how many are looked at.
-        points: how many things there are.
+        channels: channels of the feature map.
+        keypoints: number of keypoints.
+        points: number of objects.
     """
 
     def __init__(self, channels: int, keypoints: int, points: int) -> None:
@@ -89,18 +89,18 @@ class Points(nn.Module):
         self.read = nn.Linear(3 * keypoints, POINT * points)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(batch, channels, height, width)`` to x, y, height and logit of being seen, all x first: ``(batch, 4 * points)``."""
+        """``(batch, channels, height, width)`` to x, y, height and visibility logit, all x first: ``(batch, 4 * points)``."""
         out: Tensor = self.read(self.keypoints(x))
         return out
 
 
 class Grid(nn.Module):
-    """All of the last feature map, with fewer channels.
+    """Flattened feature map with fewer channels.
 
     Args:
-        channels: of the feature map.
-        kept: channels that are kept.
-        height, width: of the feature map.
+        channels: channels of the feature map.
+        kept: channels of the output.
+        height, width: size of the feature map.
     """
 
     def __init__(self, channels: int, kept: int, height: int, width: int) -> None:
@@ -115,9 +115,9 @@ class Grid(nn.Module):
 
 
 def _small(channels: int, widths: Sequence[int], stride: int, height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
-    """A residual network whose feature map is smaller by a stride in each direction, and that map's shape.
+    """Build a residual network and compute the shape of its feature map, which is smaller by ``stride`` in each direction.
 
-    The first convolution goes there at once: convolutions of few channels on many pixels take most of the time of deeper stems.
+    The first convolution does all downsampling: in deeper stems, convolutions at high resolution dominate the time.
     """
     first = nn.Conv2d(channels, widths[0], 2 * stride, stride, padding=stride // 2, bias=False)
     blocks = [ResidualBlock(before, after, 1) for before, after in itertools.pairwise(widths)]
@@ -130,7 +130,7 @@ class _ResNet18(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        from transformers import ResNetConfig, ResNetModel  # seconds of import that the small network does not need
+        from transformers import ResNetConfig, ResNetModel  # slow import, not needed for the small network
 
         sizes = [64, 128, 256, 512]
         self.network = ResNetModel(
@@ -148,25 +148,23 @@ class _ResNet18(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Features of one image, from scratch: a residual network with group normalisation, and keypoints or the final grid of it.
+    """Image encoder, trained from scratch: a residual network with group normalisation and a head.
 
     Args:
-        shape: of the image, ``(channels, height, width)``.
+        shape: image shape ``(channels, height, width)``.
         network: ``'small'``, or ``'resnet18'`` (11 million weights).
-        widths: channels of the small network's first convolution and of its residual blocks, multiples of 8; its map is a quarter
-            of the image in each direction, or what ``stride`` says.
-        stride: of the small network's first convolution, 2 or 4; 2 tells places more sharply.
-        head: ``'keypoints'`` (spatial softmax), ``'points'``, a few things that pretraining names, or ``'grid'``, all of the last
-            map, which suits ResNet-18, whose map is small.
-        keypoints: how many; of the grid, how many channels.
-        points: how many things are told apart; of ``'points'``.
-        crop: pixels by which each side is smaller after cropping: at random in training, in the middle else; 0 for none.
-        origin: name of an observed vector, the place that keypoints or points are told relative to: of a hand, for example, for
-            which it matters where things are from there. Column and row (-1 to 1) in the image for keypoints, x and y for points.
-            Empty for the image's middle.
+        widths: channels of the small network's first convolution and of its residual blocks, multiples of 8.
+        stride: stride of the small network's first convolution and so of its feature map, 2 or 4; 2 localises more precisely.
+        head: ``'keypoints'`` (spatial softmax), ``'points'`` (locations of objects that pretraining defines) or ``'grid'`` (all of
+            the last feature map, for the small map of ResNet-18).
+        keypoints: number of keypoints; of the grid, number of channels.
+        points: number of objects, for ``'points'``.
+        crop: pixels removed from each side length: random crop in training, centre crop otherwise; 0 for none.
+        origin: name of an observed vector, the origin of keypoints or points, such as the position of a hand. Column and row
+            (-1 to 1) in the image for keypoints, x and y for points. Empty for the image centre.
 
     Raises:
-        UserError: for a value that is none.
+        UserError: for an invalid value.
     """
 
     def __init__(
@@ -221,10 +219,10 @@ class ImageEncoder(nn.Module):
         else:
             grid = Grid(size[0], keypoints, *size[1:])
             self.head, self.size = grid, grid.size
-        """Numbers that are read of an image."""
+        """Number of features."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(batch, channels, height, width)`` uint8 to ``(batch, size)``, keypoints told from the image's middle."""
+        """``(batch, channels, height, width)`` uint8 to ``(batch, size)``, keypoints relative to the image centre."""
         height, width = (side - self.crop for side in images.shape[2:])
         if self.crop and self.training:
             corners = drawn(len(images), lambda n: torch.randint(self.crop + 1, (2, n, 1), device=images.device).movedim(1, 0))
@@ -240,14 +238,14 @@ class ImageEncoder(nn.Module):
 
 
 class ImageEncoders(nn.Module):
-    """An :class:`ImageEncoder` for each observed image, whose features stand one after another.
+    """An :class:`ImageEncoder` for each observed image, with concatenated features.
 
     Args:
-        observed: features by name, of which the images are encoded.
-        arguments: of every encoder.
+        observed: features by name, including the images.
+        arguments: arguments of every encoder.
 
     Raises:
-        UserError: for arguments that it does not take.
+        UserError: for invalid arguments.
     """
 
     def __init__(self, observed: Mapping[str, Feature], arguments: Mapping[str, Any]) -> None:
@@ -256,25 +254,25 @@ class ImageEncoders(nn.Module):
         encoders = [from_mapping(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
         self.origins = [encoder.origin for encoder in encoders]
         self.columns = [POINT if isinstance(encoder.head, Points) else 3 for encoder in encoders]
-        """Numbers of a keypoint or point."""
+        """Values per keypoint or point."""
         for origin in self.origins:
             if origin and (origin not in observed or observed[origin].shape != (2,)):
                 raise UserError(f"model.image_encoder.origin: expected an observed vector of 2 columns, found {short(origin)!r}")
         self.encoders = nn.ModuleList(encoders)
         self.sizes = [encoder.size for encoder in encoders]
         self.size = sum(self.sizes)
-        """Numbers that are read of all images."""
+        """Number of features of all images."""
 
     def forward(self, observed: Observed) -> Tensor:
         """Images by name ``(batch, *shape)`` to ``(batch, size)``."""
         return torch.cat([encoder(observed[name]) for name, encoder in zip(self.names, self.encoders, strict=True)], dim=-1)
 
     def from_origins(self, read: Tensor, observed: Observed) -> Tensor:
-        """The same, keypoints told from their origins.
+        """Shift keypoints to be relative to their origins.
 
         Args:
-            read: ``(batch, size)``, of images that may have been seen before.
-            observed: vectors by name, of which origins are the present ones.
+            read: features ``(batch, size)``, possibly of earlier images.
+            observed: vectors by name, including the current origins.
         """
         parts = []
         for part, origin, columns in zip(read.split(self.sizes, dim=1), self.origins, self.columns, strict=True):

@@ -14,28 +14,28 @@ from ftl_lightning.processes import Dropout
 from ftl_lightning.ranges import expect_range
 
 FEW = 8
-"""Rows that are multiplied at least: of fewer, libraries add up in another order."""
+"""Minimum number of rows in a product: with fewer, libraries sum in another order."""
 
 
 class MLPDenoiser(nn.Module):
-    """Estimates noise from the noisy plan, the timestep, the concept and, where there is something, what is observed.
+    """Denoiser of the noisy plan, conditioned on the timestep, the concept and any observed features.
 
-    Timestep and concept scale and shift every hidden layer (FiLM, Perez et al., 2018), which gives inversion more to hold on
-    to than a concept that is only concatenated to the input. Hidden layers are residual.
+    Timestep and concept scale and shift every hidden layer (FiLM, Perez et al., 2018). Inversion works better than with a concept
+    that is only concatenated to the input. Hidden layers are residual.
 
     Args:
-        sizes: of plans, concepts and observed features.
-        hidden_dim: width.
-        depth: hidden layers.
-        condition_dim: features of the concept. A wide path from the concept matters: inversion has no other handle.
-        time_dim: features of the timestep; even.
-        dropout: of the hidden layers, in training.
+        sizes: sizes of plans, concepts and observed features.
+        hidden_dim: width of the hidden layers.
+        depth: number of hidden layers.
+        condition_dim: number of concept features. Width matters, as inversion only changes the concept.
+        time_dim: number of timestep features; even.
+        dropout: dropout of the hidden layers, in training.
         initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'``, ``'set'`` or ``'points'``,
             see :mod:`ftl_lightning.diffusion.conditions`.
-        initial_dim: features of what is observed.
+        initial_dim: number of features of the observation.
 
     Raises:
-        UserError: for a size out of its range.
+        UserError: for a size out of range.
     """
 
     over_time = False
@@ -75,21 +75,20 @@ class MLPDenoiser(nn.Module):
         self.head = nn.Linear(hidden_dim, plan)
 
     def observe(self, vector: Tensor | None) -> Context:
-        """What is read once a plan of the observed vectors ``(batch, m)``, normalised; nothing where there are none."""
+        """Encode the normalised observed vectors ``(batch, m)`` once per plan; empty without vectors."""
         return () if self.initial is None or vector is None else self.initial.observe(vector)
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
         """Estimated noise ``(batch, horizon, state)``.
 
-        What depends on the concept alone, two thirds of the arithmetic, is computed once for each row of ``concepts``.
+        Computations that depend only on the concept, two thirds of the arithmetic, are done once per row of ``concepts``.
 
         Args:
             x: noisy plan ``(batch, horizon, state)``, normalised.
             t: ``(batch,)`` int64.
-            concepts: ``(concept, 1, n)``, the different concepts in the batch, in the model's concept space: of one knot, as a
-                plan of this network has no times.
-            index: ``(batch,)`` int64, each sample's row of ``concepts``.
-            context: what :meth:`observe` read.
+            concepts: ``(concept, 1, n)``, the distinct concepts of the batch, in the model's concept space, with a single knot.
+            index: ``(batch,)`` int64, row of ``concepts`` for each sample.
+            context: output of :meth:`observe`.
         """
         concepts = concepts.flatten(1)
         film = self._film(t, concepts, index)
@@ -101,7 +100,7 @@ class MLPDenoiser(nn.Module):
             hidden = torch.cat((hidden, self.initial.attend(context, concepts[index])), dim=-1)
         for depth, layer in enumerate(self.layers):
             scale, shift = film(2 * depth).add_(1), film(2 * depth + 1)
-            # In place wherever no gradient needs what was there: memory costs nearly as much time as the products.
+            # In place unless a gradient needs the value: memory traffic costs nearly as much time as the products.
             changed = layer(hidden) * scale if torch.is_grad_enabled() else layer(hidden).mul_(scale)
             update = self.dropout(functional.silu(changed.add_(shift)))
             hidden = update.add_(hidden) if depth else update
@@ -109,37 +108,34 @@ class MLPDenoiser(nn.Module):
         return out if direction is None else turned(out, direction, self.plane, back=True)
 
     def _film(self, t: Tensor, concepts: Tensor, index: Tensor) -> Callable[[int], Tensor]:
-        """What timestep and concept make of hidden layers: by number, scale and shift of each layer one after another, a fresh
-        ``(batch, hidden_dim)`` in single precision.
+        """FiLM parameters for every hidden layer, as a function of ``2 * layer`` (scale) or ``2 * layer + 1`` (shift).
 
-        While sampling, all plans are at one timestep, and in judging a loss there are few: what a pair of timestep and concept
-        makes is then computed once, and the plans of the pair take it. While concepts are learned together they share timesteps,
-        and what a timestep makes is computed once. The numbers are the same to the bit.
+        The function returns a new ``(batch, hidden_dim)`` in single precision. Sampling and evaluating losses have few timesteps:
+        parameters are computed once per pair of timestep and concept. Learning several concepts shares timesteps: the timestep's
+        part is computed once per timestep. All variants are bitwise equal.
 
         Args:
             t: ``(batch,)`` int64.
             concepts: ``(concept, n)``.
-            index: each sample's row of ``concepts`` ``(batch,)``.
+            index: row of ``concepts`` for each sample ``(batch,)``.
         """
-        # In single precision whatever the products are in: these are few, and their gradients are summed over many plans.
+        # Single precision regardless of autocast: these products are few, and their gradients are summed over many plans.
         with torch.autocast(t.device.type, enabled=False):
             of_concepts = self._by_layer(self.concept_film(self.concept(concepts.float())))
             if len(t) <= 2 * FEW or (torch.is_grad_enabled() and self.time_film.weight.requires_grad):
                 of_each = self.time_film(self.time(sinusoidal_embedding(t, self.time_dim))).chunk(len(of_concepts), dim=-1)
-                # Summed layer by layer: all layers at once would not fit into the processor's cache.
+                # Sum layer by layer: all layers together exceed the CPU cache.
                 return lambda part: of_concepts[part].index_select(0, index).add_(of_each[part])
-            times, own = t.unique(return_inverse=True)
+            times, time_index = t.unique(return_inverse=True)
             few = times[:1].expand(max(FEW - len(times), 0))
             every = self.time_film(self.time(sinusoidal_embedding(torch.cat((times, few)), self.time_dim)))
             of_times = self._by_layer(every[: len(times)])
         if len(times) * len(concepts) <= len(t) and not torch.is_grad_enabled():
             pairs = [(time[:, None] + concept).flatten(0, 1) for time, concept in zip(of_times, of_concepts, strict=True)]
-            pair = own * len(concepts) + index
+            pair = time_index * len(concepts) + index
             return lambda part: pairs[part].index_select(0, pair)
-        return lambda part: of_concepts[part].index_select(0, index).add_(of_times[part].index_select(0, own))
+        return lambda part: of_concepts[part].index_select(0, index).add_(of_times[part].index_select(0, time_index))
 
     def _by_layer(self, film: Tensor) -> tuple[Tensor, ...]:
-        """Scales and shifts of all layers ``(row, 2 * depth * hidden_dim)`` one after another, each without gaps in memory, which
-        rows are taken from in a third of the time.
-        """
+        """Split ``(row, 2 * depth * hidden_dim)`` into contiguous scales and shifts of each layer: row selection is 3x faster."""
         return film.unflatten(-1, (2 * len(self.layers), -1)).transpose(0, 1).contiguous().unbind()

@@ -1,4 +1,4 @@
-"""What a denoiser's network puts out: the noise itself, or something from which the noise follows."""
+"""Parametrisations of a denoiser: the network's output is the noise or a quantity that implies it."""
 
 from collections.abc import Sequence
 
@@ -15,23 +15,23 @@ LOSSES = PREDICTIONS[:3]
 
 
 class Prediction(nn.Module):
-    """A denoiser whose network does not estimate the noise; the noise is computed from what it estimates.
+    """Denoiser whose network predicts another quantity than the noise.
 
     ``'v'`` is the velocity ``sqrt(abar) eps - sqrt(1 - abar) x_0`` (Salimans & Ho, 2022), ``'clean'`` is ``x_0``,
-    ``'displacement'`` is ``x_0`` less the state that the plan starts from. Clean plans are smooth, noise is not: a network that
-    halves its input several times learns the one in a fraction of the steps. The displacement needs no copy of where the plan
-    starts, which a network blurs: the first states, which are those executed in closed loop, are the most exact. ``'cosines'`` are
-    those that ``x_0`` consists of over time, see :class:`~ftl_lightning.diffusion.spectrum.Spectrum`.
+    ``'displacement'`` is ``x_0`` minus the plan's initial state. Clean plans are smooth, noise is not: a network that downsamples
+    its input learns clean plans in a fraction of the steps. With displacements the network need not copy the initial state, which
+    it would blur: the first states, executed in closed loop, are the most exact. ``'cosines'`` are the coefficients of ``x_0`` over
+    time, see :class:`~ftl_lightning.diffusion.spectrum.Spectrum`.
 
     Args:
-        net: a denoiser.
+        net: network.
         kind: ``'v'``, ``'clean'``, ``'displacement'`` or ``'cosines'``.
         diffusion_steps: T.
-        state_columns: columns of the observed vectors that hold the state a plan starts from, on the plan's scale.
-        spectrum: of plans, for cosines; ``None`` for all others.
+        state_columns: columns of the observed vectors with the plan's initial state, on the plan's scale.
+        spectrum: spectrum of plans, for cosines; ``None`` otherwise.
 
     Raises:
-        UserError: for a displacement where they hold no state.
+        UserError: for displacements without ``state_columns``.
     """
 
     alpha_bar: Tensor
@@ -46,7 +46,7 @@ class Prediction(nn.Module):
         self.register_buffer("alpha_bar", cosine_alpha_bar(diffusion_steps), persistent=False)
 
     def observe(self, vector: Tensor | None) -> Context:
-        """As the network, with the state that plans start from before it, if they are displacements."""
+        """Context of the network; for displacements the initial state comes first."""
         context: Context = self.net.observe(vector)  # type: ignore[operator]
         if self.kind != "displacement":
             return context
@@ -54,7 +54,7 @@ class Prediction(nn.Module):
         return (vector[:, self.state_columns], *context)
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
-        """Estimated noise, as :data:`ftl_lightning.concepts.branches.Denoiser` says."""
+        """Estimated noise, see :data:`ftl_lightning.concepts.branches.Denoiser`."""
         alpha_bar = self.alpha_bar[t][:, None, None]
         start, context = (context[0], context[1:]) if self.kind == "displacement" else (None, context)
         out: Tensor = self.net(x, t, concepts, index, context)
@@ -68,10 +68,10 @@ class Prediction(nn.Module):
 
 
 def loss_weights(kind: str, alpha_bar: Tensor) -> Tensor:
-    """Weights of the timesteps ``(T,)`` that turn the squared error of the noise into that of what ``kind`` names.
+    """Timestep weights ``(T,)`` that convert the squared error of the noise into the squared error of ``kind``.
 
     Raises:
-        UserError: for a kind that is none of :data:`LOSSES`.
+        UserError: if ``kind`` is not in :data:`LOSSES`.
     """
     if kind not in LOSSES:
         raise UserError(f"loss: expected one of {', '.join(LOSSES)}, found {kind!r}")

@@ -1,10 +1,9 @@
-"""Samplers: free functions of one signature over a noise estimate.
+"""Samplers: functions of a noise estimate with a common signature.
 
-``epsilon(x, t)`` takes ``x (batch, horizon, state)`` and ``t (batch,)`` int64 and returns the estimated noise; usually it is
-the composed one (:func:`ftl_lightning.concepts.guidance.composed_epsilon`). ``alpha_bar (T,)`` is the schedule of
-pretraining. ``steps <= T`` are spread evenly over it. ``temperature`` is the paper's alpha: the variance of the first noise and
-of every noise added later is scaled by it. ``noise()`` draws standard normal noise ``(batch, horizon, state)`` and alone decides
-the result.
+``epsilon(x, t)`` maps ``x (batch, horizon, state)`` and ``t (batch,)`` int64 to the estimated noise; usually it is
+:func:`ftl_lightning.concepts.guidance.composed_epsilon`. ``alpha_bar (T,)`` is the schedule of pretraining. ``steps <= T`` are
+evenly spaced on it. ``temperature`` is the paper's alpha, a factor of the variance of the initial noise and of all noise added
+later. ``noise()`` draws standard normal noise ``(batch, horizon, state)`` and is the only source of randomness.
 """
 
 import itertools
@@ -25,13 +24,13 @@ Noise = Callable[[], Tensor]
 
 
 class Sampler(Protocol):
-    """The common signature; returns ``(batch, horizon, state)`` in normalised units."""
+    """Common signature; returns ``(batch, horizon, state)`` in normalised units."""
 
     def __call__(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor: ...
 
 
 def timesteps(total: int, steps: int) -> list[int]:
-    """``steps`` timesteps from ``total - 1`` down to 0, evenly spread.
+    """``steps`` evenly spaced timesteps from ``total - 1`` down to 0.
 
     Raises:
         ValueError: unless ``1 <= steps <= total``.
@@ -47,7 +46,7 @@ def _clean(epsilon: Epsilon, x: Tensor, t: int, alpha_bar: Tensor) -> Tensor:
 
 @torch.no_grad()
 def ddpm(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
-    """Ancestral sampling (Ho et al., 2020) on a subset of the timesteps; the paper's sampler with ``steps = T``."""
+    """Ancestral sampling (Ho et al., 2020) on a subset of the timesteps; the paper's sampler for ``steps = T``."""
     x = temperature**0.5 * noise()
     visited = timesteps(len(alpha_bar), steps)
     for t, before in zip(visited, [*visited[1:], None], strict=True):
@@ -64,7 +63,7 @@ def ddpm(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperat
 
 @torch.no_grad()
 def ddim(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
-    """Deterministic after the first noise (Song et al., 2021, eta = 0)."""
+    """DDIM (Song et al., 2021, eta = 0): deterministic given the initial noise."""
     x = temperature**0.5 * noise()
     visited = timesteps(len(alpha_bar), steps)
     for t, before in itertools.pairwise(visited):
@@ -76,12 +75,12 @@ def ddim(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperat
 
 @torch.no_grad()
 def dpm_solver(epsilon: Epsilon, noise: Noise, alpha_bar: Tensor, steps: int, temperature: float) -> Tensor:
-    """DPM-Solver++ (2M) (Lu et al., 2022): second order, data prediction, deterministic after the first noise."""
+    """DPM-Solver++ (2M) (Lu et al., 2022): second order, data prediction, deterministic given the initial noise."""
     x = temperature**0.5 * noise()
     visited = timesteps(len(alpha_bar), steps)
     scale, sigma = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
     half_log_snr = scale.log() - sigma.log()
-    previous: tuple[Tensor, Tensor] | None = None  # the last step's clean estimate and its length in half log-SNR
+    previous: tuple[Tensor, Tensor] | None = None  # clean estimate and length in half log-SNR of the last step
     for t, before in itertools.pairwise(visited):
         clean = _clean(epsilon, x, t, alpha_bar)
         step = half_log_snr[before] - half_log_snr[t]
@@ -98,15 +97,15 @@ SAMPLERS: dict[str, Sampler] = {"ddpm": ddpm, "ddim": ddim, "dpm_solver": dpm_so
 
 @dataclass(frozen=True)
 class Sampling:
-    """How behaviour is generated.
+    """Sampler settings.
 
     Attributes:
-        sampler: a name of :data:`SAMPLERS`.
-        steps: of the sampler, from 1 to the model's T.
+        sampler: key of :data:`SAMPLERS`.
+        steps: number of sampler steps, from 1 to the model's T.
         temperature: the paper's alpha, 0 or more; lower is more accurate and less diverse.
 
     Raises:
-        UserError: at construction, for a value that is none.
+        UserError: at construction, for an invalid value.
     """
 
     sampler: str = "ddpm"
@@ -124,5 +123,5 @@ class Sampling:
         expect_count("steps", self.steps, 1)
 
     def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
-        """Clean plans ``(batch, horizon, state)``, normalised; arguments as of :class:`Sampler`."""
+        """Sample clean normalised plans ``(batch, horizon, state)``; arguments as in :class:`Sampler`."""
         return SAMPLERS[self.sampler](epsilon, noise, alpha_bar, self.steps, self.temperature)

@@ -1,4 +1,4 @@
-"""The forward process: how noise is added and how clean data is read off a noise estimate."""
+"""Forward process: schedule, adding noise, clean data from a noise estimate, denoising loss."""
 
 import math
 from collections.abc import Callable
@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 LARGEST_POWER = 100.0
-"""Of :func:`timesteps`: with more, all of them would be the noisiest one."""
+"""Maximum power of :func:`timesteps`: with more, all timesteps would be T - 1."""
 MOST_STEPS = 100_000
-"""Of a schedule, T."""
+"""Maximum length T of a schedule."""
 
 
 def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999) -> Tensor:
@@ -17,13 +17,13 @@ def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999)
 
     Args:
         steps: T.
-        offset: their s.
-        beta_max: largest variance of a single step.
+        offset: s in the source.
+        beta_max: maximum variance of a single step.
 
     Returns:
-        ``(T,)`` float32, the product of ``1 - beta`` up to and including each step; index 0 is the least noisy.
+        ``(T,)`` float32, the cumulative product of ``1 - beta``; index 0 is the least noisy.
     """
-    # The device is said, wherever a network is being made: arithmetic on none (meta) makes torch import its compiler.
+    # Explicit CPU: arithmetic on the meta device makes torch import its compiler.
     share = torch.arange(steps + 1, dtype=torch.float64, device="cpu") / steps
     edges = torch.cos((share + offset) / (1 + offset) * math.pi / 2) ** 2
     beta = (1 - edges[1:] / edges[:-1]).clamp(max=beta_max)
@@ -31,16 +31,16 @@ def cosine_alpha_bar(steps: int, offset: float = 0.008, beta_max: float = 0.999)
 
 
 def timesteps(spread: Tensor, steps: int, power: float) -> Tensor:
-    """Timesteps ``T (1 - u^power)``: the higher the power, the more of them are noisy.
+    """Timesteps ``T (1 - u^power)``; a higher power gives noisier timesteps.
 
     Args:
-        spread: u, even in [0, 1).
+        spread: u, uniform in [0, 1).
         steps: T.
-        power: 1 spreads timesteps evenly (the paper's); with 3 half of them are of the noisiest eighth, with 10 of the noisiest
-            fifteenth.
+        power: 1 for uniform timesteps (the paper's); with 3 half of the timesteps are in the noisiest eighth, with 10 in the
+            noisiest fifteenth.
 
     Returns:
-        int64, of the shape of ``spread``.
+        int64, in the shape of ``spread``.
     """
     if power != 1:
         spread = 1 - spread**power
@@ -63,12 +63,12 @@ def add_noise(clean: Tensor, noise: Tensor, alpha_bar: Tensor) -> Tensor:
 
 
 def clean_from_epsilon(noisy: Tensor, epsilon: Tensor, alpha_bar: Tensor, clip: float | None = 1.0) -> Tensor:
-    """The clean data that a noise estimate implies; the inverse of :func:`add_noise` in its first argument.
+    """Clean data implied by a noise estimate; the inverse of :func:`add_noise` in its first argument.
 
     Args:
         noisy, epsilon: ``(batch, horizon, state)``.
         alpha_bar: ``(batch,)`` or scalar.
-        clip: bound on the result's absolute value (data are normalised to [-1, 1]); ``None`` for no bound.
+        clip: bound on the absolute value (data are normalised to [-1, 1]); ``None`` for no bound.
     """
     alpha_bar = _per_sample(alpha_bar, noisy)
     clean = (noisy - (1 - alpha_bar).sqrt() * epsilon) / alpha_bar.sqrt()
@@ -83,14 +83,14 @@ def denoising_loss(
     alpha_bar: Tensor,
     discount: float = 1.0,
 ) -> Tensor:
-    """Squared error of the noise estimate, the integrand of Eq. 1 and Eq. 2; which of the two, ``epsilon`` decides.
+    """Squared error of the noise estimate, the integrand of Eq. 1 or, with composed noise, Eq. 2.
 
     Args:
         epsilon: ``(x, t) -> noise``.
         clean, noise: ``(batch, horizon, state)``.
         t: ``(batch,)`` int64.
-        alpha_bar: the schedule ``(T,)``.
-        discount: state k of the window weighs ``discount ** k``, in units of the mean of these (Janner et al., 2022).
+        alpha_bar: schedule ``(T,)``.
+        discount: state k of the window has weight ``discount ** k``, normalised to mean 1 (Janner et al., 2022).
 
     Returns:
         ``(batch,)``, the mean over horizon and state.

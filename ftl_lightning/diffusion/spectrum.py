@@ -1,4 +1,4 @@
-"""Plans as cosines over time, each on a scale of its own: what is smooth in pretraining stays smooth in what is learned."""
+"""Cosine transform of plans over time with a scale per coefficient, which keeps plans of learned concepts smooth."""
 
 import math
 from functools import cache
@@ -7,31 +7,31 @@ import torch
 from torch import Tensor, nn
 
 LEAST = 1e-6
-"""Of the largest spread; a cosine that varies less is taken to be constant."""
+"""Minimum standard deviation relative to the largest; coefficients below are constant."""
 
 
 @cache
 def cosines(count: int) -> Tensor:
     """Orthonormal discrete cosine transform (type II), ``(cosine, time)`` in double precision; its inverse is its transpose."""
-    number = torch.arange(count, dtype=torch.float64, device="cpu")  # wherever a network is being made, as this is kept
+    number = torch.arange(count, dtype=torch.float64, device="cpu")  # explicit CPU, as the result is cached
     basis = torch.cos(math.pi / count * number[:, None] * (number + 0.5)) * (2 / count) ** 0.5
     basis[0] /= 2**0.5
     return basis
 
 
 class Spectrum(nn.Module):
-    """Turns coefficients of cosines over time (orthonormal DCT-II) into plans.
+    """Inverse cosine transform over time (orthonormal DCT-II), from coefficients to plans.
 
-    A network errs by about as much in each number that it puts out. Where the numbers are states, neighbours err as much as states
-    far apart, so that plans of concepts which pretraining did not show are jagged. Here a coefficient is put out in units of its
-    spread in pretraining: fast cosines, which hardly occur in smooth behaviour, err little.
+    The network's error is about equal for every output. If the outputs are states, plans of new concepts are jagged. Here the
+    outputs are coefficients in units of their standard deviation in pretraining: high frequencies, which are rare in smooth
+    behaviour, have small errors.
 
     Args:
-        horizon: states in a plan.
+        horizon: number of states in a plan.
         state_dim: columns of a state.
 
     Attributes:
-        mean, scale: of the coefficients ``(horizon, state)``, on the plans' normalised scale; 0 and 1 until :meth:`fit`.
+        mean, scale: mean and scale of the coefficients ``(horizon, state)`` of normalised plans; 0 and 1 until :meth:`fit`.
     """
 
     basis: Tensor
@@ -46,7 +46,7 @@ class Spectrum(nn.Module):
 
     @torch.no_grad()
     def fit(self, plans: Tensor) -> None:
-        """Take means and scales from plans of pretraining ``(plan, horizon, state)``, normalised."""
+        """Fit means and scales to normalised plans of pretraining ``(plan, horizon, state)``."""
         coefficients = torch.einsum("ct,pts->pcs", self.basis, plans)
         spread = coefficients.std(dim=0, correction=0)
         varies = spread > LEAST * spread.max()
@@ -54,5 +54,5 @@ class Spectrum(nn.Module):
         self.scale.copy_(torch.where(varies, spread, 0))
 
     def forward(self, out: Tensor) -> Tensor:
-        """Plans ``(batch, horizon, state)`` of what a network puts out, a number for each cosine and column."""
+        """Map outputs (a coefficient per cosine and column) to plans ``(batch, horizon, state)``."""
         return torch.einsum("ct,bcs->bts", self.basis, self.mean + self.scale * out)

@@ -14,7 +14,7 @@ from ftl_lightning.diffusion.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.errors import UserError
 
 MOST_CLOCK = 256
-"""Channels that tell a state's place: more are waves that single precision cannot tell."""
+"""Maximum number of position channels: single precision does not resolve higher frequencies."""
 
 KERNEL, GROUPS = 5, 8
 
@@ -24,14 +24,14 @@ def _convolution(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def over_time(knots: Tensor, times: int) -> Tensor:
-    """Values at all times, linear between knots that are evenly spread from the first time to the last.
+    """Interpolate linearly between knots that are evenly spaced from the first time to the last.
 
     Args:
         knots: ``(batch, knot, columns)``.
-        times: how many.
+        times: number of times.
 
     Returns:
-        ``(batch, columns, times)``, or ``(batch, columns, 1)`` of a single knot.
+        ``(batch, columns, times)``, or ``(batch, columns, 1)`` for a single knot.
     """
     values = knots.transpose(1, 2)
     if values.shape[2] == 1:
@@ -40,12 +40,12 @@ def over_time(knots: Tensor, times: int) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions over time; the condition acts between them.
+    """Two convolutions over time, conditioned in between.
 
     Args:
         inputs, outputs: channels.
-        condition_dim: columns of the condition.
-        film: the condition scales and shifts (FiLM, Perez et al., 2018); else it is added, as in Decision Diffuser.
+        condition_dim: size of the condition.
+        film: scale and shift by the condition (FiLM, Perez et al., 2018); otherwise add it, as in Decision Diffuser.
     """
 
     def __init__(self, inputs: int, outputs: int, condition_dim: int, film: bool) -> None:
@@ -57,12 +57,12 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         """``x (batch, inputs, time)`` and ``condition (batch, knot, condition)`` to ``(batch, outputs, time)``."""
-        hidden, own = self.first(x), over_time(self.condition(condition), x.shape[2])
+        hidden, modulation = self.first(x), over_time(self.condition(condition), x.shape[2])
         if self.film:
-            scale, shift = own.chunk(2, dim=1)
+            scale, shift = modulation.chunk(2, dim=1)
             hidden = hidden * (1 + scale) + shift
         else:
-            hidden = hidden + own
+            hidden = hidden + modulation
         hidden = self.second(hidden)
         out: Tensor = hidden + self.skip(x)
         return out
@@ -74,7 +74,7 @@ def _bias(layer: nn.Conv1d) -> Tensor:
 
 
 class Level(nn.Module):
-    """Two residual blocks at one resolution; arguments as of :class:`ResidualBlock`."""
+    """Two residual blocks at the same resolution; arguments as in :class:`ResidualBlock`."""
 
     def __init__(self, inputs: int, outputs: int, condition_dim: int, film: bool) -> None:
         super().__init__()
@@ -82,31 +82,31 @@ class Level(nn.Module):
         self.second = ResidualBlock(outputs, outputs, condition_dim, film)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """As of :class:`ResidualBlock`."""
+        """See :class:`ResidualBlock`."""
         out: Tensor = self.second(self.first(x, condition), condition)
         return out
 
 
 class TemporalUNet(nn.Module):
-    """Estimates noise from the noisy plan, the timestep, the concept and what is observed.
+    """Denoiser of the noisy plan, conditioned on the timestep, the concept and the observed features.
 
     Args:
-        sizes: of plans, concepts and observed features; the horizon is a multiple of 2 to the number of levels less one.
-        width: channels of the first level, and columns of each of the condition's three parts; the paper's size is 128.
-        multipliers: channels of the levels, in widths.
+        sizes: sizes of plans, concepts and observed features; the horizon must be a multiple of ``2 ** (levels - 1)``.
+        width: channels of the first level, and size of each of the condition's three parts; 128 in the paper.
+        multipliers: channels of the levels, in multiples of ``width``.
         initial_encoder: ``'flat'`` (the paper's), ``'joint'``, ``'entities'`` or ``'set'``,
             see :mod:`ftl_lightning.diffusion.conditions`.
-        film: the condition scales and shifts channels; false for the paper's form, which adds it.
-        broadcast: the features of what is observed are also channels of the input at every time; false for the paper's form.
-        clock: channels that tell a state's place in the plan, in addition to the states; even, 0 for the paper's form, whose
-            convolutions see it by the padding at the ends alone.
-        smooth: how often the output is smoothed over time with weights 1/4, 1/2, 1/4; 0 for the paper's form. Errors of
-            neighbouring times are independent and tremble, behaviour does not: for predictions of behaviour, not of noise.
-        skip: what the first level makes of the input also goes to the output directly, at full resolution; false for the paper's
-            form, all of which goes through the middle.
+        film: scale and shift channels by the condition; false for the paper's form, which adds it.
+        broadcast: append the features of the observation to the input at every time; false for the paper's form.
+        clock: number of channels that encode the time in the plan; even; 0 for the paper's form, in which the convolutions see the
+            time only by the padding.
+        smooth: number of smoothing passes over the output with weights 1/4, 1/2, 1/4; 0 for the paper's form. Removes jitter from
+            predictions of behaviour; not for predictions of noise.
+        skip: connect the first level directly to the output, at full resolution; false for the paper's form, in which everything
+            passes the middle.
 
     Raises:
-        UserError: for a horizon that cannot be halved once a level.
+        UserError: for an indivisible horizon or a size out of range.
     """
 
     over_time = True
@@ -137,7 +137,7 @@ class TemporalUNet(nn.Module):
             raise UserError(f"denoiser_args.clock: expected an even number up to {MOST_CLOCK}, found {clock}")
         self.smooth = smooth
         self.width, self.broadcast = width, broadcast and sizes.vector_dim > 0
-        # The device is said, wherever a network is being made: arithmetic on none (meta) makes torch import its compiler.
+        # Explicit CPU: arithmetic on the meta device makes torch import its compiler.
         rates = 2.0 ** torch.arange(-1, clock // 2 - 1, device="cpu")[:, None]
         angle = torch.linspace(0, math.pi, sizes.horizon, device="cpu") * rates
         self.register_buffer("clock", torch.cat((angle.sin(), angle.cos())), persistent=False)
@@ -165,7 +165,7 @@ class TemporalUNet(nn.Module):
             nn.init.zeros_(_bias(self.skip))
 
     def observe(self, vector: Tensor | None) -> Context:
-        """What is read once a plan of the observed vectors ``(batch, m)``, normalised; nothing where there are none."""
+        """Encode the normalised observed vectors ``(batch, m)`` once per plan; empty without vectors."""
         return () if self.initial is None or vector is None else self.initial.observe(vector)
 
     def forward(self, x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context = ()) -> Tensor:
@@ -174,10 +174,10 @@ class TemporalUNet(nn.Module):
         Args:
             x: noisy plan ``(batch, horizon, state)``, normalised.
             t: ``(batch,)`` int64.
-            concepts: ``(concept, knots, n)``, the different concepts in the batch, in the model's concept space. What a concept
-                adds to a layer is computed at each knot and linear between them.
-            index: ``(batch,)`` int64, each sample's row of ``concepts``.
-            context: what :meth:`observe` read.
+            concepts: ``(concept, knots, n)``, the distinct concepts of the batch, in the model's concept space. A layer's condition
+                is computed at each knot and interpolated linearly.
+            index: ``(batch,)`` int64, row of ``concepts`` for each sample.
+            context: output of :meth:`observe`.
         """
         knots, times = concepts.shape[1], x.shape[1]
         parts = [self.time(sinusoidal_embedding(t, self.width))[:, None].expand(-1, knots, -1), self.concept(concepts)[index]]

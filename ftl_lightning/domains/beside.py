@@ -1,4 +1,4 @@
-"""Demonstrations above what was generated from them: how people see whether a concept was learned."""
+"""Figures of demonstrations above samples, to check visually whether a concept was learned."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,25 +12,25 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.domain import Show
 from ftl_lightning.escape import figure_text
 
-if TYPE_CHECKING:  # half a second of import, for what is drawn later
+if TYPE_CHECKING:  # importing matplotlib takes half a second
     from matplotlib.figure import Figure
 
 DPI = 100
-"""Pixels of an inch of a domain's picture."""
+"""Pixels per inch of a domain's picture."""
 POINTS, LEAST = 2.2, 9.0
-"""Points of letters, for each inch of a picture's width, so that they are read where it is shown as a card, and at least."""
+"""Font size in points per inch of a picture's width, legible on cards, and minimum font size."""
 LETTER, LINE = 0.68, 1.8
-"""Width of a bold letter and height of a line, in sizes of letters."""
+"""Width of a bold letter and height of a line, relative to the font size."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Plans that are drawn together.
+    """Group of plans in a figure.
 
     Attributes:
-        label: what they are, such as ``'demonstrations'``.
+        label: such as ``'demonstrations'``.
         states: ``(plan, horizon, state)`` in the domain's units.
-        starts: where they start, or ``None``.
+        starts: initial states, or ``None``.
         right: whether each plan is right ``(plan,)``; ``None`` if not judged.
     """
 
@@ -41,13 +41,13 @@ class Drawn:
 
 
 def beside(show: Show, demonstrations: Drawn, samples: Drawn, title: str) -> "Figure":
-    """Demonstrations above samples, in the domain's own drawing.
+    """Draw demonstrations above samples with the domain's pictures.
 
     Args:
         show: the domain's pictures.
         demonstrations: drawn above.
         samples: drawn below, of the same horizon.
-        title: of the figure.
+        title: title of the figure.
     """
     if show.beside is not None:
         return show.beside(demonstrations.states, samples.states, title, samples.right)
@@ -78,7 +78,7 @@ def beside(show: Show, demonstrations: Drawn, samples: Drawn, title: str) -> "Fi
 
 
 def _pixels(figure: "Figure") -> NDArray[np.uint8]:
-    """``(height, width, 4)``."""
+    """RGBA ``(height, width, 4)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure.set_dpi(DPI)

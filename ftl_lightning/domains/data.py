@@ -1,7 +1,7 @@
-"""DataModules: of pretraining, which a domain's own names, and of inversion, one for all domains.
+"""DataModules for pretraining (subclassed by domains) and for inversion (shared by all domains).
 
-Both deliver demonstrations in the domain's units; the model normalises them. What a step sees is a function of the seed and
-the step's number alone, so a run that is killed and resumed goes on exactly as the unbroken one would.
+Both deliver demonstrations in the domain's units; the model normalises them. Each batch depends only on the seed and the step
+number, so an interrupted and resumed run matches an uninterrupted run.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ from ftl_lightning.seeding import DEMONSTRATION_SEED, generator
 
 
 class Batch(NamedTuple):
-    """What a step of pretraining sees.
+    """Batch of a pretraining step.
 
     Attributes:
         states: ``(batch, horizon, state)`` in the domain's units.
@@ -41,7 +41,7 @@ class Batch(NamedTuple):
 
 
 class Steps(IterableDataset[int]):
-    """The numbers of the steps of one epoch, from wherever the trainer stands."""
+    """Step numbers of the current epoch, from the trainer's global step."""
 
     def __init__(self, module: pl.LightningDataModule, length: int) -> None:
         self.module, self.length = module, length
@@ -58,14 +58,14 @@ class Steps(IterableDataset[int]):
 
 @dataclass(frozen=True)
 class Windows:
-    """Which windows of demonstrations a step of pretraining sees.
+    """How pretraining samples windows of demonstrations.
 
     Attributes:
-        horizon: states in a window; ``None`` for the domain's plans.
-        start_exponent: exponent u of the windows' starts, ``start = length * share^u``: 1 is uniform, with 3 half of the windows
-            start in the first eighth of a demonstration. ``None`` for the domain's where windows are as long as plans, else 1.
-        balance: exponent with which concepts are drawn by their number of states: 1 draws every state alike, 0 every concept, 0.5
-            by the square root; of a concept, demonstrations are drawn by their length. ``None`` to draw demonstrations alike.
+        horizon: states in a window; ``None`` for the domain's horizon.
+        start_exponent: exponent u of window starts, ``start = length * share^u``: 1 is uniform; with 3, half of the windows start
+            in the first eighth of a demonstration. ``None`` for the domain's exponent if windows are as long as plans, else 1.
+        balance: concepts are drawn in proportion to their number of states to this power: 1 is uniform over states, 0 over
+            concepts. Within a concept, demonstrations are drawn by length. ``None`` for uniform over demonstrations.
     """
 
     horizon: int | None = None
@@ -78,24 +78,23 @@ class PretrainingData(pl.LightningDataModule):
 
     Args:
         domain: name of the domain, or ``package.module:DOMAIN``, see :func:`ftl_lightning.domains.registry.load_domain`; empty
-            for the class's own.
+            for the class's domain.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
         samples_per_concept: demonstrations of each training concept.
-        validation_per_concept: others of each, for the validation loss.
-        recoveries: demonstrations more of each training concept that has some, which begin where behaviour went wrong, see
+        validation_per_concept: validation demonstrations of each training concept.
+        recoveries: additional demonstrations of each training concept that start after a failure, see
             :class:`~ftl_lightning.domains.domain.Recoveries`.
         more: file of further demonstrations of training concepts, such as corrections of a model; ``None`` for none.
-        seed: decides the demonstrations and the order they are seen in.
-        batch_size: windows a step, in each process.
-        steps_per_epoch: an epoch is a unit of reporting: so many batches, drawn with replacement.
+        seed: seed of the demonstrations and of their order.
+        batch_size: windows per step and process.
+        steps_per_epoch: batches per epoch, drawn with replacement; an epoch is only a unit of reporting.
         encoder: text encoder, ``'table'`` (shipped embeddings), ``'minilm'``, ``'hashing'``, or the name or path of a language
             model, see :func:`ftl_lightning.concepts.encoder.load_encoder`.
-        revision: of a Hugging Face model.
-        **windows: which windows a step sees: the attributes of :class:`Windows`, which are keys of a configuration beside the
-            others.
+        revision: revision of a Hugging Face model.
+        **windows: attributes of :class:`Windows`, as further keys of the configuration.
 
     Raises:
-        UserError: for a value that is none.
+        UserError: for an invalid value.
     """
 
     own_domain: ClassVar[str] = ""
@@ -118,8 +117,8 @@ class PretrainingData(pl.LightningDataModule):
     ) -> None:
         super().__init__()
         chosen = Windows(**windows)
-        windows = asdict(chosen)  # hyper-parameters are the local variables: those that were not given count too
-        # Configurations from before there were these keep their hash.
+        windows = asdict(chosen)  # hyper-parameters are the local variables: include defaults
+        # Leave out unset new keys, so that older configurations keep their hash.
         unsaid = {"balance": chosen.balance is None, "recoveries": not recoveries, "more": more is None}
         self.save_hyperparameters(ignore=[name for name, absent in unsaid.items() if absent])
         if self.own_domain and domain not in ("", self.own_domain):
@@ -157,7 +156,7 @@ class PretrainingData(pl.LightningDataModule):
         self.encoder: Encoder = load_encoder(encoder, self.domain.concepts.table, revision)
 
     def _domain(self, name: str) -> tuple[str, Domain]:
-        """The domain and the name by which a model knows it."""
+        """Recorded name and domain."""
         return recorded_name(name), load_domain(name)
 
     def setup(self, stage: str) -> None:
@@ -173,25 +172,25 @@ class PretrainingData(pl.LightningDataModule):
         self.validation = source.split("validation", self.validation_per_concept, self.seed).fitted(self.domain.observed)
         if self.balance is not None:
             self._shares = shares(self.training, self.balance)
-        # Evaluation draws initial states: a mistake in them is told before training, not after.
+        # Evaluation draws initial states: check them before training.
         starts = source.starts(self.domain.concepts.training[0], 1, self.seed) if self.domain.observed else None
         if starts is not None:
             expect_features(starts.observed, self.domain.observed)
 
     def _read_more(self, path: str) -> Demonstrations:
-        found = read_demonstrations(path, self.domain)
-        for text in found.concepts:
+        demonstrations = read_demonstrations(path, self.domain)
+        for text in demonstrations.concepts:
             if text not in self._number:
                 raise UserError(f"{path}: expected demonstrations of training concepts, found {short(text)!r}")
-        return found
+        return demonstrations
 
     @property
     def examples(self) -> Demonstrations | None:
-        """Demonstrations that are kept beside a model, if it is of a user's own data."""
+        """Demonstrations saved with a model of user data, else ``None``."""
         return None
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step, or its part of this process: demonstrations drawn with replacement, and of each a window."""
+        """Batch of a step (this process's share): demonstrations drawn with replacement, a window of each."""
         draw, count = generator("cpu", self.seed, step), self.batch_size
         with rows_of(*((0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size))):
             if self.balance is None:
@@ -207,16 +206,16 @@ class PretrainingData(pl.LightningDataModule):
         return Batch(states, self._concepts(demonstrations, rows), observed)
 
     def _concepts(self, demonstrations: Demonstrations, rows: Tensor) -> Tensor:
-        """Which training concept each of some demonstrations shows ``(window,)``."""
+        """Index of the training concept of each row ``(window,)``."""
         return torch.tensor([self._number[demonstrations.concepts[row]] for row in rows.tolist()])
 
     def some_windows(self, count: int) -> Batch:
-        """Windows as steps of pretraining see them, as many of each demonstration, at least ``count`` together."""
+        """At least ``count`` pretraining windows, equally many per demonstration."""
         rows = torch.arange(len(self.training)).repeat(-(-count // len(self.training)))
         return self._windows(self.training, rows, generator("cpu", self.seed))
 
     def every_window(self) -> Batch:
-        """One window from each time of each demonstration."""
+        """A window from every possible start of every demonstration."""
         lengths = self.training.lengths
         if not self.domain.plans.at_rest:
             lengths = (lengths - self.horizon + 1).clamp(min=1)
@@ -226,7 +225,7 @@ class PretrainingData(pl.LightningDataModule):
         return Batch(states, self._concepts(self.training, rows), observed)
 
     def first_windows(self) -> Batch:
-        """One window from the start of the first demonstration of each training concept, in their order."""
+        """The first window of the first demonstration of each training concept, in order."""
         concepts = self.domain.concepts.training
         rows = torch.tensor([self.training.concepts.index(text) for text in concepts])
         states, observed = self.training.windows(rows, torch.zeros_like(rows), self.horizon)
@@ -245,22 +244,22 @@ class PretrainingData(pl.LightningDataModule):
 
 
 class OwnData(PretrainingData):
-    """Batches of a user's own demonstrations, a file with one concept text for each: the file is the domain.
+    """Batches of user demonstrations; the file, with a concept text per demonstration, defines the domain.
 
-    A plan is as long as the longest demonstration, unless ``horizon`` says otherwise.
+    Plans have the length of the longest demonstration unless ``horizon`` is given.
 
     Args:
         demonstrations: the file (``.npz`` or safetensors), see
             :meth:`ftl_lightning.demonstrations.container.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
             an installed Minari data set.
-        metrics: what plans are judged by, a name and a number each, see :mod:`ftl_lightning.domains.from_file`; empty for nothing.
+        metrics: metrics of plans, number by name, see :mod:`ftl_lightning.domains.from_file`; empty for none.
         validation_share: share of each concept's demonstrations that is held out, at least one.
         seed, batch_size, steps_per_epoch, encoder, revision: see :class:`PretrainingData`; the default encoder is ``'minilm'``
             where it is installed, else ``'hashing'``.
         horizon, start_exponent: see :class:`Windows`.
 
     Raises:
-        UserError: for a value out of its range, or a file that holds no such demonstrations.
+        UserError: for a value out of range, or an invalid file.
     """
 
     def __init__(
@@ -278,7 +277,7 @@ class OwnData(PretrainingData):
     ) -> None:
         if not 0 < validation_share < 1:
             raise UserError(f"data.validation_share: expected a share between 0 and 1, found {validation_share}")
-        self._file, self._share, self._metrics, self._asked = demonstrations, validation_share, dict(metrics or {}), horizon
+        self._file, self._share, self._metrics, self._horizon = demonstrations, validation_share, dict(metrics or {}), horizon
         super().__init__(
             domain=OWN,
             seed=seed,
@@ -293,30 +292,29 @@ class OwnData(PretrainingData):
         self.metrics = self._metrics
 
     def _domain(self, name: str) -> tuple[str, Domain]:
-        return OWN, domain_from_file(self._file, self._asked, self._metrics, self._share)
+        return OWN, domain_from_file(self._file, self._horizon, self._metrics, self._share)
 
     @property
     def examples(self) -> Demonstrations:
-        """The demonstrations that are held out."""
+        """Held-out demonstrations."""
         return self.validation
 
 
 class InversionData(pl.LightningDataModule):
-    """A few demonstrations of each new concept, learned together.
+    """A few demonstrations of each new concept, all learned in the same run.
 
     Args:
-        domain: name of the domain, or ``package.module:DOMAIN``; ``'own'`` for a user's own data.
-        suite: the concepts of this suite of the domain are learned, from demonstrations drawn from the seed.
-        demonstrations: a file of your own instead (safetensors or npz), the folder of a LeRobot data set, or the name of an
-            installed Minari data set. Its concept texts name the concepts to learn; demonstrations without a text belong to one
-            concept named after the file.
-        demonstrations_per_concept: how many are drawn; the paper's number is 5.
-        seed: decides the demonstrations that are drawn.
-        steps: gradient steps, which is the length of the one epoch.
+        domain: name of the domain, or ``package.module:DOMAIN``; ``'own'`` for user data.
+        suite: suite of the domain whose concepts are learned, from demonstrations drawn with the seed.
+        demonstrations: file used instead (safetensors or npz), folder of a LeRobot data set, or name of an installed Minari data
+            set. Its concept texts name the concepts to learn; demonstrations without a text form a concept named after the file.
+        demonstrations_per_concept: number drawn per concept; 5 in the paper.
+        seed: seed of the drawn demonstrations.
+        steps: gradient steps, all in a single epoch.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
 
     Raises:
-        UserError: for a value that is none, or a file that does not fit the domain.
+        UserError: for an invalid value, or a file that does not fit the domain.
     """
 
     def __init__(
@@ -332,8 +330,8 @@ class InversionData(pl.LightningDataModule):
         super().__init__()
         self.save_hyperparameters()
         if steps < 1 or demonstrations_per_concept < 1:
-            found = f"{steps} and {demonstrations_per_concept}"
-            raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {found}")
+            given = f"{steps} and {demonstrations_per_concept}"
+            raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {given}")
         expect_count("data.steps", steps, 1, LARGEST_STEP)
         expect_count("data.demonstrations_per_concept", demonstrations_per_concept, 1, MOST_TOGETHER)
         expect_range("data.seed", seed, 0)
@@ -370,7 +368,7 @@ class InversionData(pl.LightningDataModule):
 
 
 def shares(demonstrations: Demonstrations, balance: float) -> Tensor:
-    """How often each demonstration is drawn ``(demo,)``, see ``balance`` of :class:`Windows`; they sum to 1."""
+    """Sampling probability of each demonstration ``(demo,)``, see ``balance`` of :class:`Windows`."""
     lengths = demonstrations.lengths.double()
     texts = {text: number for number, text in enumerate(dict.fromkeys(demonstrations.concepts))}
     concepts = torch.tensor([texts[text] for text in demonstrations.concepts])

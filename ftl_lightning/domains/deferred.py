@@ -1,4 +1,4 @@
-"""Functions that are imported when they are called."""
+"""Functions imported when called."""
 
 import importlib
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def deferred(reference: str) -> Callable[..., Any]:
-    """A function that is imported when it is called first, such as one that draws: matplotlib takes half a second to import.
+    """Function imported at its first call, such as a plot: importing matplotlib takes half a second.
 
     Args:
         reference: ``'package.module:function'``.

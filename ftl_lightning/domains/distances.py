@@ -1,4 +1,4 @@
-"""How far two behaviours are apart: what novelty and coverage are measured by."""
+"""Distances between behaviours, for novelty and coverage."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 Distance = Callable[[Tensor, Tensor], Tensor]
-"""``(states (a, horizon, state), others (b, horizon, state)) -> (a, b)``: 0 for the same behaviour, the same both ways round."""
+"""``(states (a, horizon, state), others (b, horizon, state)) -> (a, b)``: symmetric, 0 for the same behaviour."""
 
 
 def path_distance(paths: Tensor, others: Tensor) -> Tensor:
@@ -19,19 +19,19 @@ def path_distance(paths: Tensor, others: Tensor) -> Tensor:
     Returns:
         ``(a, b)``.
     """
-    # Differences, not products: a path is at distance 0 of itself, to the digit.
+    # Differences, not products: the distance of a path to itself is exactly 0.
     between = torch.cdist(paths.flatten(1), others.flatten(1), compute_mode="donot_use_mm_for_euclid_dist")
     return between / paths.shape[1] ** 0.5
 
 
 def scaled_distance(real: Tensor, resolution: float = 0.0) -> Distance:
-    """:func:`path_distance` in columns of standard deviation 1: what is known of behaviour of which nothing is known.
+    """Generic distance: :func:`path_distance` of columns scaled to standard deviation 1.
 
-    Scales are those of real behaviour, never of what is generated: a method that generates widely must not seem close for it.
+    Scales are of real behaviour, not of samples: widely spread samples must not seem close.
 
     Args:
         real: behaviour ``(n, time, state)`` of the task.
-        resolution: columns that vary by less are left as they are.
+        resolution: columns that vary by less are not scaled.
     """
     spread = real.flatten(0, 1).std(dim=0, correction=0)
     spread = torch.where(spread > resolution, spread, 1)

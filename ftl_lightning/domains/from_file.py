@@ -1,24 +1,24 @@
-"""A user's own behaviour, without code: a file of demonstrations with a text for each is a domain.
+"""User data as a domain, without code: a file of demonstrations with a concept text for each.
 
-Its training concepts are the texts, in the order in which they first appear. Plans are as long as the longest demonstration, or as
-``horizon`` says. What it is judged by is named in a configuration, a name and a number each:
+The training concepts are the texts in order of first appearance. Plans have the length of the longest demonstration, or of
+``horizon``. The configuration lists metrics, a name and a number each:
 
 ``recognised: P``
-    right if, of all concepts with demonstrations, the goal is the likeliest, and the plan is as typical of it as a share P of real
-    demonstrations is: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
+    right if the goal is the likeliest of all concepts with demonstrations, and the plan is as typical of it as a share P of real
+    demonstrations: in place, size, shape and roughness, see :mod:`ftl_lightning.domains.recognition`.
 ``nearest_demonstration: K``
     right if most of the K demonstrations nearest to the plan (dynamic time warping, columns scaled alike) are of the goal.
 ``nearest_shape: K``
-    right if most of the K demonstrations nearest in shape are of the goal: by Euclidean distance after place (the mean of each
-    column) and size (root mean square) are taken away. For behaviour that may be anywhere and of any size, such as pen strokes.
+    right if most of the K demonstrations nearest in shape are of the goal: Euclidean distance after removing place (mean of each
+    column) and size (root mean square). For behaviour at any place and size, such as pen strokes.
 ``end_point_within: R``
     right if the plan ends within R (Euclidean, in the file's units) of where a demonstration of the goal ends.
 ``dtw_within: R``
-    right if the mean distance a step to the nearest demonstration of the goal, after dynamic time warping, is at most R.
+    right if the mean distance per step to the nearest demonstration of the goal, after dynamic time warping, is at most R.
 ``dtw_to_demonstrations: 1``
-    that distance itself; less is better. The number does not matter.
+    this distance itself; less is better. The number does not matter.
 
-Demonstrations that plans are compared with are held out from training; of a new concept, those that it was learned from.
+Plans are compared with held-out demonstrations; for a new concept, with the demonstrations it was learned from.
 """
 
 import math
@@ -39,38 +39,38 @@ from ftl_lightning.errors import UserError, about, short
 from ftl_lightning.seeding import generator
 
 OWN = "own"
-"""Name of the domain that a user's own file is."""
+"""Name of the domain of user data."""
 
 
 @dataclass(frozen=True)
 class FileSource:
-    """Demonstrations of a file.
+    """Source that splits the demonstrations of a file.
 
     Attributes:
-        demonstrations: all of them.
-        held_out: which of them are for validation, ``(demo,)`` of bool.
+        demonstrations: all demonstrations.
+        held_out: mask of the validation split, ``(demo,)`` of bool.
     """
 
     demonstrations: Demonstrations
     held_out: Tensor
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """All that are of it: how many there are is the file's matter, and so ``count`` and ``seed`` do not matter."""
+        """All demonstrations of a split; ``count`` and ``seed`` are ignored."""
         wanted = self.held_out if name == "validation" else ~self.held_out
         return self.demonstrations.rows(wanted.nonzero()[:, 0].tolist())
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        """The first of a concept.
+        """The first ``count`` demonstrations of a concept.
 
         Raises:
             UserError: if there are fewer.
         """
-        own = self.demonstrations.select(task) if task in self.demonstrations.concepts else None
-        if own is None or len(own) < count:
+        known = self.demonstrations.select(task) if task in self.demonstrations.concepts else None
+        if known is None or len(known) < count:
             raise UserError(
-                f"task: expected {count} demonstrations of {task!r} in the file, found {0 if own is None else len(own)}"
+                f"task: expected {count} demonstrations of {task!r} in the file, found {0 if known is None else len(known)}"
             )
-        return own.rows(list(range(count)))
+        return known.rows(list(range(count)))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates | None:
         """Initial states of held-out demonstrations, drawn with replacement."""
@@ -87,17 +87,17 @@ def own_domain(
     metrics: Mapping[str, float],
     source: FileSource | None = None,
 ) -> Domain:
-    """The domain of a user's own behaviour.
+    """Domain of user data.
 
     Args:
-        examples: demonstrations that plans are compared with, at least one of each concept that is judged.
+        examples: demonstrations that plans are compared with, at least one of each evaluated concept.
         training: training concepts.
         horizon: states in a plan.
         metrics: names and numbers, see this module.
-        source: of demonstrations; ``None`` for the examples.
+        source: source of demonstrations; ``None`` for the examples.
 
     Raises:
-        UserError: for a metric that is none.
+        UserError: for an unknown metric.
     """
     if unknown := set(metrics) - set(METRICS):
         raise UserError(f"data.metrics: expected some of {', '.join(METRICS)}, found {', '.join(sorted(unknown))}")
@@ -115,56 +115,56 @@ def own_domain(
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
         headline=next(iter(metrics), ""),
         distance=partial(_warped, examples),
-        fresh=False,  # there is no more behaviour than the file's
+        fresh=False,  # the file is all there is
         recorder=drawn_by_hand(examples, horizon),
     )
 
 
 def domain_from_file(path: str, horizon: int | None, metrics: Mapping[str, float], share: float) -> Domain:
-    """The domain that a file is.
+    """Domain of a file.
 
     Args:
         path: the file, the folder of a LeRobot data set, or the name of an installed Minari data set.
-        horizon: states in a plan; ``None`` for the longest demonstration's.
+        horizon: states in a plan; ``None`` for the length of the longest demonstration.
         metrics: see :func:`own_domain`.
-        share: of each concept's demonstrations that is held out, at least one.
+        share: share of each concept's demonstrations to hold out, at least one.
 
     Raises:
         UserError: naming the file, if it has no texts, fewer than two concepts, or a concept with a single demonstration.
     """
-    found = read_own(path)
-    training = tuple(dict.fromkeys(found.concepts))
+    demonstrations = read_own(path)
+    training = tuple(dict.fromkeys(demonstrations.concepts))
     if len(training) < 2:
         raise UserError(f"{path}: key 'concepts': expected texts of two concepts or more to pretrain on, found {len(training)}")
-    held_out = torch.zeros(len(found), dtype=torch.bool)
+    held_out = torch.zeros(len(demonstrations), dtype=torch.bool)
     for text in training:
-        rows = [row for row, own in enumerate(found.concepts) if own == text]
+        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
         if len(rows) < 2:
             raise UserError(f"{path}: concept {text!r}: expected two demonstrations or more (one is held out), found 1")
         held_out[rows[-max(1, math.floor(share * len(rows))) :]] = True
-    source = FileSource(found, held_out)
-    longest = int(found.lengths.max())
+    source = FileSource(demonstrations, held_out)
+    longest = int(demonstrations.lengths.max())
     return own_domain(source.split("validation", 0, 0), training, horizon or longest, metrics, source)
 
 
 def read_own(path: str) -> Demonstrations:
-    """A file of one's own behaviour; demonstrations without a text are named after the file.
+    """Read user data; demonstrations without a text are named after the file.
 
     Args:
         path: ``.npz`` or safetensors, the folder of a LeRobot data set, or the name of an installed Minari data set such as
             ``strokes/test-v0``.
 
     Raises:
-        UserError: naming it, if it is missing or damaged.
+        UserError: naming the file, if it is missing or damaged.
     """
     return Demonstrations.load(path).named(Path(path).stem)
 
 
 def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
-    """A file or data set of a domain's demonstrations; those without a text are named after it.
+    """Read demonstrations of a domain; those without a text are named after the file or data set.
 
     Raises:
-        UserError: naming it, if it does not fit the domain.
+        UserError: naming the file, if it does not fit the domain.
     """
     demonstrations = read_own(path)
     columns = len(domain.plans.columns)
@@ -177,27 +177,27 @@ def read_demonstrations(path: str, domain: Domain) -> Demonstrations:
 
 
 def _scaled(examples: Demonstrations, states: Tensor) -> tuple[Tensor, Tensor]:
-    """Examples and states with columns of standard deviation 1 over the examples; constant ones are left as they are."""
+    """Scale columns to standard deviation 1 over the examples; constant columns stay unscaled."""
     spread = examples.states.flatten(0, 1).std(dim=0)
     spread = torch.where(spread > 0, spread, 1)
     return examples.states / spread, states / spread
 
 
 def warped_distances(states: Tensor, lengths: Tensor, others: Tensor, other_lengths: Tensor) -> Tensor:
-    """Mean distance a step after dynamic time warping (Sakoe & Chiba, 1978).
+    """Mean distance per step after dynamic time warping (Sakoe & Chiba, 1978).
 
     Args:
         states: ``(n, time, state)``.
-        lengths: ``(n,)``, of each.
+        lengths: ``(n,)``.
         others: ``(m, other time, state)``.
         other_lengths: ``(m,)``.
 
     Returns:
-        ``(n, m)``: the least sum of Euclidean distances along a warping path, by the longer of both lengths.
+        ``(n, m)``: the minimum sum of Euclidean distances along a warping path, divided by the longer length.
     """
     total = []
-    for one, length in zip(states, lengths.tolist(), strict=True):
-        cost = torch.cdist(one[None, :length].expand(len(others), -1, -1), others)  # (m, length, other time)
+    for path, length in zip(states, lengths.tolist(), strict=True):
+        cost = torch.cdist(path[None, :length].expand(len(others), -1, -1), others)  # (m, length, other time)
         far = torch.full((len(others),), math.inf)
         before = torch.full((len(others), cost.shape[2] + 1), math.inf)
         before[:, 0] = 0
@@ -216,11 +216,11 @@ def _whole(states: Tensor) -> Tensor:
 
 
 def _warped(examples: Demonstrations, states: Tensor, others: Tensor) -> Tensor:
-    """:func:`warped_distances` ``(a, b)`` of whole plans, columns scaled alike: what :func:`_nearest_demonstration` compares."""
-    (_, one), (_, other) = (_scaled(examples, each) for each in (states, others))
-    if len(other) < len(one):  # the rounds are those of the fewer
-        return warped_distances(other, _whole(other), one, _whole(one)).T
-    return warped_distances(one, _whole(one), other, _whole(other))
+    """:func:`warped_distances` ``(a, b)`` of whole plans, columns scaled as in :func:`_nearest_demonstration`."""
+    (_, rows), (_, columns) = (_scaled(examples, each) for each in (states, others))
+    if len(columns) < len(rows):  # loop over the smaller set
+        return warped_distances(columns, _whole(columns), rows, _whole(rows)).T
+    return warped_distances(rows, _whole(rows), columns, _whole(columns))
 
 
 def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:
@@ -233,7 +233,7 @@ def _goal_rows(examples: Demonstrations, goal: str) -> list[int]:
 def _recognised(examples: Demonstrations, horizon: int, number: float) -> Metric:
     if not 0 < number <= 1:
         raise UserError(f"data.metrics.recognised: expected a share of real demonstrations above 0, at most 1, found {number:g}")
-    known = cache(lambda: Recognition(examples, horizon, number))  # only where something is judged
+    known = cache(lambda: Recognition(examples, horizon, number))  # fitted on first use
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
         _goal_rows(examples, goal)
@@ -250,9 +250,9 @@ def _nearest_demonstration(examples: Demonstrations, horizon: int, number: float
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
         known, scaled = _scaled(examples, states)
         near = warped_distances(scaled, _whole(states), known[:, :horizon], examples.lengths.clamp(max=horizon))
-        own = torch.zeros(len(examples), dtype=torch.bool)
-        own[_goal_rows(examples, goal)] = True
-        return own[near.topk(min(count, len(examples)), largest=False).indices].float().mean(dim=1) > 0.5
+        of_goal = torch.zeros(len(examples), dtype=torch.bool)
+        of_goal[_goal_rows(examples, goal)] = True
+        return of_goal[near.topk(min(count, len(examples)), largest=False).indices].float().mean(dim=1) > 0.5
 
     return Metric(measure, identity=examples.hash)
 
@@ -265,16 +265,16 @@ def _nearest_shape(examples: Demonstrations, horizon: int, number: float) -> Met
     known = _shapes(examples.states[:, times])
 
     def measure(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-        own = torch.zeros(len(examples), dtype=torch.bool)
-        own[_goal_rows(examples, goal)] = True
+        of_goal = torch.zeros(len(examples), dtype=torch.bool)
+        of_goal[_goal_rows(examples, goal)] = True
         near = torch.cdist(_shapes(states), known).topk(min(count, len(examples)), largest=False).indices
-        return own[near].float().mean(dim=1) > 0.5
+        return of_goal[near].float().mean(dim=1) > 0.5
 
     return Metric(measure, identity=examples.hash)
 
 
 def _shapes(states: Tensor) -> Tensor:
-    """Behaviour ``(n, time, state)`` without its place and size, ``(n, time * state)``."""
+    """Remove place and size of behaviour ``(n, time, state)``: ``(n, time * state)``."""
     moved = states - states.mean(dim=1, keepdim=True)
     return (moved / moved.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp(min=1e-9)).flatten(1)
 

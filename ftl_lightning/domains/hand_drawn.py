@@ -1,4 +1,4 @@
-"""Lines drawn by hand, for behaviour of two columns of which nothing else is known."""
+"""Lines drawn by hand, for generic behaviour of two columns."""
 
 import numpy as np
 import torch
@@ -10,20 +10,20 @@ from ftl_lightning.domains.vector_film import VectorFilm, still
 from ftl_lightning.errors import UserError
 
 MARGIN = 0.15
-"""Of the window around what the examples cover, as a share of this."""
+"""Margin of the window around the examples, relative to their extent."""
 SHORTEST = 0.02
-"""Length of a line, as a share of the window's width, below which it is taken for a slip of the hand."""
+"""Minimum length of a line, relative to the window's width."""
 PIXEL = 1 / 400
-"""Of the window's width, about: the grid of a screen, against which lines are smoothed and no more."""
+"""Approximate size of a screen pixel relative to the window's width; scale of smoothing."""
 FRAME = "#dfe3e8"
 
 
 def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
-    """How a person draws behaviour like the examples; ``None`` where it is no line in a plane.
+    """Recorder of drawn lines; ``None`` if behaviour is not a line in a plane.
 
     Args:
-        examples: demonstrations of the model's behaviour, in whose range is drawn.
-        horizon: states of a plan, and of what is drawn.
+        examples: demonstrations, which determine the window.
+        horizon: states of a plan and of a drawn line.
     """
     if examples.states.shape[2] != 2 or horizon < 2 or examples.observed:
         return None
@@ -41,8 +41,7 @@ def drawn_by_hand(examples: Demonstrations, horizon: int) -> Recorder | None:
             raise UserError(
                 f"line: expected one longer than {SHORTEST:.0%} of the window, found {length / width:.1%}; draw it again"
             )
-        # Even steps along the line, not even steps of time: how fast a hand is, and where it rests, is an accident of the hand, and
-        # states would pile up where it rests.
+        # Even steps along the line, not in time: the speed of the hand is accidental, and states would accumulate at pauses.
         states = at_even_steps(smoothed(line, PIXEL * width), horizon)
         return Demonstrations(
             states=torch.from_numpy(states).float()[None],

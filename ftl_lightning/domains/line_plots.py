@@ -1,4 +1,4 @@
-"""Pictures and films of behaviour known by its columns alone: paths in two or three dimensions, or lines over time."""
+"""Generic pictures and films of behaviour: paths in two or three dimensions, or lines over time."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +13,7 @@ from ftl_lightning.demonstrations.features import InitialStates
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
 from ftl_lightning.escape import figure_text
 
-if TYPE_CHECKING:  # half a second of import, for what is drawn later
+if TYPE_CHECKING:  # importing matplotlib takes half a second
     from matplotlib.figure import Figure
 
 MAX_COLUMNS = 8
@@ -22,7 +22,7 @@ PATH, START, PLAIN, RIGHT, WRONG = "#3f6fb5", "#e4704a", "#8a8a8a", "#2e9e46", "
 
 
 def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, str, InitialStates | None], "Figure"]:
-    """A renderer of plans with these columns, see :class:`ftl_lightning.domains.domain.Show`."""
+    """Renderer of plans with these columns, see :class:`ftl_lightning.domains.domain.Show`."""
 
     def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> "Figure":
         return _drawn(names, {"": states}, {"": right}, title)
@@ -31,7 +31,7 @@ def picture(names: Sequence[str]) -> Callable[[Tensor, Sequence[bool] | None, st
 
 
 def beside(names: Sequence[str]) -> Callable[[Tensor, Tensor, str, Sequence[bool] | None], "Figure"]:
-    """A renderer of demonstrations above samples on one scale, see :class:`ftl_lightning.domains.domain.Show`."""
+    """Renderer of demonstrations above samples on a shared scale, see :class:`ftl_lightning.domains.domain.Show`."""
 
     def render(demonstrations: Tensor, samples: Tensor, title: str, right: Sequence[bool] | None) -> "Figure":
         return _drawn(names, {"demonstrations": demonstrations, "samples": samples}, {"samples": right}, title)
@@ -40,13 +40,13 @@ def beside(names: Sequence[str]) -> Callable[[Tensor, Tensor, str, Sequence[bool
 
 
 def _drawn(names: Sequence[str], groups: Mapping[str, Tensor], right: Mapping[str, Sequence[bool] | None], title: str) -> "Figure":
-    """Plans on one scale, those of each group from a new row on.
+    """Draw groups of plans on a shared scale, each from a new row.
 
     Args:
-        names: of columns.
-        groups: plans ``(plan, time, state)`` by what stands beside their first row.
-        right: whether each plan of a group is right; none or ``None`` for a group that is not judged.
-        title: of the figure.
+        names: names of columns.
+        groups: plans ``(plan, time, state)`` by label of the group.
+        right: whether each plan of a group is right; missing or ``None`` if not judged.
+        title: title of the figure.
     """
     from matplotlib.figure import Figure
 
@@ -71,12 +71,12 @@ def _drawn(names: Sequence[str], groups: Mapping[str, Tensor], right: Mapping[st
                 axes.plot(*plan[:1].T, "o", color=START, markersize=3)
                 axes.set(**_limits(low, high), box_aspect=None if spatial else 1)
             else:
-                axes.set_ylim(_room(min(low), max(high)))  # one scale for all
+                axes.set_ylim(_room(min(low), max(high)))  # shared scale
                 for column, label in enumerate(names):
                     axes.plot(plan[:, column], ".-" if len(plan) == 1 else "-", linewidth=1, label=figure_text(label))
             lines = states.shape[2] not in (2, 3) or states.shape[1] == 1
             axes.set(xticks=[])
-            if not lines or axes is not figure.axes[0]:  # the first panel tells the scale
+            if not lines or axes is not figure.axes[0]:  # the first panel shows the scale
                 axes.set(yticks=[])
             for spine in axes.spines.values():
                 spine.set(color=colour, linewidth=2.0)
@@ -96,14 +96,14 @@ def _room(low: float, high: float) -> tuple[float, float]:
 
 
 def _limits(low: Sequence[float], high: Sequence[float]) -> dict[str, tuple[float, float]]:
-    """Limits of the axes, equally long around what is shown, so that a circle is round."""
+    """Axis limits of equal length, so that circles are round."""
     half = 0.55 * max([b - a for a, b in zip(low, high, strict=True)] + [1e-6])
     middles = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     return {f"{axis}lim": (middle - half, middle + half) for axis, middle in zip("xyz", middles, strict=False)}
 
 
 def film(states: Tensor) -> list[NDArray[np.uint8]]:
-    """Frames ``(height, width, 3)`` of one plan ``(horizon, 2 or 3)`` as it is drawn, at most :data:`MAX_FRAMES`."""
+    """Film a plan ``(horizon, 2 or 3)``: at most :data:`MAX_FRAMES` frames ``(height, width, 3)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -127,12 +127,12 @@ def film(states: Tensor) -> list[NDArray[np.uint8]]:
 
 
 SECONDS = 3.0
-"""A film of a plan takes, whatever a step of it means."""
+"""Duration of a film of a plan."""
 COLOURS = ("#3f6fb5", "#e4704a", "#4c9f70", "#8a63b3", "#c9a227", "#5b5b5b")
 
 
 def path_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """A path ``(horizon, 2)`` that is drawn step by step."""
+    """Film of a path ``(horizon, 2)``, drawn step by step."""
     plan = states.numpy().astype(np.float32)
     limits = _limits(plan.min(axis=0).tolist(), plan.max(axis=0).tolist())
     (left, right), (low, high) = limits["xlim"], limits["ylim"]
@@ -147,7 +147,7 @@ def path_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
 
 
 def line_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """Columns over time ``(horizon, state)``, all on one scale from 0 to 1, drawn step by step."""
+    """Film of columns over time ``(horizon, state)`` on a shared scale from 0 to 1, drawn step by step."""
     plan = states.numpy().astype(np.float32)
     low, high = _room(float(plan.min()), float(plan.max()))
     times = some(len(plan), MAX_FRAMES)

@@ -1,26 +1,25 @@
-"""Names of methods and of their forms, and numbers that a paper reports, to be shown beside ours."""
+"""Names of methods and forms, and numbers reported by a paper."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 OURS = "FTL-IGM"
-"""The name of the paper's method."""
+"""Name of the paper's method."""
 FINE_TUNED = "LoRA fine-tuning"
-"""Learning a concept with an adapter that changes the whole network: what ours is compared with."""
+"""Baseline: learning a concept with an adapter of the whole network."""
 WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN = "with modes", "over time", "with adapter", "form chosen"
-"""Forms of a method whose concepts have modes, several knots or an adapter, which the paper's have not, or whichever of these the
-demonstrations ask for."""
+"""Forms of a method beyond the paper: concepts with modes, several knots or an adapter, or the form selected by leave-one-out."""
 FORMS = (WITH_MODES, WITH_KNOTS, WITH_ADAPTER, CHOSEN)
-"""In the order in which several are joined, by one space: ``'with modes over time'``."""
+"""Order in which forms are joined by a space: ``'with modes over time'``."""
 
 
 class Compared(NamedTuple):
-    """A method in one of its forms, which tables compare with others.
+    """Method and form, as compared in tables.
 
     Attributes:
         name: such as ``'FTL-IGM'`` or ``'BC'``.
-        form: how its concepts are otherwise than in one set of embeddings that is alike at all times, the paper's form: some of
-            :data:`FORMS`, or a method's own words; empty for the paper's.
+        form: form of its concepts: some of :data:`FORMS`, or the method's description; empty for the paper's form, a single set of
+            embeddings that is constant over time.
     """
 
     name: str
@@ -28,7 +27,7 @@ class Compared(NamedTuple):
 
 
 PAPERS_METHOD = Compared(OURS)
-"""Ours as the paper has it."""
+"""Our method in the paper's form."""
 
 
 @dataclass(frozen=True)

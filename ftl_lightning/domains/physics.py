@@ -1,4 +1,4 @@
-"""pybullet, the physics of several domains."""
+"""pybullet, the physics simulator of several domains."""
 
 import functools
 import importlib
@@ -8,7 +8,7 @@ from typing import Any
 
 @functools.cache
 def pybullet() -> Any:
-    """The simulator's module, imported when it is asked for first, without the line that this writes to standard error."""
+    """Import pybullet on first use, without the line it writes to standard error."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
@@ -20,9 +20,9 @@ def pybullet() -> Any:
 
 
 class Simulator:
-    """pybullet's functions, each for one simulator of its own without a display.
+    """pybullet's functions, bound to a separate simulator without a display.
 
-    pybullet's own class for that prints a line for every simulator.
+    pybullet's class for this purpose prints a line per simulator.
     """
 
     def __init__(self) -> None:

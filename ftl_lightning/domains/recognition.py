@@ -1,16 +1,16 @@
-"""Recognising behaviour by examples alone: whether a plan is of a concept, and as typical of it as real behaviour.
+"""Recognition by examples: whether a plan belongs to a concept and is as typical of it as real behaviour.
 
-A plan is described by its place (mean over time of each column), its size (root mean square about that), its shape (what is left,
-as coefficients of the discrete cosine transform over time) and its roughness (mean squared second difference over time); columns
-are first brought on one scale. A single state has a size and a shape, its columns.
+Features of a plan, after columns are scaled alike: place (mean over time of each column), size (root mean square about the place),
+shape (the normalised rest, as coefficients of the discrete cosine transform over time) and roughness (mean squared second
+difference over time). A single state has only a size and a shape, its columns.
 
-A concept is a Gaussian of place, size and shape (regularised discriminant analysis; Friedman, 1989). Variances are those within all
-concepts, drawn towards the concept's own the more examples it has. Directions in which its own examples differ from one another,
-such as the size of a part or pace, are known from these. The likeliest concept is what a plan is of.
+A concept is a Gaussian over place, size and shape (regularised discriminant analysis; Friedman, 1989). Its variances are pooled
+over concepts and move towards the concept's variances as its examples increase. Directions in which its examples vary, such as
+pace, enter its covariance. A plan belongs to the likeliest concept.
 
-How far from its concept real behaviour may be is measured by leaving examples out, with as many examples as the concept has: five
-cover less of it than twenty. Only too much roughness counts, smooth plans are right. Where no concept has two examples, nothing is
-known of how real behaviour varies: then the likeliest concept decides, and roughness.
+The largest distance of real behaviour from its concept is estimated by leave-one-out, with as many examples as the concept has:
+few examples cover less of a concept. Only excess roughness counts. If no concept has two examples, only the likeliest concept and
+the roughness decide.
 """
 
 import math
@@ -26,40 +26,40 @@ from ftl_lightning.diffusion.spectrum import cosines
 from ftl_lightning.seeding import generator
 
 STILL = 0.05
-"""Behaviour that moves by less than this share of what examples move by counts as still: it has no shape."""
+"""Size, relative to the examples', below which behaviour counts as still and has no shape."""
 VARIANCE = 4e-4
-"""Least variance of a place or size, in a column's spread: a fiftieth of it is no difference."""
+"""Minimum variance of a place or size, in squared spreads of a column: a standard deviation of 1/50."""
 EVEN = 0.1
-"""Share of the mean variance that every coefficient of a shape has at least."""
+"""Minimum variance of a shape coefficient, relative to the mean variance."""
 SHAPE_VARIANCE = 1e-4
-"""Least variance of a whole shape, which is of root mean square 1."""
+"""Minimum variance of a whole shape, whose root mean square is 1."""
 ROUGHNESS = 4e-4
-"""Mean squared second difference, in a column's spread, that counts as smooth."""
+"""Mean squared second difference that counts as smooth, in squared spreads of a column."""
 PRIOR = 10.0
-"""How many examples the variances of places and sizes within all concepts count for beside a concept's own."""
+"""Weight, in examples, of the pooled variances of places and sizes."""
 SHAPE_PRIOR = 5.0
-"""The same of shapes."""
+"""Weight, in examples, of the pooled variances of shapes."""
 RESTING = 0.25
-"""Deviation from the last state after behaviour has ended that counts as rest, in a column's spread."""
+"""Deviation from the last state after the end that counts as rest, in spreads of a column."""
 ENDS = 8
-"""Lengths that behaviour may have, of plans that are longer than some examples."""
+"""Maximum number of candidate lengths of a plan."""
 LEFT_OUT = 200
-"""Examples that are left out at most."""
+"""Maximum number of examples for leave-one-out."""
 FEW = 1.0
-"""Limits grow by this over the number of concepts that examples were left out of: few say little about how concepts differ."""
+"""Relative increase of limits, divided by the number of concepts in leave-one-out: few concepts give uncertain limits."""
 ROUGHER = 2.0
-"""Root mean square roughness over the example's where no concept has two examples."""
+"""Limit of the roughness relative to the example's (root mean square) if no concept has two examples."""
 
 
 @dataclass(frozen=True)
 class _Features:
-    """What behaviour is described by.
+    """Features of behaviour.
 
     Attributes:
-        position: ``(n, columns + 1)``, places in columns' spreads and the logarithm of the size; of single states the size alone.
+        position: ``(n, columns + 1)``, place in spreads of the columns and logarithm of the size; for single states only the size.
         shape: ``(n, coefficient)``.
         roughness: ``(n, columns)``.
-        rest: ``(n,)``, root mean square deviation from the last state after the end, in columns' spreads.
+        rest: ``(n,)``, root mean square deviation from the last state after the end, in spreads of the columns.
     """
 
     position: Tensor
@@ -74,7 +74,7 @@ class _Features:
 
 @dataclass(frozen=True)
 class _Within:
-    """Sums of squared deviations from their concepts' means, of positions and shapes, and of how many examples beyond these."""
+    """Sums of squared deviations of positions and shapes from concept means, and their degrees of freedom."""
 
     position: Tensor
     shape: Tensor
@@ -94,15 +94,15 @@ class _Within:
 
 @dataclass(frozen=True)
 class _Concept:
-    """A Gaussian of behaviour.
+    """Gaussian model of a concept.
 
     Attributes:
         position, variance: mean and predictive variance of positions.
-        shape: mean.
-        precision: of shapes, without what ``inverse`` takes off: ``(coefficient,)``.
-        loadings, inverse: ``(k, coefficient)`` and ``(k, k)``, the directions in which examples differ (Woodbury's identity).
-        volume: logarithm of the determinant of both covariances, as if means were known: else concepts of many examples would be
-            favoured, as coefficients of a shape vary together.
+        shape: mean of shapes.
+        precision: diagonal part of the shapes' precision ``(coefficient,)``.
+        loadings, inverse: low-rank part ``(k, coefficient)`` and ``(k, k)``, directions of variation (Woodbury's identity).
+        volume: log-determinant of both covariances, for known means: otherwise concepts with many examples would be favoured, as
+            coefficients of a shape are correlated.
         roughness: ``(columns,)``.
     """
 
@@ -117,15 +117,15 @@ class _Concept:
 
     @classmethod
     def of(cls, known: _Features, within: _Within) -> "_Concept":
-        """From some of its examples, and what varies within concepts."""
+        """Fit to examples of the concept, given the pooled scatter."""
         count, coefficients = known.shape.shape
-        own, wider = _Within.of(known), 1 + 1 / count  # the mean is not known better
+        scatter, wider = _Within.of(known), 1 + 1 / count  # uncertainty of the mean
         common = within.position / max(within.freedom, 1)
-        variance = ((own.position + PRIOR * common) / (count - 1 + PRIOR)).clamp(min=VARIANCE)
+        variance = ((scatter.position + PRIOR * common) / (count - 1 + PRIOR)).clamp(min=VARIANCE)
         even = within.shape / max(within.freedom, 1)
         even = even + EVEN * even.mean() + SHAPE_VARIANCE / coefficients
         weight = 1 / (count - 1 + SHAPE_PRIOR)
-        scale = weight * (own.shape.sum() / even.sum() + SHAPE_PRIOR)  # a concept may vary more or less than others do
+        scale = weight * (scatter.shape.sum() / even.sum() + SHAPE_PRIOR)  # variation relative to all concepts
         diagonal = even * scale * SHAPE_PRIOR * weight
         loadings = (known.shape - known.shape.mean(dim=0)) * math.sqrt(weight)
         scaled = loadings / diagonal
@@ -135,31 +135,31 @@ class _Concept:
         inverse = torch.linalg.inv(inner) / wider
         return cls(mean[0], variance * wider, mean[1], 1 / (diagonal * wider), scaled, inverse, float(volume), mean[2])
 
-    def distances(self, found: _Features, resting: float) -> tuple[Tensor, Tensor]:
-        """How unlikely behaviour is ``(n,)``, and how far off in place, size, shape, roughness and rest: ``(n, 5)``, 1 is usual."""
-        far = (found.position - self.position) ** 2 / self.variance
-        apart = found.shape - self.shape
+    def distances(self, features: _Features, resting: float) -> tuple[Tensor, Tensor]:
+        """-2 log-likelihood ``(n,)`` up to a constant; deviations in place, size, shape, roughness and rest ``(n, 5)``, about 1."""
+        far = (features.position - self.position) ** 2 / self.variance
+        apart = features.shape - self.shape
         along = apart @ self.loadings.T
         square = (apart**2 * self.precision).sum(dim=1) - torch.einsum("nk,kl,nl->n", along, self.inverse, along)
         square = square.clamp(min=0)
-        rough = ((found.roughness + ROUGHNESS) / (self.roughness + ROUGHNESS)).mean(dim=1)
+        rough = ((features.roughness + ROUGHNESS) / (self.roughness + ROUGHNESS)).mean(dim=1)
         measured = (
             far[:, :-1].mean(dim=1) if far.shape[1] > 1 else torch.zeros_like(square),
             far[:, -1],
             square / apart.shape[1],
             rough if self.roughness.numel() else torch.ones_like(square),
-            (found.rest / resting) ** 2,
+            (features.rest / resting) ** 2,
         )
         return far.sum(dim=1) + square + self.volume, torch.stack(measured, dim=1).sqrt()
 
 
 class Recognition:
-    """What is known of concepts by their examples.
+    """Classifier of plans, fitted to examples of concepts.
 
     Args:
-        examples: one or more of each concept. Where they are of different lengths, a plan may end where some do, and rests then.
+        examples: one or more per concept. If their lengths differ, a plan may end at one of these lengths and then rests.
         horizon: states in a plan.
-        share: of real behaviour that shall be typical, in (0, 1].
+        share: share of real behaviour to accept as typical, in (0, 1].
     """
 
     def __init__(self, examples: Demonstrations, horizon: int, share: float) -> None:
@@ -181,18 +181,18 @@ class Recognition:
         self.within = {concept: _Within.of(self.known.rows(rows)) for concept, rows in self.rows.items()}
         zero = _Within(torch.zeros(self.known.position.shape[1]), torch.zeros(self.known.shape.shape[1]), 0)
         self.total = zero
-        for own in self.within.values():
-            self.total = self.total.plus(own)
-        if not self.total.freedom:  # nothing is known of how concepts vary: as they differ from one another
+        for within in self.within.values():
+            self.total = self.total.plus(within)
+        if not self.total.freedom:  # single examples: use the variation between concepts
             self.total = _Within.of(self.known)
         self.concepts = {concept: _Concept.of(self.known.rows(rows), self.total) for concept, rows in self.rows.items()}
         self._limits = cache(self._left_out)
 
     def recognised(self, goal: str, states: Tensor) -> Tensor:
-        """Whether plans are of a concept: it is the likeliest of all, and they are typical of it.
+        """Whether a concept is the likeliest for plans and they are typical of it.
 
         Args:
-            goal: the concept, one with examples.
+            goal: a concept with examples.
             states: ``(sample, time, state)``; plans that are not finite are not recognised.
 
         Returns:
@@ -201,37 +201,37 @@ class Recognition:
         finite = states.isfinite().flatten(1).all(dim=1)
         ending = self._ending(self._fitted(torch.where(finite[:, None, None], states, 0)))
         unlikely, far = _nearest_end(self.concepts[goal], ending, self.resting)
-        others = [_nearest_end(one, ending, self.resting)[0] for name, one in self.concepts.items() if name != goal]
+        others = [_nearest_end(concept, ending, self.resting)[0] for name, concept in self.concepts.items() if name != goal]
         likeliest = torch.stack([unlikely, *others]).argmin(dim=0) == 0
         typical = (far <= self._limits(len(self.rows[goal]))).all(dim=1)
         return finite & likeliest & typical
 
     def _left_out(self, count: int) -> Tensor:
-        """How far real behaviour may be from a concept that is known by ``count`` examples: ``(5,)``."""
+        """Limits ``(5,)`` of deviations from a concept with ``count`` examples, by leave-one-out."""
         draw = generator("cpu", count)
         pairs = [(concept, row) for concept, rows in self.rows.items() if len(rows) > 1 for row in rows]
         if not pairs:
             return torch.tensor([math.inf, math.inf, math.inf, ROUGHER, 1], dtype=torch.float64)
-        found = []
+        deviations = []
         for pair in torch.randperm(len(pairs), generator=draw)[:LEFT_OUT].tolist():
             concept, row = pairs[pair]
-            rest = [other for other in self.rows[concept] if other != row]
+            rest = [candidate for candidate in self.rows[concept] if candidate != row]
             chosen = [rest[index] for index in torch.randperm(len(rest), generator=draw)[:count].tolist()]
             within = self.total.plus(self.within[concept], -1).plus(_Within.of(self.known.rows(rest)))
-            one = _Concept.of(self.known.rows(chosen), within if within.freedom else self.total)
-            found.append(_nearest_end(one, [ending.rows([row]) for ending in self.presented], self.resting)[1])
-        far = torch.cat(found)
+            fitted = _Concept.of(self.known.rows(chosen), within if within.freedom else self.total)
+            deviations.append(_nearest_end(fitted, [ending.rows([row]) for ending in self.presented], self.resting)[1])
+        far = torch.cat(deviations)
         limits = far.quantile(self.share, dim=0).clamp(min=1)
-        together = (far / limits).amax(dim=1).quantile(self.share)  # of all five at once
+        together = (far / limits).amax(dim=1).quantile(self.share)  # joint limit of all five
         return (limits * together * (1 + FEW / len({concept for concept, _ in pairs}))).clamp(min=1)
 
     def _fitted(self, states: Tensor) -> Tensor:
-        """As long as plans are, ``(n, horizon, state)``; what is shorter stays where it ends."""
+        """Cut or pad with the last state to ``(n, horizon, state)``."""
         times = torch.arange(self.horizon).clamp(max=states.shape[1] - 1)
         return states[:, times].double()
 
     def _ending(self, states: Tensor) -> list[_Features]:
-        """Features of behaviour, for each end that it may have."""
+        """Features for each candidate length."""
         return [self._features(states, torch.full((len(states),), end)) for end in self.ends]
 
     def _features(self, states: Tensor, lengths: Tensor) -> _Features:
@@ -258,7 +258,7 @@ def _scatter(values: Tensor) -> Tensor:
 
 
 def _spread(states: Tensor, kept: Tensor) -> Tensor:
-    """Scale of each column ``(state,)``: how much it varies within behaviour, else between behaviours, else how large it is."""
+    """Scale of each column ``(state,)``: its variation within behaviour, else between behaviours, else its magnitude."""
     counts = kept.sum(dim=1)[:, None]
     places = (states * kept[..., None]).sum(dim=1) / counts
     moved = ((states - places[:, None]).square() * kept[..., None]).sum(dim=1) / counts
@@ -270,7 +270,7 @@ def _spread(states: Tensor, kept: Tensor) -> Tensor:
 
 
 def _stretched(states: Tensor, lengths: Tensor) -> Tensor:
-    """Behaviour ``(n, time, state)`` of some lengths ``(n,)`` at as many even times from its start to its end."""
+    """Resample behaviour ``(n, time, state)`` from its lengths ``(n,)`` to ``time`` even steps."""
     times = torch.linspace(0, 1, states.shape[1], dtype=states.dtype) * (lengths - 1)[:, None]
     before = times.floor().long()
     after = torch.minimum(before + 1, (lengths - 1)[:, None])
@@ -280,10 +280,10 @@ def _stretched(states: Tensor, lengths: Tensor) -> Tensor:
 
 
 def _nearest_end(concept: _Concept, ending: Sequence[_Features], resting: float) -> tuple[Tensor, Tensor]:
-    """How unlikely behaviour is and how far off, see :meth:`_Concept.distances`, with the end that suits the concept best."""
-    found = [concept.distances(features, resting) for features in ending]
-    unlikely = torch.stack([one for one, _ in found])  # (end, n)
-    far = torch.stack([one for _, one in found])
+    """Results of :meth:`_Concept.distances` at the likeliest end."""
+    distances = [concept.distances(features, resting) for features in ending]
+    unlikely = torch.stack([score for score, _ in distances])  # (end, n)
+    far = torch.stack([deviation for _, deviation in distances])
     best = (unlikely + torch.where(far[..., -1] > 1, 1e30, 0)).argmin(dim=0)
     index = torch.arange(unlikely.shape[1])
     return unlikely[best, index], far[best, index]

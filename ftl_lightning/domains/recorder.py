@@ -1,4 +1,4 @@
-"""How a person shows behaviour with a pointer: what is seen before a demonstration, what moves, and what becomes of it."""
+"""Recording of demonstrations with a pointer: scenes, movable pieces and conversion of paths."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ Kind = Literal["draw", "arrange", "steer"]
 Numbers = NDArray[np.float64]
 
 MOST_STEPS = 20_000
-"""Of a path: more than five minutes at 60 a second."""
+"""Maximum number of steps in a path: more than five minutes at 60 per second."""
 AROUND = 4.0
-"""A path stays within so many widths and heights of the window around it: a hand may leave what is in sight, but not get lost."""
+"""Maximum distance of a path from the window, in widths and heights of the window."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Something that the hand moves.
+    """Movable object of a scene.
 
     Attributes:
-        name: such as ``'circle'``; read aloud by a screen reader.
-        at: where it is before it is moved, x and y in the film's unit.
-        shapes: which of the film's shapes move with it, by their numbers.
+        name: such as ``'circle'``; read aloud by screen readers.
+        at: initial position, x and y in the film's unit.
+        shapes: indices of the film's shapes that move with the piece.
     """
 
     name: str
@@ -39,15 +39,15 @@ class Piece:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a person sees before a demonstration.
+    """Scene shown before a demonstration.
 
     Attributes:
-        film: one frame.
-        pieces: what is moved; none where a line is drawn.
-        speed: the most that a piece moves in a second of the person's time, in the film's unit; 0 for any speed.
-        seconds: the most that a demonstration takes, in the person's time; 0 for any time.
-        starts: of one episode, where behaviour has initial states.
-        state: ``(state,)`` float32, what a domain's ``record`` needs to know of the scene; ``None`` for nothing.
+        film: a single frame.
+        pieces: movable pieces; empty for drawing a line.
+        speed: maximum speed of a piece per second of real time, in the film's unit; 0 for no limit.
+        seconds: maximum duration of a demonstration in real time; 0 for no limit.
+        starts: initial state of an episode, if behaviour has initial states.
+        state: ``(state,)`` float32, data of the scene for the domain's ``record``; ``None`` for none.
     """
 
     film: VectorFilm
@@ -60,17 +60,16 @@ class Scene:
 
 @dataclass(frozen=True)
 class Recorder:
-    """How behaviour of a domain is shown by hand.
+    """Recorder of demonstrations by hand.
 
     Attributes:
-        kind: ``'draw'``, one line, a path ``(step, 1, 2)``; ``'arrange'``, pieces are put where they belong, of which the last
-            places ``(1, piece, 2)`` count; ``'steer'``, the path ``(step, 1, 2)`` of one piece from its place on.
-        hint: one sentence that says what to do.
-        scene: ``(task or '', seed) -> what is seen``; the same two give the same scene.
-        record: ``(scene, path (step, piece, 2) in the film's unit, seconds (step,)) -> one demonstration`` without a text. It
-            raises a :class:`~ftl_lightning.errors.UserError` for a path that shows nothing. What it is given was checked by
-            :func:`expect_path`.
-        tasks: of which scenes can be drawn; empty where scenes are alike.
+        kind: ``'draw'``, a line, as path ``(step, 1, 2)``; ``'arrange'``, placing pieces, where only the last places
+            ``(1, piece, 2)`` count; ``'steer'``, the path ``(step, 1, 2)`` of a piece from its initial place.
+        hint: instruction in a sentence.
+        scene: ``(task or '', seed) -> scene``; deterministic.
+        record: ``(scene, path (step, piece, 2) in the film's unit, seconds (step,)) -> demonstration`` without a text. Raises
+            :class:`~ftl_lightning.errors.UserError` for an unusable path. Arguments are validated by :func:`expect_path`.
+        tasks: tasks with different scenes; empty if scenes do not depend on the task.
     """
 
     kind: Kind
@@ -81,15 +80,15 @@ class Recorder:
 
 
 def expect_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]:
-    """What a person's hand did, checked once, where it comes in.
+    """Validate a recorded path.
 
     Args:
-        scene: that was seen.
-        path: numbers ``(step, piece, 2)`` in the film's unit, as nested lists or an array; one piece where a line is drawn.
-        seconds: ``(step,)``, when the hand was there.
+        scene: scene shown to the user.
+        path: numbers ``(step, piece, 2)`` in the film's unit, as nested lists or an array; a drawn line has a single piece.
+        seconds: time of each step ``(step,)``.
 
     Returns:
-        The same as arrays.
+        Path and times as arrays.
 
     Raises:
         UserError: for anything else, numbers that are not finite, too many steps, places far outside the window, or times that
@@ -116,9 +115,9 @@ def expect_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers
 
 def _numbers(key: str, values: Any) -> Numbers:
     try:
-        found = np.asarray(values)
+        array = np.asarray(values)
     except (TypeError, ValueError):  # lists of different lengths
-        found = np.empty(0, dtype=object)
-    if found.dtype.kind not in "fiu":
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu":
         raise UserError(f"{key}: expected numbers in lists of equal lengths, found {shown(values)}")
-    return found.astype(np.float64)
+    return array.astype(np.float64)

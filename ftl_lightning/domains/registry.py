@@ -1,4 +1,4 @@
-"""Domains by name: those that installed packages offer, and any that a person names by its module."""
+"""Registry of domains: by entry-point name from installed packages, or by module."""
 
 import functools
 import importlib
@@ -8,44 +8,44 @@ from ftl_lightning.errors import UserError, short
 from ftl_lightning.trust import OPTION, entry_points, is_vouched
 
 GROUP = "ftl_lightning.domains"
-"""Entry-point group in which a package offers domains: ``name = package.module:DOMAIN``."""
+"""Entry-point group of domains: ``name = package.module:DOMAIN``."""
 
 
 def domain_names() -> tuple[str, ...]:
-    """Names of the domains that installed packages offer, in alphabetical order."""
+    """Names of domains in installed packages, in alphabetical order."""
     return tuple(sorted(_offered()))
 
 
 def _offered() -> dict[str, str]:
-    """Where the domains are that installed packages offer, ``module:ATTRIBUTE`` by name."""
+    """References ``module:ATTRIBUTE`` of domains in installed packages, by name."""
     return {point.name: point.value for point in reversed(entry_points(GROUP))}
 
 
 @functools.cache
 def load_domain(name: str) -> Domain:
-    """A domain by the name under which a package offers it, or as ``package.module:DOMAIN``.
+    """Load a domain by entry-point name or ``package.module:DOMAIN``.
 
-    The module is imported. For a name that stands in a file, :func:`domain_of_file` is to be asked.
+    The module is imported. For names read from files, use :func:`domain_of_file`.
 
     Raises:
-        UserError: if there is none of that name, or it is something else.
+        UserError: if there is no such domain, or the object is not a domain.
     """
     reference = _offered().get(name, name)
     module, colon, attribute = reference.partition(":")
     if not colon:
         raise _unknown(name)
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        domain = getattr(importlib.import_module(module), attribute)
     except UserError:
         raise
-    except Exception as error:  # whatever a module raises that is imported
+    except Exception as error:  # any error of the imported module
         known = isinstance(error, ModuleNotFoundError | AttributeError | ValueError)
-        told = str(error) if known else f"{type(error).__name__}: {error}"
+        message = str(error) if known else f"{type(error).__name__}: {error}"
         mend = "install its package or mend the name" if known else "mend its module"
-        raise UserError(f"domain {name!r}: cannot be imported ({told}); {mend}") from error
-    if not isinstance(found, Domain):
-        raise UserError(f"domain {name!r}: expected a Domain, found {type(found).__name__}")
-    return found
+        raise UserError(f"domain {name!r}: cannot be imported ({message}); {mend}") from error
+    if not isinstance(domain, Domain):
+        raise UserError(f"domain {name!r}: expected a Domain, found {type(domain).__name__}")
+    return domain
 
 
 def _unknown(name: str) -> UserError:
@@ -54,16 +54,16 @@ def _unknown(name: str) -> UserError:
 
 
 def is_known(name: str) -> bool:
-    """Whether an installed package offers a domain, by its name or as ``module:ATTRIBUTE``, or a person vouches for it."""
+    """Whether a domain (name or ``module:ATTRIBUTE``) is in an installed package or trusted by the user."""
     offered = _offered()
     return name in offered or name in offered.values() or is_vouched(name)
 
 
 def domain_of_file(name: str) -> Domain:
-    """The domain that a file asks for: one that an installed package offers, or that a person names beside the file.
+    """Load a domain named in a file, if it is in an installed package or trusted by the user.
 
     Raises:
-        UserError: for another one; nothing is imported.
+        UserError: for any other domain; nothing is imported.
     """
     if is_known(name):
         return load_domain(name)
@@ -77,16 +77,16 @@ def domain_of_file(name: str) -> Domain:
 
 
 def recorded_name(name: str) -> str:
-    """The name by which files know a domain: the one under which a package offers it or, where none does, the one given.
+    """Name of a domain in files: its entry-point name if it has one, else the given name.
 
-    So a model finds the domain again, and where a package offers the domain both ways of naming it mean the same.
+    Models find their domain by this name; both ways of naming a domain give the same name.
 
     Args:
-        name: as of :func:`load_domain`.
+        name: see :func:`load_domain`.
 
     Raises:
-        UserError: as of :func:`load_domain`.
+        UserError: see :func:`load_domain`.
     """
     domain = load_domain(name)
-    offered = (other for other in domain_names() if other == name or (other == domain.name and load_domain(other) is domain))
+    offered = (known for known in domain_names() if known == name or (known == domain.name and load_domain(known) is domain))
     return next(offered, name)

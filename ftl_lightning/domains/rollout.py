@@ -1,4 +1,4 @@
-"""What happened when plans were executed."""
+"""Results of executing plans."""
 
 import itertools
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ class Rollout:
     """Episodes.
 
     Attributes:
-        starts: where they started.
-        observed: features that were kept, by name ``(episode, steps + 1, *shape)``, padded with an episode's last.
-        failed: ``(episode,)`` of bool: the policy had no finite action or the environment raised an error; the episode ended there.
-        infos: what the environment told of each episode's last step, by name.
+        starts: initial states.
+        observed: kept features by name ``(episode, steps + 1, *shape)``, padded with an episode's last observation.
+        failed: ``(episode,)`` of bool: the episode ended as the policy had no finite action or the environment raised an error.
+        infos: the environment's info of each episode's last step.
     """
 
     starts: InitialStates
@@ -27,11 +27,11 @@ class Rollout:
     infos: list[dict[str, Any]]
 
     def take(self, start: int, end: int) -> "Rollout":
-        """Some of the episodes."""
+        """Episodes from ``start`` to ``end``."""
         rows = slice(start, end)
         return Rollout(self.starts.take(rows), take(self.observed, rows), self.failed[rows], self.infos[rows])
 
     def split(self, counts: Sequence[int]) -> list["Rollout"]:
-        """The same in parts of so many episodes."""
+        """Split into parts of ``counts`` episodes."""
         ends = list(itertools.accumulate(counts))
         return [self.take(start, end) for start, end in zip([0, *ends], ends, strict=False)]

@@ -1,4 +1,4 @@
-"""What is evaluated: tasks, and suites of them."""
+"""Evaluation tasks and suites."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 from ftl_lightning.errors import UserError
 
 WITHOUT_WEIGHT = -0.5
-"""Guidance weight of the texts that a task is generated without."""
+"""Guidance weight of the texts in ``without``."""
 
 
 @dataclass(frozen=True)
@@ -48,40 +48,40 @@ class EvaluationTask:
 
     @property
     def name(self) -> str:
-        """Its name within its setting."""
+        """Name within its setting."""
         return self.goal if self.component is None else f"{self.goal} (learned from: {self.learned[0]})"
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Evaluation tasks that are reported together."""
+    """Suite of evaluation tasks that are reported together."""
 
     tasks: tuple[EvaluationTask, ...]
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """Names of the concepts to learn, each once, in order."""
+        """Distinct names of the concepts to learn, in order."""
         return tuple(dict.fromkeys(name for task in self.tasks for name in task.learned))
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Names of the settings, each once, in order."""
+        """Distinct names of the settings, in order."""
         return tuple(dict.fromkeys(task.setting for task in self.tasks))
 
     @property
     def goals(self) -> tuple[str, ...]:
-        """The goals, each once, in order."""
+        """Distinct goals, in order."""
         return tuple(dict.fromkeys(task.goal for task in self.tasks))
 
 
 def training_suite(concepts: tuple[str, ...]) -> Suite:
-    """Each training concept, generated and judged by itself."""
+    """Suite of single training concepts."""
     return Suite(tuple(EvaluationTask("training concept", text, texts=(text,)) for text in concepts))
 
 
 def few_shot_suites(training: tuple[str, ...], new: tuple[str, ...]) -> dict[str, Suite]:
-    """The suites ``'training'`` and ``'new'``: training concepts, and others that are learned from a few demonstrations each.
+    """The suites ``'training'`` and ``'new'``: training concepts, and concepts learned from a few demonstrations each.
 
-    The goal of each is its own text.
+    The goal of a task is the text of its concept.
     """
     return {"training": training_suite(training), "new": Suite(tuple(EvaluationTask("new concept", text, (text,)) for text in new))}

@@ -1,4 +1,4 @@
-"""Films as shapes that move: a web page draws them at any size, in a hundredth of the bytes of pictures."""
+"""Films of moving shapes, drawn by web pages at any size, in a hundredth of the bytes of pictures."""
 
 import math
 from collections.abc import Sequence
@@ -15,16 +15,16 @@ Kind = Literal["area", "line", "dots", "way"]
 
 @dataclass(frozen=True)
 class Shape:
-    """Something that is drawn.
+    """Shape of a film.
 
     Attributes:
-        kind: ``'area'``, a filled polygon; ``'line'`` through the points; ``'dots'``, a disc at each point; ``'way'``, the line
-            through all places so far of a single point.
-        points: ``(frame, point, 2)`` in the film's unit, x to the right and y upwards, or ``(1, point, 2)`` where nothing moves.
-            A shape with a point that is not finite is not there in this frame.
+        kind: ``'area'``, a filled polygon; ``'line'`` through the points; ``'dots'``, a disc at each point; ``'way'``, the past
+            path of a single point.
+        points: ``(frame, point, 2)`` in the film's unit, x right and y up; ``(1, point, 2)`` for a still shape. Shapes with a point
+            that is not finite are hidden in this frame.
         colour: ``#rrggbb``.
         size: width of a line or radius of a disc in the film's unit; 0 for a hairline, or the outline of an area.
-        filled: whether areas and discs are.
+        filled: whether areas and discs are filled.
     """
 
     kind: Kind
@@ -36,12 +36,12 @@ class Shape:
 
 @dataclass(frozen=True)
 class VectorFilm:
-    """A film of one plan or episode.
+    """Film of a plan or episode.
 
     Attributes:
-        shapes: in the order in which they are drawn; those that move have equally many frames.
-        window: what is in sight: left, lower edge, width and height, in the film's unit.
-        rate: frames a second. Between frames, points move evenly.
+        shapes: shapes in drawing order; moving shapes have the same number of frames.
+        window: visible window: left edge, lower edge, width and height, in the film's unit.
+        rate: frames per second. Points are interpolated linearly between frames.
     """
 
     shapes: Sequence[Shape]
@@ -50,32 +50,32 @@ class VectorFilm:
 
     @property
     def frames(self) -> int:
-        """How many there are."""
+        """Number of frames."""
         return max((len(shape.points) for shape in self.shapes), default=0)
 
 
 def still(kind: Kind, points: Sequence[Sequence[float]] | NDArray[np.floating], colour: str, size: float = 0.0) -> Shape:
-    """A shape that does not move, from its points ``(point, 2)``."""
+    """Still shape from points ``(point, 2)``."""
     return Shape(kind, np.asarray(points, dtype=np.float32)[None], colour, size)
 
 
 def regular(corners: int, radius: float, turn: float = 0.0) -> NDArray[np.float32]:
-    """A regular polygon ``(corners, 2)`` around the origin, with a corner at the angle ``turn`` in radians."""
+    """Regular polygon ``(corners, 2)`` around the origin, with a corner at the angle ``turn`` in radians."""
     angle = turn + np.arange(corners) * 2 * math.pi / corners
     return (radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)).astype(np.float32)
 
 
 def some(count: int, most: int) -> NDArray[np.int64]:
-    """At most so many of some frames, evenly, with the first and the last."""
+    """At most ``most`` evenly spaced frames, including the first and last."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))
 
 
 FLOOR, LIMB = "#dfe3e8", 0.045
-"""Colour of the floor, and the width of lines in metres."""
+"""Colour of the floor and width of lines in metres."""
 
 
 def of_wireframe(wireframe: Wireframe) -> VectorFilm:
-    """A motion in space as it is seen in pictures, on its floor."""
+    """Vector film of a wireframe, with its floor."""
     at = seen(wireframe.points)[..., :2]
     left, lower, side = window([wireframe])
     shapes = [still("area", seen(disc(wireframe.room[0]))[:, :2], FLOOR)]

@@ -1,7 +1,7 @@
-"""Motion as points and lines in space: what films of bodies are drawn from, here and by a web page.
+"""Wireframes, motion as points and lines in space, for films of bodies here and on web pages.
 
-Everything is drawn from one place, from the front and a little from the side and from above, without perspective, so that lengths
-can be compared within a film and between films.
+The view is fixed, from the front and slightly from the side and above, in parallel projection, so that lengths are comparable
+within and between films.
 """
 
 import math
@@ -15,25 +15,25 @@ from PIL import Image, ImageDraw
 Points = NDArray[np.float32]
 
 SIDE, ABOVE = math.radians(28), math.radians(12)
-"""Where the film is seen from: turned about the vertical towards +x, and raised above the horizontal."""
+"""View direction: rotation about the vertical towards +x, and elevation."""
 SIZE = 240
 """Width and height of a frame in pixels."""
 FINER = 3
-"""Frames are drawn this many times as large and made smaller, which smooths lines."""
+"""Supersampling factor of frames, for antialiasing."""
 PAPER, GROUND, GRID = (255, 255, 255), (238, 240, 242), (214, 218, 222)
 
 
 @dataclass(frozen=True)
 class Wireframe:
-    """A motion of points, some of them joined by lines.
+    """Motion of points connected by lines.
 
     Attributes:
-        points: ``(frame, point, 3)`` in metres: x and y along the floor, z upwards, the floor at 0. Who faces +y faces the viewer.
-        lines: pairs of points; colours: one ``#rrggbb`` each, in the same order.
-        heads: points with a ball around them, with its radius in metres and colour.
-        rate: frames a second.
-        room: radius of the floor, a disc, and the height that is always in sight, in metres. Films with the same room have the same
-            scale, unless something leaves it.
+        points: ``(frame, point, 3)`` in metres: x and y along the floor, z upwards, floor at 0. The viewer is at +y.
+        lines: pairs of points; colours: ``#rrggbb`` of each line, in the same order.
+        heads: points drawn as balls, with radius in metres and colour.
+        rate: frames per second.
+        room: radius of the floor, a disc, and height that is always visible, in metres. Films of the same room have the same scale,
+            unless motion leaves the room.
     """
 
     points: Points
@@ -45,16 +45,16 @@ class Wireframe:
 
 
 def seen(points: Points) -> Points:
-    """Where points are in the picture.
+    """Project points to the picture.
 
     Args:
         points: ``(..., 3)`` in metres.
 
     Returns:
-        ``(..., 3)``: to the right, upwards, and towards the viewer, in metres.
+        ``(..., 3)``: right, up, and towards the viewer, in metres.
     """
     x, y, z = np.moveaxis(points, -1, 0)
-    # The viewer stands at +y, so that +x is at the left.
+    # The viewer is at +y, so +x points left.
     across, near = -x * math.cos(SIDE) + y * math.sin(SIDE), x * math.sin(SIDE) + y * math.cos(SIDE)
     return np.stack(
         (across, z * math.cos(ABOVE) - near * math.sin(ABOVE), near * math.cos(ABOVE) + z * math.sin(ABOVE)), axis=-1
@@ -62,11 +62,11 @@ def seen(points: Points) -> Points:
 
 
 def window(wireframes: Sequence[Wireframe]) -> tuple[float, float, float]:
-    """The square that all of some motions are seen in: its left and lower edge and its side, in metres of :func:`seen`."""
+    """Square window around motions: left edge, lower edge and side, in metres of :func:`seen`."""
     radius, height = wireframes[0].room
     top = np.array([[0, 0, height]], dtype=np.float32)
     flat = np.concatenate([seen(disc(radius)), seen(top)])[:, :2]
-    everything = [flat, *(seen(one.points)[..., :2].reshape(-1, 2) for one in wireframes)]
+    everything = [flat, *(seen(motion.points)[..., :2].reshape(-1, 2) for motion in wireframes)]
     low = np.min([part.min(axis=0) for part in everything], axis=0)
     high = np.max([part.max(axis=0) for part in everything], axis=0)
     side = float((high - low).max())
@@ -75,17 +75,17 @@ def window(wireframes: Sequence[Wireframe]) -> tuple[float, float, float]:
 
 
 def disc(radius: float) -> Points:
-    """The edge ``(64, 3)`` of a round floor."""
+    """Edge ``(64, 3)`` of a round floor."""
     angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     return np.stack((radius * np.cos(angle), radius * np.sin(angle), 0 * angle), axis=-1).astype(np.float32)
 
 
 def drawn(wireframe: Wireframe, size: int = SIZE) -> list[NDArray[np.uint8]]:
-    """Frames ``(size, size, 3)`` of a motion, on a round floor.
+    """Draw frames ``(size, size, 3)`` of a motion on a round floor.
 
     Args:
         wireframe: the motion.
-        size: of a frame in pixels.
+        size: size of a frame in pixels.
     """
     wide = size * FINER
     left, lower, side = window([wireframe])
@@ -109,7 +109,7 @@ def drawn(wireframe: Wireframe, size: int = SIZE) -> list[NDArray[np.uint8]]:
         for a, b in wireframe.lines:
             _line(pen, shadow[a], shadow[b], GRID, 0.045 * scale)
         depth = [float(frame[a, 2] + frame[b, 2]) for a, b in wireframe.lines]
-        for index in np.argsort(depth):  # what is nearer hides what is behind it
+        for index in np.argsort(depth):  # nearer lines on top
             a, b = wireframe.lines[index]
             _line(pen, frame[a], frame[b], wireframe.colours[index], 0.045 * scale)
         for point, radius, colour in wireframe.heads:

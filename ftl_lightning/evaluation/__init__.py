@@ -1,6 +1,6 @@
-"""Judging what is generated and executed: the evaluator callback, closed loop, reference lines, and the results file.
+"""Evaluation: the evaluator callback, closed-loop execution, reference lines, and results files.
 
-The evaluator is imported when it is asked for: executing plans and drawing animations do not need Lightning.
+The evaluator is imported lazily: executing plans and drawing animations do not need Lightning.
 """
 
 from typing import TYPE_CHECKING, Any

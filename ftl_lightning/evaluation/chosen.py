@@ -1,4 +1,4 @@
-"""What a person chose of a run, by names that they know: the columns of the HPARAMS tab."""
+"""Settings of a run for the columns of the HPARAMS tab."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,26 +11,26 @@ from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import public
 
 USUAL = "usual"
-"""Of a form that is not said to be otherwise."""
+"""Name of the default form."""
 MOST = 100
-"""Letters of the tasks' names that are shown."""
+"""Maximum length of the list of tasks."""
 OTHERS = "with "
-"""How names of the other settings begin: TensorBoard shows the first five by name, or those in which runs differ."""
-TOLD = ("model/components", "model/omega", "model/guidance", "model/seed", "model/form", "data/domain", "data/seed", "data/steps")
-"""Settings that are among the first ones, by other names."""
+"""Prefix of the other settings: TensorBoard shows the first five by name, or those in which runs differ."""
+MAIN = ("model/components", "model/omega", "model/guidance", "model/seed", "model/form", "data/domain", "data/seed", "data/steps")
+"""Settings listed under another name without the prefix."""
 
 
 def chosen(
     module: Evaluable, data: pl.LightningDataModule, settings: Mapping[str, Any], trainer: pl.Trainer, rows: Sequence[Row]
 ) -> dict[str, Any]:
-    """Settings by name: what is known by name stands for itself, and never a hash for it.
+    """Settings by name, without hashes.
 
     Args:
-        module: what generated.
-        data: what it learned from, or was tested on.
-        settings: the evaluator's.
-        trainer: what learned.
-        rows: of the method, one or more.
+        module: evaluated module.
+        data: training or test data.
+        settings: settings of the evaluator.
+        trainer: trainer.
+        rows: rows of the method, at least one.
     """
     first = rows[0]
     groups = {"model": public(module.hparams), "data": public(data.hparams), "evaluation": settings.items()}
@@ -46,7 +46,7 @@ def chosen(
         "steps": data.hparams.get("steps", trainer.max_steps),
         "tasks": short(", ".join(dict.fromkeys(row.task for row in rows)), MOST),
         "variant": first.variant,
-        **{f"{OTHERS}{name}": value for name, value in others.items() if name not in TOLD},
+        **{f"{OTHERS}{name}": value for name, value in others.items() if name not in MAIN},
     }
 
 

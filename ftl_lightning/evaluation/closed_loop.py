@@ -1,4 +1,4 @@
-"""Executing plans: environments step in lock-step, their plans are made in one batch (paper, 'closed loop')."""
+"""Closed-loop execution: environments step in lockstep with batched planning (paper, 'closed loop')."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -23,88 +23,88 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 Planner = Callable[[Tensor, int, Observed], Tensor]
-"""``(plans (episode, horizon, state), steps since they were made, observed) -> actions (episode, action)``."""
+"""``(plans (episode, horizon, state), age in steps, observed) -> actions (episode, action)``."""
 MakePlans = Callable[[Observed, list[int]], Tensor]
-"""``(observed (episode, *shape) by name, which episodes) -> plans (episode, horizon, state)``."""
+"""``(observed (episode, *shape) by name, episode numbers) -> plans (episode, horizon, state)``."""
 SIDE_BY_SIDE = 64
-"""Episodes that run together: a simulator takes tens of megabytes, and a larger batch makes no plan faster."""
+"""Number of parallel episodes: a simulator takes tens of megabytes, and a larger batch plans no faster."""
 
 
 def roll_out(loop: ClosedLoop, starts: InitialStates, policy: Policy) -> Rollout:
-    """Run one episode from each scene until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
+    """Run an episode from each scene until its environment ends it, :data:`SIDE_BY_SIDE` at a time.
 
     Args:
         loop: the domain's environment.
         starts: initial states with scenes.
-        policy: acts in those episodes that still run.
+        policy: policy of the running episodes.
 
     Raises:
         UserError: naming the episode, for a scene that cannot be built.
-        MemoryError, OSError: for what the machine lacks; what else an environment raises costs its episode alone.
+        MemoryError, OSError: from an environment; any other error only fails its episode.
     """
     count, kept = len(starts), loop.keeps or tuple(starts.observed)
     observed = {
         name: starts.observed[name][:, None].repeat(1, loop.steps + 1, *(1,) * (starts.observed[name].dim() - 1)) for name in kept
     }
-    found = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
+    rollout = Rollout(starts, observed, torch.zeros(count, dtype=torch.bool), [{} for _ in range(count)])
     with bar(f"{count} episodes", loop.steps * count, lines=False) as advance:
         for rows in torch.arange(count).split(SIDE_BY_SIDE):
-            _lock_step(loop, rows.tolist(), found, policy, advance)
-    return found
+            _lock_step(loop, rows.tolist(), rollout, policy, advance)
+    return rollout
 
 
 def reset(loop: ClosedLoop, scenes: Tensor) -> InitialStates:
-    """What is observed where an environment is reset to scenes ``(episode, scene)``.
+    """Observe the initial states of an environment reset to scenes ``(episode, scene)``.
 
     Raises:
         UserError: naming the episode, for a scene that cannot be built.
     """
     environment = loop.environment()
     try:
-        seen = [_begun(environment, row, scene) for row, scene in enumerate(scenes)]
+        seen = [_reset(environment, row, scene) for row, scene in enumerate(scenes)]
     finally:
         environment.close()
-    return InitialStates({name: torch.stack([torch.as_tensor(one[name]) for one in seen]) for name in seen[0]}, scenes)
+    return InitialStates({name: torch.stack([torch.as_tensor(first[name]) for first in seen]) for name in seen[0]}, scenes)
 
 
-def _begun(environment: "gymnasium.Env[Any, Any]", row: int, scene: Tensor) -> Any:
-    """What is observed where an episode starts."""
+def _reset(environment: "gymnasium.Env[Any, Any]", row: int, scene: Tensor) -> Any:
+    """Reset to a scene and return the observation."""
     try:
         return environment.reset(options={"scene": scene.numpy()})[0]
     except UserError as error:
         raise UserError(f"episode {row}: {error}") from error
 
 
-def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy, advance: Advance) -> None:
-    """Run these episodes together, one step of each after the other, and fill in what happened."""
+def _lock_step(loop: ClosedLoop, rows: list[int], rollout: Rollout, policy: Policy, advance: Advance) -> None:
+    """Run episodes in lockstep and fill in the rollout."""
     environments: dict[int, gymnasium.Env[Any, Any]] = {}
-    scenes = found.starts.require_scenes()
-    # What is seen now, of every feature; a rollout keeps some of them.
-    now = {name: values[rows].clone() for name, values in found.starts.observed.items()}
+    scenes = rollout.starts.require_scenes()
+    # Current values of all features; the rollout keeps some of them.
+    now = {name: values[rows].clone() for name, values in rollout.starts.observed.items()}
     place = {row: index for index, row in enumerate(rows)}
 
     def fail(row: int, why: str) -> None:
-        found.failed[row] = True
+        rollout.failed[row] = True
         _LOG.warning("episode %d, %s; the episode counts as failed", row, why)
 
     def see(row: int, step: int, seen: Observed) -> None:
         for name, values in now.items():
             if not isinstance(seen, Mapping) or name not in seen or tuple(np.shape(seen[name])) != tuple(values.shape[1:]):
-                found_shape = np.shape(seen[name]) if isinstance(seen, Mapping) and name in seen else "none"
-                raise UserError(f"environment: expected it to observe {name!r} {tuple(values.shape[1:])}, found {found_shape}")
+                shape = np.shape(seen[name]) if isinstance(seen, Mapping) and name in seen else "none"
+                raise UserError(f"environment: expected it to observe {name!r} {tuple(values.shape[1:])}, found {shape}")
             values[place[row]] = torch.as_tensor(seen[name])
-            if name in found.observed:
-                found.observed[name][row, step:] = values[place[row]]
+            if name in rollout.observed:
+                rollout.observed[name][row, step:] = values[place[row]]
 
     try:
         active = []
         for row in rows:
             environments[row] = loop.environment()
             try:
-                seen = _begun(environments[row], row, scenes[row])
+                seen = _reset(environments[row], row, scenes[row])
             except (UserError, MemoryError, OSError):
                 raise
-            except Exception as error:  # whatever a simulator raises: the other episodes go on
+            except Exception as error:  # any error of a simulator: the other episodes go on
                 fail(row, f"before its first step: {error!r}")
                 advance(loop.steps)
                 continue
@@ -130,10 +130,10 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
                     fail(row, f"step {step}: {error!r}")
                     continue
                 see(row, step + 1, seen)
-                found.infos[row].update(info)
+                rollout.infos[row].update(info)
                 if not (terminated or truncated):
                     going.append(row)
-            advance((len(active) - len(going)) * (loop.steps - step - 1))  # of those that have ended
+            advance((len(active) - len(going)) * (loop.steps - step - 1))  # remaining steps of ended episodes
             active = going
     finally:
         for environment in environments.values():
@@ -141,15 +141,15 @@ def _lock_step(loop: ClosedLoop, rows: list[int], found: Rollout, policy: Policy
 
 
 class PlanFollower:
-    """The policy that follows plans. Where one holds a number that is not finite, there is no action.
+    """Policy that follows plans. A plan with a non-finite value becomes NaN.
 
     Args:
-        make: makes plans.
+        make: function that makes plans.
         act: the domain's planner, see :class:`~ftl_lightning.domains.domain.ClosedLoop`.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
+        replan: number of steps before replanning; 1 in the paper.
 
     Attributes:
-        followed: for each episode the plan ``(horizon, state)`` of each of its steps.
+        followed: plan ``(horizon, state)`` at each step, by episode.
     """
 
     def __init__(self, make: MakePlans, act: Planner, replan: int) -> None:
@@ -172,28 +172,28 @@ class PlanFollower:
 def sampled_plans(
     model: ConceptModel, compositions: Sequence[Composition], sampling: Sampling, generators: Sequence[torch.Generator]
 ) -> MakePlans:
-    """Plans from a model: composition and noise are an episode's own, so that it does not depend on its neighbours.
+    """Sample plans from a model, independently for each episode.
 
     Args:
-        model: the model.
-        compositions: of each episode, ``(K, ...)``.
+        model: generative model.
+        compositions: composition of each episode ``(K, ...)``.
         sampling: sampler, steps and temperature.
-        generators: of each episode's noise, and of its mode, which it keeps to its end.
+        generators: generator of each episode's noise and mode; the mode is kept for the whole episode.
     """
-    compositions = [one.drawn(draw) for one, draw in zip(compositions, generators, strict=True)]
+    compositions = [composition.drawn(draw) for composition, draw in zip(compositions, generators, strict=True)]
 
     def make(observed: Observed, rows: list[int]) -> Tensor:
-        own, draws = [compositions[row] for row in rows], [generators[row] for row in rows]
-        return model.sample(own, 1, sampling, draws, moved(observed, model.device))[:, 0].cpu()
+        batch, draws = [compositions[row] for row in rows], [generators[row] for row in rows]
+        return model.sample(batch, 1, sampling, draws, moved(observed, model.device))[:, 0].cpu()
 
     return make
 
 
 def planner(model: ConceptModel, loop: ClosedLoop) -> Planner:
-    """What follows a model's plans: the domain's planner, or that of the model's view."""
+    """The planner of the model's view, if it has one, else the domain's."""
     return model.view.act if model.view is not None and model.view.act is not None else loop.act
 
 
 def fixed_plans(plans: Tensor) -> MakePlans:
-    """Plans ``(episode, horizon, state)`` that are made once, such as those of reference policies."""
+    """Use fixed plans ``(episode, horizon, state)``, such as those of reference policies."""
     return lambda observed, rows: plans[rows]

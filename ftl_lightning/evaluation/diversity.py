@@ -1,14 +1,14 @@
-"""Novelty and coverage: what accuracy does not see.
+"""Novelty and coverage, which complement accuracy.
 
-*Novelty* is the mean distance of a generated plan to the nearest demonstration of the concept that it was learned from: 0 for a
-method that replays them. *Coverage* is the mean distance of fresh behaviour of the task to the nearest generated plan: less is
-better, and a method that generates one plan again and again has a large one however right that is. Both in the domain's distance.
+*Novelty* is the mean distance of a generated plan to the nearest demonstration of its concept: 0 for a method that replays
+demonstrations. *Coverage* is the mean distance of a fresh sample of the task to the nearest generated plan: lower is better, and a
+method that always generates the same plan has a high coverage even if the plan is right. Both use the domain's distance.
 
-Neither is read alone: wrong plans are as novel as you like. Two lines stand beside every number: *demonstrations replayed* in turn
-(right, nothing new) and *fresh samples*, an independent draw of the task (right, and as novel as new behaviour is).
+Novelty alone means little: wrong plans can be arbitrarily novel. Two reference lines give the scale: *demonstrations replayed* in
+turn (right, nothing new) and *fresh samples*, an independent draw of the task (right, as novel as new behaviour is).
 
-Coverage falls with the number of plans, so that numbers are comparable where as many plans were generated: the column n of results.
-As many samples are drawn to be covered, and as many for the line.
+Coverage decreases with the number of plans: compare values with an equal column n of the results. The covered samples and the
+reference line have n samples each.
 """
 
 import logging
@@ -34,19 +34,19 @@ _LOG = logging.getLogger(__name__)
 REPLAYED, FRESH = "demonstrations replayed", "fresh samples"
 """Names of the reference lines."""
 _DRAWN: dict[tuple[Any, ...], Demonstrations | None] = {}
-"""Fresh behaviour by all that decides it: every method is compared with the same."""
+"""Cache of fresh samples by their arguments, shared by all methods."""
 
 
 @dataclass(frozen=True)
 class Real:
-    """Real behaviour of one task, which generated plans are compared with.
+    """Real behaviour of a task, for comparison with generated plans.
 
     Attributes:
-        task: that it shows.
-        domain: whose it is.
-        count: of plans that are generated.
-        demonstrations: that the task's concept was learned from; ``None`` where a plan is not to be like them.
-        fresh: ``count`` samples of the task that are to be covered, and as many others; ``None`` where none can be drawn.
+        task: evaluated task.
+        domain: domain of the task.
+        count: number of generated plans.
+        demonstrations: demonstrations of the task's concept; ``None`` if novelty does not apply.
+        fresh: ``count`` samples of the task to cover, and ``count`` more; ``None`` if the domain cannot draw any.
     """
 
     task: EvaluationTask
@@ -65,19 +65,18 @@ class Real:
         root: Path | None = None,
         seed: int = 0,
     ) -> Self:
-        """What there is.
+        """Collect the real behaviour of a task.
 
-        A plan is to be like the demonstrations, though none of them, where the task is what they show: not where it is composed
-        with training concepts, nor generated from a single component. Where behaviour starts in the demonstrations' initial states,
-        there is nothing to compare: there a good plan is one of them, and there are as few as they are.
+        Novelty applies if the demonstrations show the task itself, not to compositions with training concepts or single components.
+        Nothing is compared for tasks that start in the demonstrations' initial states, where replaying a demonstration is right.
 
         Args:
-            task: what is generated.
-            domain: whose task it is.
-            count: of plans that are generated.
-            demonstrations: of the task's learned concept, if there are any.
+            task: evaluated task.
+            domain: domain of the task.
+            count: number of generated plans.
+            demonstrations: demonstrations of the task's learned concept, if any.
             root: folder of the user's copy of the data.
-            seed: of the fresh samples.
+            seed: seed of the fresh samples.
         """
         if task.initial != "new":
             return cls(task, domain, count, None, None)
@@ -87,24 +86,24 @@ class Real:
         return cls(task, domain, count, demonstrations if shown else None, fresh)
 
     def _distance(self, behaviour: Demonstrations) -> Distance:
-        """The domain's, or that of plans whose columns are scaled as those of real behaviour."""
+        """The domain's distance, or a distance with columns scaled by real behaviour."""
         if self.domain.distance is not None:
             return self.domain.distance
         return scaled_distance(self._windows(behaviour), self.domain.plans.resolution)
 
     def _windows(self, demonstrations: Demonstrations) -> Tensor:
-        """Their first windows, as long as a plan ``(demo, horizon, state)``."""
+        """First windows of plan length ``(demo, horizon, state)``."""
         rows = torch.arange(len(demonstrations))
         return demonstrations.windows(rows, torch.zeros_like(rows), self.domain.plans.horizon)[0]
 
     def values(self, plans: Tensor) -> dict[str, float]:
-        """Novelty and coverage of plans ``(sample, horizon, state)``, by name, so far as there is something to compare with.
+        """Novelty and coverage of plans ``(sample, horizon, state)`` by name, as far as they apply.
 
-        Nothing for plans of another length than the domain's, such as those of methods that plan a step at a time: their distances
-        would be those of other times.
+        Empty for plans of another length than the domain's, such as those of methods that plan step by step: the times would not
+        match.
 
         Raises:
-            UserError: for plans that the domain's distance does not fit, or a distance that returns something else.
+            UserError: for plans that do not fit the domain's distance, or a distance with an invalid result.
         """
         measured: dict[str, float] = {}
         behaviour = self.fresh[0] if self.fresh else self.demonstrations
@@ -119,9 +118,9 @@ class Real:
         return measured
 
     def lines(self) -> dict[str, TaskResult]:
-        """The reference lines by name, judged as a method's plans are: as many demonstrations in turn, and fresh samples.
+        """Judge the reference lines, ``count`` replayed demonstrations and fresh samples, by name.
 
-        Where nothing but novelty is measured, there is nothing to say of demonstrations: theirs is 0.
+        Replayed demonstrations are omitted if only novelty is measured, as their novelty is 0.
         """
         judged = {}
         if (self.domain.metrics or self.fresh) and (replayed := self.replayed()) is not None:
@@ -131,7 +130,7 @@ class Real:
         return judged
 
     def replayed(self) -> TaskResult | None:
-        """As many plans as are generated, which are the demonstrations in turn; ``None`` without any."""
+        """Judge ``count`` plans that repeat the demonstrations in turn; ``None`` without demonstrations."""
         if self.demonstrations is None:
             return None
         turns = torch.arange(self.count) % len(self.demonstrations)
@@ -142,17 +141,17 @@ class Real:
         return self.added(TaskResult.of(self.task, self._windows(behaviour), starts, self.domain))
 
     def added(self, judged: TaskResult) -> TaskResult:
-        """Behaviour with its novelty and coverage."""
+        """Add novelty and coverage to generated behaviour."""
         return judged.compared(self.values(judged.states))
 
 
 def novelty(distances: Tensor) -> float:
-    """Mean distance of a plan to the nearest demonstration, of distances ``(plan, demonstration)``."""
+    """Mean distance of a plan to the nearest demonstration, from distances ``(plan, demonstration)``."""
     return float(distances.amin(dim=1).mean())
 
 
 def coverage(distances: Tensor) -> float:
-    """Mean distance of a fresh sample to the nearest plan, of distances ``(plan, sample)``; more plans never have a larger one."""
+    """Mean distance of a fresh sample to the nearest plan, from distances ``(plan, sample)``; adding plans never increases it."""
     return float(distances.amin(dim=0).mean())
 
 
@@ -163,14 +162,14 @@ def real_behaviour(
     root: Path | None = None,
     seed: int = 0,
 ) -> list[Real]:
-    """The real behaviour that the plans of each task are compared with.
+    """Collect the real behaviour of each task.
 
     Args:
-        judged: what was generated.
-        domain: whose tasks they are.
-        demonstrated: what a concept was learned from, by its name.
+        judged: generated behaviour.
+        domain: domain of the tasks.
+        demonstrated: function from a concept's name to its demonstrations.
         root: folder of the user's copy of the data.
-        seed: of the fresh samples.
+        seed: seed of the fresh samples.
     """
     behaviour = []
     with bar(f"fresh samples of {len(judged)} tasks", len(judged), lines=False) as advance:
@@ -182,20 +181,20 @@ def real_behaviour(
 
 
 def lines(real: Sequence[Real]) -> dict[str, list[TaskResult]]:
-    """The reference lines of some tasks, by name."""
+    """Reference lines of all tasks, by name."""
     by_task = [behaviour.lines() for behaviour in real]
     return {name: judged for name in (REPLAYED, FRESH) if (judged := [line[name] for line in by_task if name in line])}
 
 
 def _drawn(domain: Domain, goal: str, count: int, root: Path | None, seed: int) -> Demonstrations | None:
-    """Fresh samples of a goal; ``None`` where the domain has none."""
+    """Draw fresh samples of a goal; ``None`` if the domain cannot."""
     if not domain.fresh or not domain.concepts.reads(goal):
         return None
     key = (domain.name, goal, count, root, seed)
     if key not in _DRAWN:
         try:
             _DRAWN[key] = domain.source(root).draw(goal, count, FRESH_SEED + seed)
-        except Exception as error:  # whatever a domain's source raises: accuracy is known already
+        except Exception as error:  # any error of a domain's source: accuracy is already known
             _LOG.warning("domain %s: no coverage of %r, of which nothing can be drawn: %r", domain.name, goal, error)
             _DRAWN[key] = None
     return _DRAWN[key]

@@ -1,4 +1,4 @@
-"""What an evaluation draws: figures of plans below the demonstrations, films of plans and of episodes."""
+"""Pictures of an evaluation: figures of demonstrations and plans, films of plans and episodes."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ from ftl_lightning.evaluation.judged import TaskResult, share
 from ftl_lightning.evaluation.tensorboard import log_animation
 from ftl_lightning.learning.quality import first_windows
 
-if TYPE_CHECKING:  # half a second of import, for what is drawn later
+if TYPE_CHECKING:  # slow import
     from matplotlib.figure import Figure
 
 
@@ -27,15 +27,15 @@ def draw(
     figures: int,
     step: int,
 ) -> None:
-    """Draw each task's plans into TensorBoard, film the first, and its first episode if there is one.
+    """Log a figure of each task's plans and films of the first plan and the first episode to TensorBoard.
 
     Args:
-        logger: where to.
-        judged: what is drawn.
-        domain: whose pictures they are.
-        demonstrated: what a concept was learned from, by its name; drawn above the plans.
-        figures: how many samples a figure shows, 1 or more, and demonstrations at most.
-        step: the trainer's.
+        logger: output.
+        judged: generated behaviour.
+        domain: domain that draws.
+        demonstrated: function from a concept's name to its demonstrations, which are drawn above the plans.
+        figures: number of samples in a figure, 1 or more, and maximum number of demonstrations.
+        step: global step.
     """
     for behaviour in judged:
         name = f"{behaviour.task.setting}/{behaviour.task.name}"
@@ -49,18 +49,18 @@ def draw(
 
 
 def title(behaviour: TaskResult) -> str:
-    """The task's name and the share of plans that are right, if they are judged."""
+    """Name of the task and share of right plans, if judged."""
     return behaviour.task.name if behaviour.right is None else f"{behaviour.task.name}: {share(behaviour.right):.2f} right"
 
 
 def picture(behaviour: TaskResult, domain: Domain, demonstrated: Callable[[str], Demonstrations | None], figures: int) -> "Figure":
-    """Some of a task's plans, framed green where they are right and red where they are wrong, below what was learned from.
+    """Draw plans, framed green if right and red if wrong, below the demonstrations.
 
     Args:
-        behaviour: the task's.
-        domain: whose picture it is.
-        demonstrated: what a concept was learned from, by its name.
-        figures: how many plans are shown, and demonstrations at most.
+        behaviour: behaviour of a task.
+        domain: domain that draws.
+        demonstrated: function from a concept's name to its demonstrations.
+        figures: number of plans, and maximum number of demonstrations.
     """
     shown = slice(0, figures)
     starts = None if behaviour.starts is None else behaviour.starts.take(shown)

@@ -1,4 +1,4 @@
-"""What an evaluated module offers."""
+"""Interface of evaluated modules."""
 
 from collections.abc import Callable
 from typing import Any, Protocol, TypeGuard
@@ -12,7 +12,7 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 
 class Evaluable(Protocol):
-    """The model, names of the method, of its form, of its variant and of learned concepts, and the points of concept space."""
+    """Module with a model, names of method, form, variant and learned concepts, and points of concept space."""
 
     model: ConceptModel
     hparams: Any
@@ -40,20 +40,20 @@ class Evaluable(Protocol):
 
 
 def is_evaluable(module: object) -> TypeGuard[Evaluable]:
-    """Whether a module offers all of that.
+    """Whether a module implements :class:`Evaluable`.
 
-    Not by ``isinstance``: from Python 3.12 on it looks past ``__getattr__``, by which a module gives its submodules, the model too.
+    ``isinstance`` does not work: from Python 3.12 on it ignores ``__getattr__``, which provides submodules such as the model.
     """
     members = (*Evaluable.__annotations__, *(name for name in vars(Evaluable) if not name.startswith("_")))
     return all(hasattr(module, name) for name in members)
 
 
 def demonstrations_of(task: EvaluationTask, demonstrated: Callable[[str], Demonstrations | None]) -> Demonstrations | None:
-    """What a task's concepts were learned from, one after another; ``None`` if nothing was learned.
+    """Concatenate the demonstrations of a task's learned concepts; ``None`` without learned concepts.
 
     Args:
-        task: what is evaluated.
-        demonstrated: what a concept was learned from, by its name.
+        task: evaluated task.
+        demonstrated: function from a concept's name to its demonstrations.
     """
     learned = [demonstrations for name in task.learned if (demonstrations := demonstrated(name)) is not None]
     return concatenate(learned) if len(learned) > 1 else next(iter(learned), None)

@@ -1,7 +1,6 @@
-"""Evaluation as a callback: it says when behaviour is generated and judged, and who is told.
+"""Evaluation callback: generates and judges behaviour, logs it and writes results.
 
-It works the same while fitting, in ``validate``, in ``test`` and after ``invert``; all it asks of a module is its generative
-model and :class:`Evaluable`.
+It works the same in ``fit``, ``validate``, ``test`` and after ``invert``, for any module that implements :class:`Evaluable`.
 """
 
 import logging
@@ -32,24 +31,22 @@ _LOG = logging.getLogger(__name__)
 
 
 class Evaluator(pl.Callback):
-    """Accuracy of generated behaviour.
+    """Evaluates generated behaviour.
 
     Args:
-        suites: names of suites of the domain; ``None`` for the training concepts while fitting, for ``training`` and ``paper`` of
-            concepts that a suite asks for, and for none of the user's own demonstrations. Tasks whose concept was not learned are
-            left out; learned concepts that no suite asks for are judged by their own name, if the domain can read it.
-        closed_loop: also execute plans, in domains that can, when testing (``test``, ``invert``).
-        figures: how many samples of a task a TensorBoard figure shows; 0 for no figures.
+        suites: names of suites of the domain; ``None`` for the training concepts while fitting, for ``training`` and ``paper`` when
+            testing concepts of the domain, and for no suite with user demonstrations. Tasks whose concept was not learned are
+            skipped; learned concepts outside all suites are judged by their name, if the domain can read it.
+        closed_loop: execute plans when testing (``test``, ``invert``), in domains with an environment.
+        figures: number of samples per task in a TensorBoard figure; 0 for no figures.
         results: file to which rows are added when testing (``test``, ``invert``); ``None`` for ``results.csv`` in the log folder.
-        references: also measure reference policies when testing; the same for every method, they are needed once a seed. ``None``
-            for all but the user's own demonstrations.
-        diversity: also measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.diversity`; adds rows and
-            changes none.
-        films: JSON file to which films of the first :data:`~ftl_lightning.evaluation.films.FILMED` samples or episodes of each task
-            are written when testing, for ``report --html``; ``None`` for none.
-        variant: what tables tell of this run beside the method's name, in place of the method's own words.
-        **generation: how behaviour is generated: the attributes of :class:`~ftl_lightning.evaluation.generation.Generation`, which
-            are keys of a configuration beside the others.
+        references: measure reference policies when testing. The rows are equal for all methods, so a single run per seed suffices.
+            ``None`` for all data except user demonstrations.
+        diversity: measure novelty and coverage when testing, see :mod:`ftl_lightning.evaluation.diversity`; only adds rows.
+        films: JSON file for films of the first :data:`~ftl_lightning.evaluation.films.FILMED` samples or episodes of each task,
+            written when testing, for ``report --html``; ``None`` for none.
+        variant: label of this run in tables; ``None`` for the method's label.
+        **generation: attributes of :class:`~ftl_lightning.evaluation.generation.Generation`, as keys of the same configuration.
     """
 
     def __init__(
@@ -77,8 +74,8 @@ class Evaluator(pl.Callback):
         self.judged: list[TaskResult] = []
         self._projected = False
 
-    def _asked(self, data: pl.LightningDataModule) -> tuple[str, ...]:
-        """The suites that are evaluated, given what is learned from."""
+    def _suite_names(self, data: pl.LightningDataModule) -> tuple[str, ...]:
+        """Names of the evaluated suites."""
         if self.suites is not None:
             return self.suites
         if not isinstance(data, InversionData):
@@ -86,11 +83,11 @@ class Evaluator(pl.Callback):
         return () if data.own else ("training", "paper")
 
     def settings(self, data: pl.LightningDataModule) -> dict[str, Any]:
-        """What is configured here, given what is learned from."""
+        """Evaluation settings by name."""
         generation = self.generation
-        # The suites too: the size of a batch decides how its numbers are rounded.
+        # Suites are included because batch sizes affect rounding.
         return {
-            "suites": ", ".join(self._asked(data)),
+            "suites": ", ".join(self._suite_names(data)),
             "samples": generation.samples,
             "sampler": generation.sampler,
             "steps": generation.steps,
@@ -101,11 +98,11 @@ class Evaluator(pl.Callback):
         }
 
     def config_hash(self, module: Evaluable, data: pl.LightningDataModule, trainer: pl.Trainer) -> str:
-        """What the results file knows this evaluation by."""
+        """Hash of the configuration in the results file."""
         return config_hash(configuration(module, data, self.settings(data), trainer))
 
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Tell mistakes before hours of training, not after."""
+        """Validate the settings before training starts."""
         module = _evaluable(pl_module)
         total = module.model.max_steps
         if total is not None and self.generation.steps > total:
@@ -115,9 +112,9 @@ class Evaluator(pl.Callback):
             loop.expect()
         others = () if loop is None else tuple(loop.others)
         if unknown := [name for name in self.generation.environments if name not in others]:
-            told = f"one of {', '.join(others)}" if others else f"none, as {module.domain.name} has no other"
-            raise UserError(f"evaluation.environments: expected {told}, found {short(unknown[0])!r}")
-        tasks_of(module.domain, self._asked(_data(trainer)), module.concepts)
+            expected = f"one of {', '.join(others)}" if others else f"none, as {module.domain.name} has no other"
+            raise UserError(f"evaluation.environments: expected {expected}, found {short(unknown[0])!r}")
+        tasks_of(module.domain, self._suite_names(_data(trainer)), module.concepts)
 
     on_fit_start = on_validation_start = on_test_start = _check
 
@@ -127,10 +124,10 @@ class Evaluator(pl.Callback):
             return
         module = _evaluable(pl_module)
         means: dict[str, float] = {}
-        if trainer.is_global_zero:  # of several processes the first evaluates, and the others wait
+        if trainer.is_global_zero:  # rank 0 evaluates, the other ranks wait
             self._generate(module, _data(trainer))
-            means = setting_means({(one.task.setting, one.task.name): one.values for one in self.judged})
-        # Others go on with its global generators too, from which a domain's evaluation may draw.
+            means = setting_means({(result.task.setting, result.task.name): result.values for result in self.judged})
+        # Synchronise the global generators, from which a domain's evaluation may draw.
         means, random = trainer.strategy.broadcast((means, Random.now(pl_module.device, 0)))
         if not trainer.is_global_zero:
             random.restore(pl_module.device)
@@ -149,39 +146,39 @@ class Evaluator(pl.Callback):
         if self.closed_loop and module.domain.closed_loop is not None:
             self.judged = execute(module, self.judged, self.generation)
         configured = configuration(module, data, self.settings(data), trainer)
-        beside = self._compare(module, data) if self.judged else {}
-        measured = rows(module, module.domain, self.judged, beside, configured, self.variant)
-        record(measured, self.results, trainer.log_dir or trainer.default_root_dir)  # before anything is drawn, which may fail
+        line_results = self._compare(module, data) if self.judged else {}
+        measured = rows(module, module.domain, self.judged, line_results, configured, self.variant)
+        record(measured, self.results, trainer.log_dir or trainer.default_root_dir)  # before drawing, which may fail
         if self.films and trainer.is_global_zero:
-            count = write_films(self.films, module.domain, self.judged, beside, measured)
+            count = write_films(self.films, module.domain, self.judged, line_results, measured)
             say(f"{self.films}: {count} films")
-        own = own_rows(measured)
+        method_rows = own_rows(measured)
         for logger in _boards(trainer):
             self._draw(logger, module, trainer.global_step)
             self._project(logger, module, trainer.global_step)
-            if own:
-                log_test(logger, chosen(module, data, self.settings(data), trainer, own), measured, trainer.global_step)
+            if method_rows:
+                log_test(logger, chosen(module, data, self.settings(data), trainer, method_rows), measured, trainer.global_step)
 
     def _generate(self, module: Evaluable, data: PretrainingData | InversionData) -> None:
-        tasks = tasks_of(module.domain, self._asked(data), module.concepts)
+        tasks = tasks_of(module.domain, self._suite_names(data), module.concepts)
         self.judged = generate(module, tasks, self.generation, data.root)
 
     def _compare(self, module: Evaluable, data: PretrainingData | InversionData) -> Mapping[str, Sequence[TaskResult]]:
-        """Measure novelty and coverage, and what stands beside the method's numbers: the reference lines by name."""
+        """Measure novelty and coverage, and return the reference lines by name."""
         domain, seed = module.domain, self.generation.seed
         compared = self.references if self.references is not None else not getattr(data, "own", False)
-        beside = references(self.judged, domain, module.demonstrated, seed, self.generation.environments) if compared else {}
+        line_results = references(self.judged, domain, module.demonstrated, seed, self.generation.environments) if compared else {}
         if self.diversity:
             real = real_behaviour(self.judged, domain, module.demonstrated, data.root, seed)
             self.judged = [known.added(generated) for known, generated in zip(real, self.judged, strict=True)]
-            beside |= lines(real) if compared else {}
-        return beside
+            line_results |= lines(real) if compared else {}
+        return line_results
 
     def _draw(self, logger: TensorBoardLogger, module: Evaluable, step: int) -> None:
         try:
             if self.figures:
                 draw(logger, self.judged, module.domain, module.demonstrated, self.figures, step)
-        except Exception as error:  # whatever a domain's pictures raise: numbers are there already
+        except Exception as error:  # any error of a domain's pictures: results are already saved
             _LOG.warning("domain %s: its pictures cannot be drawn: %r", module.domain.name, error)
 
     def _project(self, logger: TensorBoardLogger, module: Evaluable, step: int) -> None:
@@ -190,10 +187,10 @@ class Evaluator(pl.Callback):
 
 
 def _evaluable(module: pl.LightningModule) -> Evaluable:
-    """The module, if it can be evaluated.
+    """Check that a module can be evaluated.
 
     Raises:
-        UserError: for one that generates no behaviour.
+        UserError: for a module that generates no behaviour.
     """
     if not is_evaluable(module):
         raise UserError(f"model.class_path: expected a module that generates behaviour, found {type(module).__name__}")
@@ -201,7 +198,7 @@ def _evaluable(module: pl.LightningModule) -> Evaluable:
 
 
 def _data(trainer: pl.Trainer) -> PretrainingData | InversionData:
-    """What the trainer was given to learn from, or to test on."""
+    """The trainer's data module."""
     data: PretrainingData | InversionData = trainer.datamodule  # type: ignore[attr-defined]
     return data
 

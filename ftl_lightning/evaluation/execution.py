@@ -1,4 +1,4 @@
-"""Executed plans as a user of the Python API holds them: outcomes, frames, a film."""
+"""Execution in the Python API: outcomes, frames and films of episodes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,19 +32,19 @@ def episodes(
     replan: int,
     seed: int,
 ) -> tuple[Rollout, Mapping[int, Sequence[Tensor]]]:
-    """Execute a concept from some scenes.
+    """Execute a concept from given scenes.
 
     Args:
-        model: makes the plans.
-        loop: the environment.
+        model: model that makes the plans.
+        loop: environment.
         concept: ``(K, ...)``.
-        starts: initial states with scenes, one for each episode.
+        starts: initial state and scene of each episode.
         sampling: sampler, steps and temperature.
-        replan: steps that a plan is followed before a new one is made.
-        seed: of the noise.
+        replan: number of steps before replanning.
+        seed: seed of the noise.
 
     Returns:
-        What happened, and for each episode the plan ``(horizon, state)`` of each of its steps.
+        Rollout, and the plan ``(horizon, state)`` at each step, by episode.
     """
     draws = [generator("cpu", seed, 1, episode) for episode in range(len(starts))]
     make = sampled_plans(model, [concept] * len(starts), sampling, draws)
@@ -54,13 +54,13 @@ def episodes(
 
 @dataclass(frozen=True, repr=False)
 class Execution(Shown):
-    """Episodes in which plans were executed.
+    """Executed episodes.
 
     Attributes:
-        domain: whose environment it was.
-        goal: in words; empty if nobody judged.
-        rollout: what happened.
-        followed: for each episode the plan ``(horizon, state)`` of each of its steps.
+        domain: domain of the environment.
+        goal: goal as text; empty without a judgement.
+        rollout: recorded episodes.
+        followed: plan ``(horizon, state)`` at each step, by episode.
     """
 
     domain: Domain
@@ -78,20 +78,20 @@ class Execution(Shown):
 
     @property
     def outcomes(self) -> dict[str, float]:
-        """Share of episodes in which something happened, or its mean, by name; empty without a goal."""
+        """Share of episodes (boolean outcomes) or mean (numeric outcomes) by name; empty without a goal."""
         if not self.goal:
             return {}
         judged = self.domain.judge(self.goal, self.rollout)
         return {name: float(values.float().mean()) for name, values in judged.items()}
 
     def frames(self, episode: int = 0) -> list[NDArray[np.uint8]]:
-        """Pictures ``(height, width, 3)`` of an episode.
+        """Render the frames ``(height, width, 3)`` of an episode.
 
         Args:
-            episode: its number from 0.
+            episode: number of the episode, from 0.
 
         Raises:
-            UserError: for an episode that did not begin, or a domain that films none.
+            UserError: for an episode that did not begin, or a domain without films of episodes.
         """
         plans = self.followed.get(episode) if isinstance(episode, int) else None
         if not plans:
@@ -101,14 +101,14 @@ class Execution(Shown):
         return film(self.rollout.take(episode, episode + 1), torch.stack(list(plans)))
 
     def save(self, path: str | Path, episode: int = 0) -> None:
-        """Write an episode as an animated .gif.
+        """Save an episode as an animated .gif.
 
         Args:
-            path: of the file.
-            episode: its number from 0.
+            path: output file.
+            episode: number of the episode, from 0.
 
         Raises:
-            UserError: for another ending of the file's name, an episode that did not begin, or a domain that films none.
+            UserError: for another suffix, an episode that did not begin, or a domain without films of episodes.
         """
         if Path(path).suffix != ".gif":
             raise UserError(f"{path}: expected a name that ends in .gif, found {Path(path).suffix or 'no ending'}")

@@ -1,4 +1,4 @@
-"""Films of an evaluation in a file of shapes, with the rows that they belong to: what ``report --html`` shows."""
+"""Vector films of an evaluation with their rows, for ``report --html``."""
 
 import base64
 import json
@@ -20,14 +20,14 @@ from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.tensor_file import write_text
 
 FILMED = 4
-"""Samples or episodes of each task, the first."""
+"""Number of filmed samples or episodes per task."""
 FORMAT = 1
 STEPS, ABSENT = 10_000, -32_768
-"""Steps of a coordinate across the window's width, and the number of a point that is not there."""
+"""Coordinate steps across the window's width, and the coordinate of an absent point."""
 
 
 def film_of(behaviour: TaskResult, domain: Domain, number: int) -> VectorFilm | None:
-    """The film of an episode, or of a plan that was not executed; ``None`` where the domain draws none."""
+    """Film of an episode, or of a plan without execution; ``None`` if the domain draws none."""
     loop = domain.closed_loop
     if behaviour.rollout is not None and loop is not None:
         return loop.vector_film(behaviour.rollout.take(number, number + 1)) if loop.vector_film else None
@@ -49,34 +49,34 @@ def write_films(
     """Write the films of an evaluation.
 
     Args:
-        path: of a JSON file.
-        domain: that draws.
-        judged: what the method did.
-        references: what reference lines did, by name.
-        rows: of the evaluation, which say what each film is of.
+        path: JSON file.
+        domain: domain that draws.
+        judged: behaviour of the method.
+        references: behaviour of the reference lines, by name.
+        rows: rows of the evaluation, which describe the films.
 
     Returns:
-        How many there are.
+        Number of films.
     """
-    shapes: dict[str, int] = {}  # roads and tables are the same in many films
+    shapes: dict[str, int] = {}  # many films share roads and tables
     films = []
     sources = [(None, judged), *references.items()]
     for name, behaviours in sources:
         for behaviour in behaviours:
-            own = [
+            measured = [
                 row
                 for row in rows
                 if (row.setting, row.task) == (behaviour.task.setting, behaviour.task.name)
                 and (row.role == METHOD if name is None else row.method == name)
             ]
-            if not own:
+            if not measured:
                 continue
-            values = {row.metric: row.value for row in own}
-            told = {key: value for key, value in asdict(own[0]).items() if key not in ("metric", "value")}
+            values = {row.metric: row.value for row in measured}
+            subject = {key: value for key, value in asdict(measured[0]).items() if key not in ("metric", "value")}
             drawn = [_entry(behaviour, domain, number, shapes) for number in range(min(FILMED, len(behaviour.states)))]
-            if found := [entry for entry in drawn if entry]:
-                films.append({"row": told, "values": values, "goal": behaviour.task.goal, "films": found})
-    text = json.dumps({"format": FORMAT, "domain": domain.name, "shapes": [json.loads(one) for one in shapes], "tasks": films})
+            if entries := [entry for entry in drawn if entry]:
+                films.append({"row": subject, "values": values, "goal": behaviour.task.goal, "films": entries})
+    text = json.dumps({"format": FORMAT, "domain": domain.name, "shapes": [json.loads(shape) for shape in shapes], "tasks": films})
     write_text(Path(path), text + "\n")
     return sum(len(task["films"]) for task in films)
 
@@ -85,7 +85,7 @@ def _entry(behaviour: TaskResult, domain: Domain, number: int, shapes: dict[str,
     film = film_of(behaviour, domain, number)
     if film is None:
         return None
-    used = [shapes.setdefault(json.dumps(one), len(shapes)) for one in packed(film)]
+    used = [shapes.setdefault(json.dumps(shape), len(shapes)) for shape in packed(film)]
     window = [round(edge, 4) for edge in film.window]
     return {"start": number, "rate": round(film.rate, 3), "frames": film.frames, "window": window, "shapes": used} | {
         "outcomes": dict(_outcomes(behaviour, number))
@@ -93,10 +93,10 @@ def _entry(behaviour: TaskResult, domain: Domain, number: int, shapes: dict[str,
 
 
 def _outcomes(behaviour: TaskResult, number: int) -> Iterator[tuple[str, bool | float]]:
-    """How an episode ended in the domain's own environment, or what metrics say of a plan."""
-    found: Mapping[str, Tensor] = behaviour.outcomes if behaviour.rollout is not None else behaviour.measured
-    for name, values in found.items():
-        if values.dim() and not name.endswith(")"):  # others' names stand in brackets
+    """Outcomes of an episode in the domain's main environment, or metrics of a plan."""
+    by_name: Mapping[str, Tensor] = behaviour.outcomes if behaviour.rollout is not None else behaviour.measured
+    for name, values in by_name.items():
+        if values.dim() and not name.endswith(")"):  # names of alternative environments stand in brackets
             value = values[number]
             if value.dtype == torch.bool:
                 yield name, bool(value)
@@ -105,7 +105,7 @@ def _outcomes(behaviour: TaskResult, number: int) -> Iterator[tuple[str, bool | 
 
 
 def packed(film: VectorFilm) -> list[dict[str, Any]]:
-    """Shapes as JSON: points as 16-bit numbers, in steps of the window's width from its lower left corner."""
+    """Pack shapes as JSON: points as 16-bit integers, in :data:`STEPS` per window width from the lower left corner."""
     return [_packed(shape, film.window) for shape in film.shapes]
 
 
@@ -113,24 +113,24 @@ def _packed(shape: Shape, window: tuple[float, float, float, float]) -> dict[str
     left, lower, width, _ = window
     steps = (np.asarray(shape.points, dtype=np.float64) - (left, lower)) / width * STEPS
     whole = _whole(steps)
-    whole = whole[:1] if (whole == whole[:1]).all() else whole  # most things on a table do not move
-    told: dict[str, Any] = {"kind": shape.kind, "colour": shape.colour, "count": shape.points.shape[1]}
-    told |= {"size": round(shape.size, 4)} if shape.size else {}
-    told |= {} if shape.filled else {"hollow": True}
-    return told | {"points": base64.b64encode(whole.tobytes()).decode()}
+    whole = whole[:1] if (whole == whole[:1]).all() else whole  # a single frame for static objects
+    entry: dict[str, Any] = {"kind": shape.kind, "colour": shape.colour, "count": shape.points.shape[1]}
+    entry |= {"size": round(shape.size, 4)} if shape.size else {}
+    entry |= {} if shape.filled else {"hollow": True}
+    return entry | {"points": base64.b64encode(whole.tobytes()).decode()}
 
 
 MILLIMETRES = 1000
-"""In a metre; coordinates of what moves in space are whole ones."""
+"""Millimetres per metre; 3D coordinates are integers in millimetres."""
 
 
 def packed_space(motion: Wireframe) -> dict[str, Any]:
-    """A motion in space as JSON, which a page can turn: x and y along the floor, z upwards.
+    """Pack a 3D motion as JSON: x and y along the floor, z upwards.
 
     Returns:
-        ``points``, base64 of little-endian int16 ``(frame, point, 3)`` in millimetres, within 32 metres, :data:`ABSENT` where they
-        are not finite; ``count``, how many points there are; ``lines``, pairs of points, with their ``colours``; ``heads``, a
-        point, a radius in metres and a colour each; ``rate``, frames a second; ``room``, radius of the floor and height in metres.
+        ``points``, base64 of little-endian int16 ``(frame, point, 3)`` in millimetres, within 32 metres, :data:`ABSENT` for
+        non-finite values; ``count``, number of points; ``lines``, pairs of points, with ``colours``; ``heads``, a point, a radius
+        in metres and a colour each; ``rate``, frames per second; ``room``, radius of the floor and height in metres.
     """
     steps = motion.points.astype(np.float64) * MILLIMETRES
     return {
@@ -145,6 +145,6 @@ def packed_space(motion: Wireframe) -> dict[str, Any]:
 
 
 def _whole(steps: NDArray[np.float64]) -> NDArray[np.int16]:
-    """Numbers of steps as 16-bit numbers; those that are not finite are :data:`ABSENT`."""
+    """Round to 16-bit integers; non-finite values become :data:`ABSENT`."""
     there = np.isfinite(steps)
     return np.where(there, np.clip(np.rint(np.where(there, steps, 0)), ABSENT + 1, -ABSENT - 1), ABSENT).astype("<i2")

@@ -1,4 +1,4 @@
-"""Generating what is evaluated: every task's behaviour in one batch of the network, judged, and executed if it is asked for."""
+"""Generation, judgement and optional execution of the evaluated behaviour, batched over tasks."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -23,20 +23,20 @@ from ftl_lightning.seeding import EVALUATION_SEED, generator, task_key
 
 @dataclass(frozen=True)
 class Generation:
-    """How behaviour is generated.
+    """Settings of generation.
 
     Attributes:
-        samples: generated for each task; the paper's number is 50.
+        samples: number of samples per task; 50 in the paper.
         sampler: ``'ddpm'`` (the paper's), ``'ddim'`` or ``'dpm_solver'``.
-        steps: of the sampler, at most the model's T.
+        steps: number of sampler steps, at most the model's T.
         temperature: the paper's alpha.
-        environments: of the domain's others, in which plans are executed besides its own; outcomes there are metrics of their own,
+        environments: alternative environments of the domain in which plans are also executed; outcomes there are separate metrics,
             such as ``closed loop success (step veto)``.
-        replan: steps that a plan is followed before a new one is made; the paper's number is 1.
-        seed: of the samples.
+        replan: number of steps before replanning; 1 in the paper.
+        seed: seed of the samples.
 
     Raises:
-        UserError: at construction, naming the key below ``evaluation``, for a value that is out of its range.
+        UserError: at construction, naming the key below ``evaluation``, for a value out of range.
     """
 
     samples: int = 50
@@ -65,34 +65,33 @@ class Generation:
         return Sampling(self.sampler, self.steps, self.temperature)
 
     def noise(self, task: EvaluationTask, *episode: int) -> torch.Generator:
-        """What draws a task's samples, or the plans of one of its episodes: it depends on no other task."""
+        """Generator of a task's samples, or of the plans of an episode, independent of other tasks."""
         demonstrated = {"new": (), "demonstrated": (1,), "last": (2,)}[task.initial]
         return generator("cpu", self.seed, task_key(task.name), *demonstrated, *episode)
 
 
 def tasks_of(domain: Domain, suites: Sequence[str], learned: Sequence[str]) -> list[EvaluationTask]:
-    """What is to be evaluated.
+    """List the evaluated tasks.
 
     Args:
-        domain: whose tasks they are.
-        suites: names of suites of the domain, all of whose tasks are evaluated.
-        learned: names of learned concepts. Those that no suite asks for are tasks by themselves, if the domain can read them or
-            judges nothing.
+        domain: domain of the tasks.
+        suites: names of suites of the domain.
+        learned: names of learned concepts. Concepts outside all suites become tasks if the domain can read them or has no metrics.
 
     Raises:
-        UserError: for a suite that the domain has not.
+        UserError: for an unknown suite.
     """
     for name in suites:
         if name not in domain.concepts.suites:
             raise UserError(f"evaluation.suites: expected some of {', '.join(domain.concepts.suites)}, found {name!r}")
     tasks = [task for name in suites for task in domain.concepts.suites[name].tasks]
-    asked = {name for task in tasks for name in task.learned}
-    others = [name for name in learned if name not in asked and (domain.concepts.reads(name) or not domain.metrics)]
-    return tasks + [EvaluationTask(OWN, name, learned=(name,)) for name in others]
+    covered = {name for task in tasks for name in task.learned}
+    extra = [name for name in learned if name not in covered and (domain.concepts.reads(name) or not domain.metrics)]
+    return tasks + [EvaluationTask(OWN, name, learned=(name,)) for name in extra]
 
 
 def _composed(module: Evaluable, tasks: Iterable[EvaluationTask]) -> dict[EvaluationTask, Composition]:
-    """What each task is generated from, in their order; tasks whose concepts were not learned are left out."""
+    """Composition of each task, in order, without tasks whose concepts were not learned."""
     return {task: composition for task in tasks if (composition := module.composition(task))}
 
 
@@ -100,19 +99,19 @@ def _composed(module: Evaluable, tasks: Iterable[EvaluationTask]) -> dict[Evalua
 def generate(
     module: Evaluable, tasks: Sequence[EvaluationTask], generation: Generation, root: Path | None = None
 ) -> list[TaskResult]:
-    """Generate and judge tasks, those with equally many samples in one batch of the network.
+    """Generate and judge behaviour; tasks with equal numbers of samples share a batch.
 
     Args:
-        module: what generates.
-        tasks: what is asked; those whose concepts were not learned are left out.
-        generation: how.
+        module: evaluated module.
+        tasks: evaluated tasks; tasks whose concepts were not learned are skipped.
+        generation: settings.
         root: folder of the user's copy of the data.
 
     Returns:
-        The tasks that are not left out, each once, in their order.
+        Results of the tasks that are not skipped, without duplicates, in order.
 
     Raises:
-        UserError: for a task that starts in demonstrations where there are none.
+        UserError: for a task that starts in missing demonstrations.
     """
     model, domain = module.model, module.domain
     compositions = _composed(module, tasks)
@@ -131,7 +130,7 @@ def generate(
 
 
 def _starts(task: EvaluationTask, module: Evaluable, generation: Generation, root: Path | None) -> InitialStates | None:
-    """Where a task's behaviour starts, or ``None`` where the domain has no initial states."""
+    """Initial states of a task; ``None`` if the domain has none."""
     domain = module.domain
     if not domain.observed:
         return None
@@ -147,12 +146,12 @@ def _starts(task: EvaluationTask, module: Evaluable, generation: Generation, roo
 
 @torch.no_grad()
 def execute(module: Evaluable, judged: Sequence[TaskResult], generation: Generation) -> list[TaskResult]:
-    """The same tasks with their episodes, in which the model makes new plans on the way.
+    """Execute tasks with replanning.
 
     Args:
-        module: what generated.
-        judged: what it generated, with the initial states that episodes start in.
-        generation: how.
+        module: evaluated module.
+        judged: generated behaviour with the initial states of the episodes.
+        generation: settings.
 
     Raises:
         UserError: for a domain without an environment.
@@ -172,7 +171,7 @@ def execute(module: Evaluable, judged: Sequence[TaskResult], generation: Generat
     for environment in generation.environments:
         done = executed(done, follower(), domain, environment)
     firsts = itertools.accumulate((len(behaviour.states) for behaviour in judged[:-1]), initial=0)
-    followed = (policy.followed.get(first) for first in firsts)  # none where the first episode could not begin
+    followed = (policy.followed.get(first) for first in firsts)  # None if the first episode failed at reset
     return [
         replace(behaviour, followed=None if plans is None else torch.stack(plans))
         for behaviour, plans in zip(done, followed, strict=True)

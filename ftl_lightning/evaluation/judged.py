@@ -1,4 +1,4 @@
-"""Generated behaviour and what it was judged to be: the one place where metrics are computed from judgements."""
+"""Generated behaviour with its judgements, and the metrics computed from them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,23 +14,22 @@ from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import roll_out
 
 WON, LOST = "won against ", "lost against "
-"""Metrics of the share of episodes in which only the method succeeds, or only a reference policy from the same initial state."""
+"""Prefixes of metrics: share of episodes in which only the method succeeds, or only a policy from the same initial state."""
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Generated behaviour of one task.
+    """Generated behaviour of a task.
 
     Attributes:
-        task: what was asked.
+        task: evaluated task.
         states: plans ``(sample, horizon, state)``.
-        measured: what the domain's metrics say of them, by name: ``(sample,)``, or ``()`` for the whole set; NaN where a metric
-            says nothing of a plan.
-        starts: initial states that they start from, or ``None``.
-        rollout: what happened when they were executed, if they were.
-        followed: the plan ``(step, horizon, state)`` of each step of the first episode, if they were.
-        outcomes: the domain's judgement of that, by name ``(sample,)``; in other environments, with theirs behind it.
-        diversity: novelty and coverage, so far as they are known, see :mod:`ftl_lightning.evaluation.diversity`.
+        measured: values of the domain's metrics by name: ``(sample,)``, or ``()`` for the whole set; NaN for not applicable.
+        starts: initial states of the plans, or ``None``.
+        rollout: rollout of the plans; ``None`` without execution.
+        followed: plan ``(step, horizon, state)`` at each step of the first episode; ``None`` without execution.
+        outcomes: the domain's outcomes of the rollout by name ``(sample,)``; names from other environments have a suffix.
+        diversity: novelty and coverage, if measured, see :mod:`ftl_lightning.evaluation.diversity`.
     """
 
     task: EvaluationTask
@@ -48,12 +47,12 @@ class TaskResult:
         return cls(task, states, domain.measure(task.goal, states, starts), starts)
 
     def executed(self, rollout: Rollout, domain: Domain, environment: str = "") -> Self:
-        """Behaviour with its episodes, judged by the task's goal; one whose plan was not finite is no success.
+        """Add a rollout, judged by the task's goal; failed episodes are no success.
 
         Args:
-            rollout: the episodes.
-            domain: whose they are.
-            environment: of the domain's others, in which they took place; its outcomes are beside those that there are.
+            rollout: episodes.
+            domain: domain of the task.
+            environment: name of an alternative environment, whose outcomes are added to the existing outcomes; empty for the main.
         """
         outcomes = domain.judge(self.task.goal, rollout)
         outcomes |= {SUCCESS: outcomes[SUCCESS] & ~rollout.failed}
@@ -63,19 +62,19 @@ class TaskResult:
         return replace(self, rollout=rollout, outcomes=outcomes)
 
     def compared(self, diversity: Mapping[str, float]) -> Self:
-        """Behaviour with its novelty and coverage."""
+        """Set novelty and coverage."""
         return replace(self, diversity=diversity)
 
     @property
     def right(self) -> Tensor | None:
-        """Whether each plan is right ``(sample,)``, by the first metric that says so; ``None`` if none does."""
+        """Whether each plan is right ``(sample,)``, by the first boolean metric per plan; ``None`` without such a metric."""
         return next((values for values in self.measured.values() if values.dtype == torch.bool and values.dim()), None)
 
     @property
     def values(self) -> dict[str, float]:
-        """Every metric's value: those of plans, what happened when they were executed after ``closed loop``, and diversity.
+        """Value of every metric: metrics of plans, outcomes of execution with prefix ``closed loop``, and diversity.
 
-        Metrics that say nothing of any plan are left out.
+        Metrics without an applicable plan are omitted.
         """
         plans = {name: share(values) for name, values in self.measured.items() if not values.isnan().all()}
         plans |= {f"{CLOSED} {name}": share(values) for name, values in self.outcomes.items()}
@@ -83,25 +82,25 @@ class TaskResult:
 
 
 def share(values: Tensor) -> float:
-    """Share of true values, or the mean of numbers; those that are NaN do not count."""
-    from torchmetrics import MeanMetric  # two seconds of import, which tables and films of what was judged do not need
+    """Share of true values, or the mean of numbers; NaN is excluded."""
+    from torchmetrics import MeanMetric  # slow import, not needed for tables and films
 
-    metric = MeanMetric(nan_strategy="ignore", sync_on_compute=False)  # of several processes one evaluates
+    metric = MeanMetric(nan_strategy="ignore", sync_on_compute=False)  # only rank 0 evaluates
     metric.update(values.float())
     return float(metric.compute())
 
 
 def paired(generated: TaskResult, reference: TaskResult, policy: str, domain: Domain) -> dict[str, Tensor]:
-    """In which episodes ``(sample,)`` a method succeeds and a policy, from the same initial state, does not, and the reverse.
+    """Compare a method with a policy from the same initial states: episodes ``(sample,)`` in which only one of the two succeeds.
 
     Args:
-        generated: what the method did.
-        reference: what the policy did.
-        policy: its name.
-        domain: whose headline decides, if it is an outcome, else success.
+        generated: behaviour of the method.
+        reference: behaviour of the policy.
+        policy: name of the policy.
+        domain: domain whose headline metric defines success, if it is an outcome.
 
     Returns:
-        both by their metric's name, in the domain's own environment and in each other in which both acted.
+        Episodes won and lost by metric name, in each environment in which both acted.
     """
     name = domain.headline.removeprefix(f"{CLOSED} ")
     decisive = name if name != domain.headline else SUCCESS
@@ -114,13 +113,13 @@ def paired(generated: TaskResult, reference: TaskResult, policy: str, domain: Do
 
 
 def standard_error(values: Sequence[float]) -> float:
-    """Standard error of the mean over tasks; 0 for a single one."""
+    """Standard error of the mean over tasks; 0 for a single task."""
     count = len(values)
     return float(torch.tensor(values).std() / count**0.5) if count > 1 else 0.0
 
 
 def executed(judged: Sequence[TaskResult], policy: Policy, domain: Domain, environment: str = "") -> list[TaskResult]:
-    """The same tasks with their episodes, which run all side by side; in the domain's own environment or one of its others.
+    """Execute all tasks in parallel, in the domain's main or an alternative environment.
 
     Raises:
         UserError: for a domain without an environment.

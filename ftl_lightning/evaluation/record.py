@@ -1,4 +1,4 @@
-"""What an evaluation leaves: rows in a results file, and a table in the terminal."""
+"""Recording an evaluation: rows in a results file and a table in the terminal."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,16 +12,16 @@ def record(rows: Sequence[Row], results: str | None, folder: str | Path) -> None
     """Add rows to the results file and show their summary.
 
     Args:
-        rows: of one evaluation; without any, nothing is written or shown.
-        results: the file; ``None`` for ``results.csv`` in the folder, which is told.
-        folder: the run's log folder.
+        rows: rows of an evaluation; if empty, nothing is written or shown.
+        results: results file; ``None`` for ``results.csv`` in ``folder``, whose path is then printed.
+        folder: log folder of the run.
 
     Raises:
-        UserError: for a file that is none of results, or cannot be written.
+        UserError: for an invalid results file or a write error.
     """
     if not rows:
         return
-    from ftl_lightning.evaluation.results import append_rows  # pandas, which nothing needs before
+    from ftl_lightning.evaluation.results import append_rows  # lazy import of pandas
 
     path = results or Path(folder) / "results.csv"
     append_rows(path, list(rows))

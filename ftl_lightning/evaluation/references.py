@@ -1,4 +1,4 @@
-"""Reference lines: what trivial policies and oracles do on the tasks that were judged, from the same initial states."""
+"""Reference lines: behaviour of trivial policies and oracles on the same tasks and initial states."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.tensor_file import bytes_hash
 
 _KNOWN: dict[tuple[Any, ...], Any] = {}
-"""What they did, by their names and all that it depends on: the cells of an ablation compare with the same."""
+"""Cache of reference behaviour by name and all arguments, shared by the cells of an ablation."""
 
 
 def references(
@@ -24,14 +24,14 @@ def references(
     seed: int,
     environments: Sequence[str] = (),
 ) -> dict[str, list[TaskResult]]:
-    """Each reference policy's behaviour by its name; executed where the method's was.
+    """Behaviour of each reference policy by name, executed if the method's behaviour was executed.
 
     Args:
-        judged: what the method did.
-        domain: whose policies they are.
-        demonstrated: what a concept was learned from, by its name.
-        seed: of the policies.
-        environments: of the domain's others, in which the method's was executed besides its own.
+        judged: behaviour of the method.
+        domain: domain of the policies.
+        demonstrated: function from a concept's name to its demonstrations.
+        seed: seed of the policies.
+        environments: alternative environments in which the method's behaviour was executed.
     """
     loop = None if all(behaviour.rollout is None for behaviour in judged) else domain.closed_loop
     by_policy = {name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.references}
@@ -45,7 +45,7 @@ def references(
 def _planned(
     name: str, like: TaskResult, domain: Domain, loop: ClosedLoop | None, seed: int, environments: Sequence[str]
 ) -> TaskResult:
-    """A policy that makes its plan once, for the task and the initial states of a method's behaviour."""
+    """Run a policy that plans once, for the task and initial states of ``like``."""
     task, starts, (count, _, columns) = like.task, like.starts, like.states.shape
     key = (name, domain.name, task.goal, count, _hash(starts), seed)
     if key not in _KNOWN:
@@ -74,7 +74,7 @@ def _acted(
     seed: int,
     environments: Sequence[str],
 ) -> TaskResult | None:
-    """A policy that acts as it goes, from the initial states of a method's behaviour; ``None`` where it would take too long."""
+    """Run a policy that acts step by step from the initial states of ``like``; ``None`` if it would take too long."""
     task, starts = like.task, expect_starts(like.starts)
     demonstrations, behaviour = demonstrations_of(task, demonstrated), like
     for place in ("", *environments):

@@ -1,4 +1,4 @@
-"""The results file: one :class:`~ftl_lightning.evaluation.row.Row` for every evaluated number."""
+"""Results files: a :class:`~ftl_lightning.evaluation.row.Row` for every measured value."""
 
 import csv
 import math
@@ -15,27 +15,27 @@ from ftl_lightning.limits import MOST_TEXT, expect_readable
 from ftl_lightning.tensor_file import alone, atomic, visible
 
 FOLDER = r"\w[\w .+-]{0,99}"
-"""What a domain may be called: each has a folder in a report."""
+"""Pattern of domain names, which are folder names in a report."""
 LARGEST_WHOLE = 2**53
-"""Of whole numbers, seeds among them."""
+"""Maximum integer, including seeds."""
 COLUMNS = [field.name for field in fields(Row)]
 _WHOLE = [field.name for field in fields(Row) if field.type is int]
 _MAYBE_EMPTY = ("setting", "task", "form", "variant", "omega", "model_hash")
-_TEXT = {field.name: object for field in fields(Row) if field.type is str}  # chosen from faster than pandas's strings
+_TEXT = {field.name: object for field in fields(Row) if field.type is str}  # faster selection than pandas's strings
 _SUBJECT = ["domain", "setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations", "seed", "metric"]
 _KEY = [*_SUBJECT, "n", "config_hash"]
-"""What makes a row the same measurement as another, which it then replaces."""
+"""Columns that identify a measurement; a newer row with equal values replaces an older row."""
 
 
 def append_rows(path: str | Path, rows: list[Row]) -> None:
-    """Add rows to a results file, made if missing; the same measurements are replaced. Whole or not at all."""
+    """Add rows to a results file atomically, creating it if missing and replacing equal measurements."""
     add_rows(path, pd.DataFrame([asdict(row) for row in rows], columns=COLUMNS))
 
 
 def add_rows(path: str | Path, table: pd.DataFrame) -> None:
-    """Add rows of a table by :data:`COLUMNS`; the same measurements are replaced. Whole or not at all.
+    """Add rows of a table with :data:`COLUMNS` atomically, replacing equal measurements.
 
-    Processes that add to the same file wait for one another.
+    A lock serialises processes that write to the same folder.
     """
     path = Path(path)
     with alone(path.parent):
@@ -53,25 +53,25 @@ def labels(rows: pd.DataFrame) -> pd.Series:
 
 
 def replaced(rows: pd.DataFrame) -> int:
-    """How many rows :func:`latest` leaves out: the same subject was measured again later, in another configuration."""
+    """Number of rows that :func:`latest` removes: subjects measured again later in another configuration."""
     return len(rows) - len(latest(rows))
 
 
 def latest(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of rows that differ only in the number of samples and in how they were configured, the one that was measured last."""
+    """Keep the last of the rows that differ only in the number of samples and the configuration."""
     return rows.drop_duplicates(_SUBJECT, keep="last")
 
 
 COMPARISON, CURVES, CHANGES, PAPER_SIZE = "comparison", "curves", "changes", "paper_size"
-"""Names of results files that are shown apart from ablations: all methods; numbers of demonstrations and components; ours with one
-of its changes to the paper's form taken away at a time; models of the paper's size, which have no table of their own."""
+"""Names of results files that are not ablations: all methods; numbers of demonstrations and components; our method without each of
+its changes to the paper's form; models of the paper's size, which have no separate table."""
 
 
 def read_study(path: str | Path, name: str = "") -> pd.DataFrame:
-    """The rows of the files of this name in a folder; without a name, of all that are not shown apart. Maybe none.
+    """Read the files named ``name`` in a folder, or without a name all ablations. The table may be empty.
 
     Raises:
-        UserError: if there is no such path, or a file has other columns or a cell that is none of its column's.
+        UserError: for a missing file, or a file with wrong columns or an invalid cell.
     """
     path = Path(path)
     files = _files(path) if path.is_dir() else [path]
@@ -85,7 +85,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _parts(path: Path) -> list[str]:
-    # Every second part is a number, so that numbers are compared with numbers alone.
+    # Every second part is a number, so numbers are only compared with numbers.
     return re.split(r"(\d+)", path.as_posix())
 
 
@@ -112,7 +112,7 @@ def _table(file: Path, kinds: Any) -> pd.DataFrame:
 
 
 def _bad_cell(table: pd.DataFrame) -> tuple[int, str, str] | None:
-    """Row, column and what is expected there, of the first cell that is none of its column's."""
+    """Row, column and expected content of the first invalid cell; ``None`` if all are valid."""
     for name, values in table.items():
         numbers = pd.to_numeric(values.astype(str), errors="coerce") if name not in _TEXT else pd.Series(dtype=float)
         if name == "role":
@@ -129,15 +129,15 @@ def _bad_cell(table: pd.DataFrame) -> tuple[int, str, str] | None:
         if not good.all():
             return int((~good).to_numpy().argmax()), str(name), expected
         if name not in _TEXT and len(values) and values.dtype.kind not in ("iu" if name in _WHOLE else "iuf"):
-            return 0, str(name), expected  # numbers that are written in another way
+            return 0, str(name), expected  # numbers in another notation
     return None
 
 
 def read_rows(path: str | Path) -> pd.DataFrame:
-    """Read one results file, or all ``.csv`` files of a folder.
+    """Read a results file, or all ``.csv`` files of a folder.
 
     Raises:
-        UserError: if there is none, or a file has other columns.
+        UserError: for a missing file, or a file with wrong columns or an invalid cell.
     """
     path = Path(path)
     if not path.exists():

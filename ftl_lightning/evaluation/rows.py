@@ -1,4 +1,4 @@
-"""What an evaluation adds to the results file, and the configuration that its numbers are known by."""
+"""Rows of an evaluation for the results file, and the configuration behind their hash."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,24 +24,24 @@ LATER = (
     ("adapter_scope", "concept"),
     ("form", ""),
 )
-"""Settings that came later, at the values under which everything is as before: they are left out, so that hashes stay."""
+"""Settings added later, with their neutral values: they are omitted from the configuration to keep hashes."""
 
 
 def public(hparams: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Hyper-parameters without those that Lightning's command line adds for itself."""
+    """Hyper-parameters without the private keys of Lightning's command line."""
     return [(key, value) for key, value in hparams.items() if not key.startswith("_")]
 
 
 def configuration(
     module: Evaluable, data: pl.LightningDataModule, settings: Mapping[str, Any], trainer: pl.Trainer | None = None
 ) -> dict[str, Any]:
-    """Everything that was configured, by its place in a configuration file.
+    """Full configuration, by place in a configuration file.
 
     Args:
-        module: what generates.
-        data: what it learned from.
-        settings: the evaluator's.
-        trainer: what learns. Unusual options of ours count, unless a model is pretrained, which is known by its weights.
+        module: evaluated module.
+        data: training data.
+        settings: settings of the evaluator.
+        trainer: trainer. Its unusual options are included, except in pretraining, where the model's hash identifies the weights.
     """
     demonstrations, loop = data.hparams.get("demonstrations"), module.model.domain.closed_loop
     unusual = getattr(trainer, "unusual", {}) if "pretrained" in module.hparams else {}
@@ -53,19 +53,19 @@ def configuration(
         **{f"trainer/{key}": value for key, value in unusual.items()},
         **({"environment": loop.identity} if "replan" in settings and loop and loop.identity else {}),
         "model/pretrained": module.model.hash,
-        # A trained judge decides values, too; rules have no identity.
+        # Trained metrics affect values too; rules have no identity.
         **{f"metric/{name}": metric.identity for name, metric in module.model.domain.metrics.items() if metric.identity},
         **({"data/demonstrations": _identity(demonstrations)} if demonstrations else {}),
     }
 
 
 def _identity(demonstrations: str) -> str:
-    """A file's hash; a data set with a name and a version, which is no file, is known by these."""
+    """Hash of a file; a data set with a name and a version is returned as it is."""
     return file_hash(demonstrations) if Path(demonstrations).is_file() else demonstrations
 
 
 def config_hash(configured: Mapping[str, Any]) -> str:
-    """16-digit hash of the full configuration."""
+    """Hash of the full configuration, 16 digits."""
     return content_hash([__version__, configured])
 
 
@@ -77,15 +77,15 @@ def rows(
     configured: Mapping[str, Any],
     variant: str | None = None,
 ) -> list[Row]:
-    """The method's numbers, its comparison with policies from the same initial states, and the reference lines' numbers.
+    """Rows of the method, of its paired comparison with policies, and of the reference lines.
 
     Args:
-        module: what generated.
-        domain: that it generated for.
-        judged: what it did.
-        references: what reference policies did, by name.
+        module: evaluated module.
+        domain: domain of the tasks.
+        judged: behaviour of the method.
+        references: behaviour of the reference lines, by name.
         configured: see :func:`configuration`.
-        variant: told beside the method's name, in place of the module's own words.
+        variant: label of the run in tables; ``None`` for the module's label.
     """
     hparams = module.hparams
     learned = {
@@ -107,7 +107,7 @@ def rows(
     def task_rows(behaviour: TaskResult, source: Mapping[str, Any], values: Mapping[str, float]) -> list[Row]:
         task = behaviour.task
         subject = {"domain": domain.name, "setting": task.setting, "task": task.name, "seed": hparams["seed"]}
-        # Reference plans are drawn without demonstrations; policies are given them.
+        # Reference policies use demonstrations, reference plans do not.
         given = demonstrations_of(task, module.demonstrated) if source["method"] not in domain.references else None
         subject["demonstrations"] = 0 if given is None else len(given)
         count = len(behaviour.states)

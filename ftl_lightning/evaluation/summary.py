@@ -1,4 +1,4 @@
-"""The end of a run: one table in the terminal in place of a line for every number."""
+"""Summary table of an evaluation for the terminal."""
 
 import io
 import sys
@@ -17,27 +17,27 @@ from ftl_lightning.printing import line, say
 
 DIVERSITY = (NOVELTY, COVERAGE)
 OWN = "own demonstrations"
-"""The setting of learned concepts that no suite asks for."""
+"""Setting of learned concepts outside all suites."""
 
 
 def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
-    """One evaluation: the user's own concepts first, each with its numbers, then the mean of each setting.
+    """Summarise an evaluation: a line for each task in ``single``, then the mean of each setting.
 
-    Below each, in lines that begin with a dash, stand the reference lines of the same tasks. Errors are standard errors over tasks;
-    a single task has none. The column n tells tasks x samples of each.
+    Lines with a dash are the reference lines of the same tasks. Errors are standard errors over tasks; a single task has none. The
+    column n is the number of tasks x samples per task.
 
     Args:
-        rows: of one evaluation, see :func:`ftl_lightning.evaluation.rows.rows`.
-        single: names of tasks that get a line of their own, for example the concepts of the user's own demonstrations.
+        rows: rows of an evaluation, see :func:`ftl_lightning.evaluation.rows.rows`.
+        single: names of tasks with a separate line, for example the concepts of user demonstrations.
     """
     measured = [row for row in rows if row.role == METHOD and not row.metric.startswith((WON, LOST))]
     metrics = list(dict.fromkeys(row.metric for row in measured))
-    metrics.sort(key=lambda name: DIVERSITY.index(name) if name in DIVERSITY else -1)  # behind what is right, in their order
+    metrics.sort(key=lambda name: DIVERSITY.index(name) if name in DIVERSITY else -1)  # diversity last
     table = Table(title=literal(_title(measured), "table.title"), box=box.SIMPLE, title_justify="left", padding=0)
     table.add_column("mean ± error over tasks")
     for name in (*metrics, "n"):
         table.add_column(literal(name), justify="right")
-    # Single tasks first, in their order; they are not part of their setting's mean.
+    # Single tasks first, in order; they are excluded from their setting's mean.
     order = {name: number for number, name in enumerate(single)}
     task_rows = sorted((row for row in measured if row.task in order), key=lambda row: order[row.task])
     subjects = dict.fromkeys(_subject(row, single) for row in (*task_rows, *(row for row in measured if row.task not in order)))
@@ -52,7 +52,7 @@ def summary_table(rows: Sequence[Row], single: Sequence[str] = ()) -> Table:
 
 
 def _subject(row: Row, single: Sequence[str]) -> tuple[str, str]:
-    """What a line is about: a single task, or a setting."""
+    """Setting and single task of a line; the task is empty for a whole setting."""
     return (row.setting, row.task if row.task in single else "")
 
 
@@ -81,7 +81,7 @@ def _mean(rows: Sequence[Row], metric: str, error: bool = True) -> str:
 
 
 def _samples(rows: Sequence[Row]) -> str:
-    """Of each task, and of how many tasks."""
+    """Number of tasks and of samples per task."""
     counts = sorted({row.n for row in rows})
     samples = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     tasks = len({row.task for row in rows})
@@ -89,12 +89,12 @@ def _samples(rows: Sequence[Row]) -> str:
 
 
 def literal(text: str, style: str = "") -> Text:
-    """A cell that is shown as it reads: rich takes words in brackets for its own marks, and names come from files."""
+    """Cell with literal text: names come from files, and rich would interpret words in brackets as markup."""
     return Text(line(text), style)
 
 
 def plain(table: Table) -> str:
-    """The table as Markdown, as wide as it needs to be: for log files, pipes and TensorBoard."""
+    """Format a table as Markdown of unlimited width, for log files, pipes and TensorBoard."""
     in_markdown = Table(box=box.MARKDOWN, padding=(0, 1, 0, 1))
     for column in table.columns:
         in_markdown.add_column(Text(markdown(str(column.header))), justify=column.justify)
@@ -106,7 +106,7 @@ def plain(table: Table) -> str:
 
 
 def show(table: Table) -> None:
-    """Print a table: as wide as the terminal, or where there is none as :func:`plain`."""
+    """Print a table in the terminal's width, or without a terminal as :func:`plain`."""
     if sys.stdout.isatty():
         Console().print(table)
     else:

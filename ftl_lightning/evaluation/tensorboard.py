@@ -1,7 +1,7 @@
-"""What TensorBoard gets besides curves and figures: the HPARAMS tab, tables, animations and the projector.
+"""TensorBoard output besides curves and figures: HPARAMS tab, tables, animations, projector.
 
-While fitting, a setting's mean is one point of a curve. A test is no curve: its means go to the HPARAMS tab and its numbers,
-task by task, into a table. The HPARAMS tab takes them from charts of one point each, which stand behind all curves and pictures.
+While fitting, a setting's mean is a point of a curve. In a test the means go to the HPARAMS tab and the values per task into a
+table. The HPARAMS tab reads the means from charts with a single point, which come after all curves and pictures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,19 +27,19 @@ from ftl_lightning.evaluation.summary import plain, summary_table
 from ftl_lightning.printing import line
 
 HPARAMS = ".hparams"
-"""Ending of the event file of a run that the HPARAMS tab shows. A file of its own, so that a later test can replace it: of several
-settings of a run TensorBoard shows the first."""
+"""Suffix of the event file for the HPARAMS tab. The file is separate so that a later test can replace it: TensorBoard shows only
+the first settings of a run."""
 COLUMNS = ("text", "set", "component", "part")
-"""Of the projector's points."""
+"""Metadata columns of the projector."""
 WITHOUT = "-"
-"""Where a point has no component."""
+"""Placeholder for a point without a component."""
 
 
 def setting_means(values: Mapping[tuple[str, str], Mapping[str, float]]) -> dict[str, float]:
-    """The mean over tasks of every metric and setting: ``'accuracy/new concept'``, the same names in every domain.
+    """Mean over tasks of every metric and setting, such as ``'accuracy/new concept'``; names are the same in every domain.
 
     Args:
-        values: by setting and task, each by metric.
+        values: values by metric, by setting and task.
     """
     by_name: dict[str, list[float]] = {}
     for (setting, _), by_metric in values.items():
@@ -49,7 +49,7 @@ def setting_means(values: Mapping[tuple[str, str], Mapping[str, float]]) -> dict
 
 
 def own_rows(rows: Sequence[Row]) -> list[Row]:
-    """The method's own numbers, without reference lines and comparisons with them.
+    """Rows of the method without reference lines and paired comparisons.
 
     Args:
         rows: see :func:`ftl_lightning.evaluation.rows.rows`.
@@ -59,13 +59,13 @@ def own_rows(rows: Sequence[Row]) -> list[Row]:
 
 @rank_zero_only
 def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Sequence[Row], step: int) -> None:
-    """Put a test's numbers into the HPARAMS tab and, as tables of settings and of tasks, into the TEXT tab.
+    """Log the results of a test to the HPARAMS tab and, as tables of settings and tasks, to the TEXT tab.
 
     Args:
-        logger: where to.
+        logger: output.
         settings: see :func:`ftl_lightning.evaluation.chosen.chosen`.
-        rows: the test's, some of them the method's own.
-        step: the trainer's.
+        rows: rows of the method and of reference lines.
+        step: global step.
     """
     measured = own_rows(rows)
     values: dict[tuple[str, str], dict[str, float]] = {}
@@ -79,16 +79,16 @@ def log_test(logger: TensorBoardLogger, settings: Mapping[str, Any], rows: Seque
 
 @rank_zero_only
 def log_hparams(logger: TensorBoardLogger, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int = 0) -> None:
-    """Put one run into the HPARAMS tab, with its results as the run's metrics; it replaces what the run has there.
+    """Log a run with its results to the HPARAMS tab, replacing an earlier entry of the run.
 
-    No list of hyper-parameters and metrics is written: of several runs' lists TensorBoard takes any one for all of them, and of
-    runs of other domains shows nothing. Without a list it collects what there is.
+    No list of hyper-parameters and metrics is written: TensorBoard would apply an arbitrary run's list to all runs and hide the
+    metrics of other domains. Without a list it collects all names.
 
     Args:
-        logger: whose run it is.
-        settings: by name; what is neither a number nor a truth value becomes text.
-        metrics: by name.
-        step: the trainer's.
+        logger: logger of the run.
+        settings: values by name; anything but numbers and booleans becomes text.
+        metrics: values by name.
+        step: global step.
     """
     plain_values = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in settings.items()}
     folder = Path(logger.log_dir)
@@ -103,12 +103,12 @@ def log_hparams(logger: TensorBoardLogger, settings: Mapping[str, Any], metrics:
 
 
 def log_projector(logger: TensorBoardLogger, points: Sequence[Point], step: int) -> None:
-    """Put concept embeddings into the projector, with the columns :data:`COLUMNS` to name and colour them by.
+    """Log concept embeddings to the projector, with :data:`COLUMNS` for labels and colours.
 
     Args:
-        logger: where to.
-        points: of one concept space.
-        step: the trainer's.
+        logger: output.
+        points: points of the same concept space.
+        step: global step.
     """
     if points:
         stacked = torch.stack([point.embedding.cpu() for point in points])
@@ -123,14 +123,14 @@ def _numbered(part: Part | None) -> tuple[str, str]:
 def log_animation(
     logger: TensorBoardLogger, tag: str, pictures: Sequence[NDArray[np.uint8]], step: int, caption: str = "", ending: str = ""
 ) -> None:
-    """Put an animated GIF among the images.
+    """Log an animated GIF as an image.
 
     Args:
-        logger: where to.
-        tag: its name.
+        logger: output.
+        tag: name of the image.
         pictures: ``(height, width, 3)`` each.
-        step: the trainer's.
-        caption, ending: drawn below every picture and below the last, see :func:`~ftl_lightning.evaluation.animation.captioned`.
+        step: global step.
+        caption, ending: text below every picture and below the last, see :func:`~ftl_lightning.evaluation.animation.captioned`.
     """
     shown = captioned(pictures, caption, ending)
     height, width, _ = shown[0].shape

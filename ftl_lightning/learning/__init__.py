@@ -1,6 +1,6 @@
 """The two LightningModules: pretraining (Eq. 1) and inversion (Eq. 2).
 
-They are imported when they are asked for: what learns and samples without a trainer does not need Lightning.
+They are imported on demand: learning and sampling without a trainer do not need Lightning.
 """
 
 import importlib

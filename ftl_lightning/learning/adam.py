@@ -8,9 +8,9 @@ from torch.optim.adam import adam
 
 
 class Group:
-    """A parameter and its state of Adam with cosine decay, the same arithmetic as the optimiser of an inversion.
+    """A parameter and its state of Adam with cosine decay, with the arithmetic of torch's optimiser.
 
-    torch's optimiser classes import its compiler when they are used first, which takes longer than some concepts take to learn.
+    torch's optimiser classes import its compiler on first use, which may take longer than learning a concept.
     """
 
     def __init__(self, parameter: nn.Parameter, rate: float) -> None:
@@ -20,11 +20,11 @@ class Group:
 
     @torch.no_grad()
     def step(self, gradient: Tensor, decay: tuple[int, int] | None) -> None:
-        """Follow the gradient of a step; the rate for the next is the decay's recursion in torch's order of arithmetic.
+        """Make a gradient step; the next learning rate follows the decay's recursion in torch's order of arithmetic.
 
         Args:
-            gradient: like the parameter.
-            decay: the step's number from 0 and the number of steps, or ``None`` for a constant rate.
+            gradient: gradient of the parameter.
+            decay: number of the step from 0 and total steps; ``None`` for a constant rate.
         """
         adam(
             [self.parameter],

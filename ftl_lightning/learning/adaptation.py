@@ -1,4 +1,4 @@
-"""Adapting a frozen pretrained model to new concepts from a few demonstrations, whatever the method."""
+"""Adaptation of a frozen pretrained model to new concepts from a few demonstrations, for any method."""
 
 import functools
 import operator
@@ -30,21 +30,21 @@ from ftl_lightning.targets import expect_writable_file
 
 
 class Adaptation(pl.LightningModule, ABC):
-    """What ``invert`` asks of a method: the concepts of an :class:`InversionData`, and what generates an evaluation task.
+    """Base module of ``invert``: learn the concepts of an :class:`InversionData` and compose evaluation tasks.
 
-    The pretrained model is frozen and stays in evaluation mode. Concepts are written to files when they are found.
+    The pretrained model is frozen and stays in evaluation mode. Learned concepts are written to files.
 
     Args:
         pretrained: folder of the pretrained model.
-        omega: guidance weight of training concepts that are generated or composed with a learned one.
+        omega: guidance weight of training concepts, alone or composed with a learned concept.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
 
     Raises:
-        UserError: for a folder that holds no model, or one of a kind that this does not adapt.
+        UserError: for a folder without a model, or with a model of an unsupported kind.
     """
 
     learns = False
-    """Whether concepts are learned by gradient descent, for which there are training steps."""
+    """Whether concepts are learned by gradient descent, in training steps."""
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
@@ -52,14 +52,14 @@ class Adaptation(pl.LightningModule, ABC):
         kind = self.model.method.kind
         if not adapts(type(self), kind):
             expected = " or ".join(kinds_for(type(self))) or "another"
-            told = f"expected a model of kind {expected}, found {kind} in {pretrained}"
+            message = f"expected a model of kind {expected}, found {kind} in {pretrained}"
             module = self.model.method.adaptation.replace(":", ".")
-            raise UserError(f"model.pretrained: {told}, which model.class_path {module} adapts")
+            raise UserError(f"model.pretrained: {message}, which model.class_path {module} adapts")
         self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
         self._found: dict[str, Concept] = {}
-        self._own = False  # whether somebody's own demonstrations are learned from, not a domain's tasks
+        self._own = False  # whether the demonstrations are a user's, not a domain's tasks
 
     @property
     def method(self) -> str:
@@ -68,23 +68,23 @@ class Adaptation(pl.LightningModule, ABC):
 
     @property
     def form(self) -> str:
-        """How its concepts are otherwise than in the method's usual form, in words behind its name in tables; empty for that."""
+        """Suffix of the method's name in tables; empty for its default form."""
         return ""
 
     @property
     def variant(self) -> str:
-        """What tells it apart from others of the same method in tables; may be empty."""
+        """Variant of the method in tables; may be empty."""
         return ""
 
     @abstractmethod
     def learned(self) -> dict[str, Concept]:
-        """The concepts by name."""
+        """Learned concepts by name."""
 
     def configure_model(self) -> None:
-        """Take the demonstrations over and check that they fit the model.
+        """Set the demonstrations and check that they fit the model.
 
         Raises:
-            UserError: naming the option, where they do not, or concepts cannot be written.
+            UserError: with the option, if they do not fit or concepts cannot be written.
         """
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, InversionData):
@@ -98,23 +98,23 @@ class Adaptation(pl.LightningModule, ABC):
         for name in self.concepts:
             expect_writable_file(self._file(name), "concepts")
         self._found = {}
-        expected, found = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
-        if found != expected:
-            raise UserError(f"data.demonstrations: expected states of {expected} columns (the pretrained model's), found {found}")
+        expected, columns = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
+        if columns != expected:
+            raise UserError(f"data.demonstrations: expected states of {expected} columns (the pretrained model's), found {columns}")
         try:
             self.demonstrations: Demonstrations = data.demonstrations.fitted(self.domain.observed)
         except UserError as error:
             raise UserError(f"data.demonstrations: {error}") from None
         self._own = data.own
-        if self.model.examples is not None:  # of a user's own data, whose new concepts are judged by their demonstrations
+        if self.model.examples is not None:  # a user's data: new concepts are judged by their demonstrations
             self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
-        if told := longer_than_plans(self.demonstrations, self.model):
-            say(f"note: {told}", error=True)
+        if note := longer_than_plans(self.demonstrations, self.model):
+            say(f"note: {note}", error=True)
         for text in self.concepts if self._own else ():
-            for told in warnings_of(self.model, self.demonstrations.select(text)):
-                say(f"note: {text}: {told}", error=True)
+            for note in warnings_of(self.model, self.demonstrations.select(text)):
+                say(f"note: {text}: {note}", error=True)
 
-    # Validation and test log the learned concepts' loss on common noise; behaviour is judged by the evaluator.
+    # Validation and test log the learned concepts' loss on common noise; the evaluator judges behaviour.
     def validation_step(self, step: int) -> None:
         self._log_loss("val/loss")
 
@@ -132,21 +132,21 @@ class Adaptation(pl.LightningModule, ABC):
 
     @property
     def processes(self) -> int:
-        """In which concepts are learned; 1 with a trainer of Lightning's own."""
+        """Number of learning processes; 1 with a plain Lightning trainer."""
         return int(getattr(self.trainer, "processes", 1))
 
     @property
     def folder(self) -> Path:
-        """Where the learned concepts are written."""
+        """Folder of the learned concepts."""
         return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
 
     def _file(self, concept: str) -> Path:
         return self.folder / f"{file_name(concept)}.safetensors"
 
     def find(self) -> None:
-        """Write every concept to a file of its own."""
+        """Learn the concepts and write each to a file."""
         self._found = self.learned()
-        log_folder.keep()  # also where nothing is trained
+        log_folder.keep()  # also without training
         for name, concept in self._found.items():
             path = self._file(name)
             concept.save(path)
@@ -158,11 +158,11 @@ class Adaptation(pl.LightningModule, ABC):
                 self._show_quality(name, concept)
 
     def _show_quality(self, name: str, concept: Concept) -> None:
-        """Say what samples of a concept are like beside its demonstrations, and draw them into TensorBoard."""
-        own = self.demonstrations.select(name)
-        if len(own) < 2 or self.model.config.horizon != self.domain.plans.horizon:  # some methods plan a step at a time
+        """Print the quality of a concept's samples, and draw them into TensorBoard."""
+        demonstrations = self.demonstrations.select(name)
+        if len(demonstrations) < 2 or self.model.config.horizon != self.domain.plans.horizon:  # some methods plan a step at a time
             return
-        seen = inspected(self.model, self.domain, own, concept, self.hparams["seed"])
+        seen = inspected(self.model, self.domain, demonstrations, concept, self.hparams["seed"])
         say(f"  quality: {seen}")
         for logger in self.trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
@@ -189,13 +189,13 @@ class Adaptation(pl.LightningModule, ABC):
         return self._omega
 
     def composition(self, task: EvaluationTask) -> Composition | None:
-        """What generates a task, or ``None`` if a concept of it was not learned here.
+        """Composition for a task; ``None`` if it needs a concept that was not learned here.
 
-        The modes of a learned concept are used where it stands alone.
+        The modes of a learned concept are used if it is not composed.
         """
         if len(task.learned) == 1 and task.component is None and not (task.texts or task.without):
-            found = self._found.get(task.learned[0])
-            return None if found is None else found.composition.to(self.device)
+            concept = self._found.get(task.learned[0])
+            return None if concept is None else concept.composition.to(self.device)
         weights = [self.training_weight(task)] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
         embeddings = [self.model.concept(text)[None, None] for text in (*task.texts, *task.without)]
         parts = [Composition(text, text.new_tensor([weight])) for text, weight in zip(embeddings, weights, strict=True)]
@@ -213,11 +213,11 @@ class Adaptation(pl.LightningModule, ABC):
         return functools.reduce(operator.add, parts)
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
-        """What a concept was learned from."""
+        """Demonstrations of a learned concept."""
         return self.demonstrations.select(concept)
 
     def concept_points(self) -> list[Point]:
-        """Every embedding, for the projector: training concepts and learned components."""
+        """All embeddings, for the projector: training concepts and learned components."""
         learned = [
             Point(name, NEW_COMPONENT, part.embedding, part)
             for name, concept in self._found.items()

@@ -1,4 +1,4 @@
-"""What methods have in common that compose concepts by adding them (paper, 'Implementation Details')."""
+"""Base of methods that compose concepts by addition (paper, 'Implementation Details')."""
 
 from abc import abstractmethod
 
@@ -12,7 +12,7 @@ from ftl_lightning.learning.concept_model import ConceptModel, Draws
 
 
 class AdditiveModel(ConceptModel):
-    """A model to which a composition is one concept: the weighted sum of its parts."""
+    """A model conditioned on the weighted sum of a composition's parts."""
 
     invertible = True
 
@@ -35,7 +35,7 @@ def added(composition: Composition) -> Tensor:
     """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, 1, n)``.
 
     Raises:
-        UserError: for a concept whose weight is on some columns alone: one sum acts on all of them.
+        UserError: for a concept restricted to some columns: a sum acts on all columns.
     """
     if composition.columns is not None:
         raise UserError("compose: expected concepts without '@' for a model that adds them up, found groups of columns")

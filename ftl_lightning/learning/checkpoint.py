@@ -1,4 +1,4 @@
-"""Checkpoints: whole or absent, of one module class alone, and with all that a resumed run needs to end with the same bytes."""
+"""Checkpoints: written atomically, bound to a module class, and complete, so that a resumed run ends with the same bytes."""
 
 import io
 import zipfile
@@ -33,23 +33,23 @@ _FORM: Mapping[str, type] = {
     _KEY: dict,
     _RANDOM: dict,
 }
-"""Of a checkpoint's keys the kinds; all but those of :data:`_NEEDED` may be missing."""
+"""Type of each checkpoint key; only those in :data:`_NEEDED` are required."""
 _NEEDED = ("state_dict", "epoch", "global_step", "loops")
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes a checkpoint beside its name and renames it, and refuses a damaged one.
+    """Atomic checkpoint writes by renaming; damaged checkpoints are refused.
 
-    Lightning writes to the folder for temporary files, from which a file on another file system is copied and not renamed.
+    Lightning writes to the folder for temporary files, and a move from there to another file system is not atomic.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write it whole or not at all.
+        """Write a checkpoint atomically.
 
         Raises:
-            UserError: where the folder cannot be written or the disk is full.
+            UserError: if the folder cannot be written or the disk is full.
         """
-        if "://" in str(path):  # on a store that renames nothing
+        if "://" in str(path):  # a store without renaming
             super().save_checkpoint(checkpoint, path, storage_options)
             return
         content = io.BytesIO()
@@ -60,7 +60,7 @@ class WholeCheckpoints(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Callable[..., Any] | None = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read it on the CPU, as :func:`read_checkpoint`; nothing is unpickled whatever the caller says."""
+        """Read a checkpoint to the CPU by :func:`read_checkpoint`; ``weights_only`` is always on."""
         if "://" in str(path):
             return super().load_checkpoint(path, map_location, weights_only=True)
         content = read_checkpoint(path)
@@ -68,22 +68,22 @@ class WholeCheckpoints(TorchCheckpointIO):
             old = Version(content.get(_VERSION, "")) < Version("2")
         except InvalidVersion:
             old = True
-        if old:  # Lightning would look for what they do not have
+        if old:  # Lightning would look for missing keys
             raise UserError(f"{path}: key {_VERSION!r}: expected 2.0 or newer, found {shown(content.get(_VERSION))}")
         return content
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The content of a checkpoint whose every byte is as it was written.
+    """Read a checkpoint and verify its checksums.
 
     Raises:
-        UserError: for a file that is damaged or no checkpoint, naming the newest whole checkpoint beside it.
+        UserError: for a damaged or foreign file, with the newest whole checkpoint of the folder.
     """
     try:
         return _read(Path(path))
     except UserError as error:
-        others = sorted(_beside(Path(path)), key=lambda other: other.stat().st_mtime, reverse=True)
-        if whole := next((other for other in others if _is_whole(other)), None):
+        checkpoints = sorted(_beside(Path(path)), key=lambda checkpoint: checkpoint.stat().st_mtime, reverse=True)
+        if whole := next((checkpoint for checkpoint in checkpoints if _is_whole(checkpoint)), None):
             raise UserError(f"{error}; go on from the newest whole one: --ckpt_path {whole}") from error.__cause__
         raise
 
@@ -94,7 +94,7 @@ def _read(path: Path) -> dict[str, Any]:
         with zipfile.ZipFile(path) as archive:
             if sum(member.file_size for member in archive.infolist()) > size:
                 raise ValueError("its content is compressed, which that of a checkpoint is not")
-            damaged = archive.testzip()  # torch itself does not look at the checksums
+            damaged = archive.testzip()  # torch does not verify checksums
         if damaged is not None:
             raise ValueError(f"the checksum of {damaged} is another")
         content = torch.load(path, weights_only=True, map_location="cpu")
@@ -103,17 +103,17 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected a checkpoint, found a {type(content).__name__}")
     for key, kind in _FORM.items():
-        found = content.get(key)
-        if (key in content or key in _NEEDED) and (not isinstance(found, kind) or isinstance(found, bool)):
-            raise UserError(f"{path}: key {key!r}: expected a checkpoint's {kind.__name__}, found {_kind(found)}")
+        part = content.get(key)
+        if (key in content or key in _NEEDED) and (not isinstance(part, kind) or isinstance(part, bool)):
+            raise UserError(f"{path}: key {key!r}: expected a checkpoint's {kind.__name__}, found {_kind(part)}")
     for name, value in content["state_dict"].items():
         if not (isinstance(name, str) and isinstance(value, Tensor)):
             raise UserError(f"{path}: key 'state_dict': expected tensors by name, found {_kind(value)} as {str(name)[:50]!r}")
     return content
 
 
-def _kind(found: object) -> str:
-    return "nothing" if found is None else f"a {type(found).__name__}"
+def _kind(value: object) -> str:
+    return "nothing" if value is None else f"a {type(value).__name__}"
 
 
 def _is_whole(path: Path) -> bool:
@@ -126,26 +126,26 @@ def _is_whole(path: Path) -> bool:
 
 def _beside(path: Path) -> list[Path]:
     """Other checkpoints of the folder."""
-    return [other for other in visible(path.parent, "*.ckpt") if other.name != path.name]
+    return [checkpoint for checkpoint in visible(path.parent, "*.ckpt") if checkpoint.name != path.name]
 
 
 def last_checkpoint(trainer: pl.Trainer) -> Path | None:
-    """The checkpoint that ``last`` names: the newest of those that the trainer's callbacks keep as their last; maybe none."""
-    callbacks = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
-    found = [Path(path) for callback in callbacks for path in callback._find_last_checkpoints(trainer)]
-    return max((path for path in found if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
+    """The newest of the last checkpoints of the trainer's callbacks; ``None`` without any."""
+    callbacks = [callback for callback in trainer.checkpoint_callbacks if isinstance(callback, ModelCheckpoint)]
+    paths = [Path(path) for callback in callbacks for path in callback._find_last_checkpoints(trainer)]
+    return max((path for path in paths if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
 
 
 def check_parameters(found: Mapping[str, Any], module: pl.LightningModule, optional: str = "") -> None:
-    """Refuse parameters of a checkpoint that are not those of a module.
+    """Refuse checkpoint parameters that do not fit a module.
 
     Args:
-        found: of the checkpoint, by name.
-        module: with its layers.
-        optional: what the names of the only parameters that a checkpoint holds begin with; empty for all.
+        found: parameters of the checkpoint, by name.
+        module: module with its layers.
+        optional: prefix of the parameters in a checkpoint; empty for all.
 
     Raises:
-        UserError: naming the first one that is missing, unknown, of another shape or not finite.
+        UserError: for the first missing, unknown or non-finite parameter, or another shape.
     """
     expected = {name: value for name, value in module.state_dict().items() if name.startswith(optional)}
     for name in expected | dict(found):
@@ -155,20 +155,20 @@ def check_parameters(found: Mapping[str, Any], module: pl.LightningModule, optio
         if found[name].shape != expected[name].shape:
             shapes = f"expected shape {tuple(expected[name].shape)}, found {tuple(found[name].shape)}"
             raise UserError(f"ckpt_path: key 'state_dict', {name!r}: {shapes}; it is damaged")
-    # Losses that a concept has not reached yet are infinite.
-    own = [name for name, _ in module.named_parameters() if name in found] if optional else list(found)
-    expect_finite({name: found[name] for name in own}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
+    # Buffers of losses may still be infinite.
+    learned = [name for name, _ in module.named_parameters() if name in found] if optional else list(found)
+    expect_finite({name: found[name] for name in learned}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
 
 
 def check_restored(module: pl.LightningModule, step: int) -> None:
-    """Refuse what was restored if Lightning and torch took it though it does not belong together.
+    """Refuse inconsistent state that Lightning and torch accepted.
 
     Args:
-        module: whose trainer starts.
-        step: of the checkpoint.
+        module: module with a starting trainer.
+        step: step of the checkpoint.
 
     Raises:
-        UserError: for another step, an optimiser without a state, or one whose tensors are not of their parameters' shapes.
+        UserError: for another step, an optimiser without state, or state whose shapes differ from the parameters'.
     """
     if module.trainer.global_step != step:
         raise UserError(f"ckpt_path: key 'loops': expected step {step}, found {module.trainer.global_step}; it is damaged")
@@ -186,12 +186,12 @@ def check_restored(module: pl.LightningModule, step: int) -> None:
 
 
 class Random(NamedTuple):
-    """Where the global generators stood after a step.
+    """States of the global generators after a step.
 
     Attributes:
-        cpu: state of the CPU's.
-        cuda: that of the module's GPU; ``None`` on a CPU.
-        iterations: how often the unbroken run begins to iterate a loader before its next step; each time draws one number.
+        cpu: state of the CPU generator.
+        cuda: state of the module's GPU generator; ``None`` on a CPU.
+        iterations: loader iterations that an unbroken run starts before its next step; each draws one number.
     """
 
     cpu: Tensor
@@ -200,11 +200,11 @@ class Random(NamedTuple):
 
     @classmethod
     def now(cls, device: torch.device, iterations: int) -> "Random":
-        """As they stand."""
+        """The current states."""
         return cls(torch.get_rng_state(), torch.cuda.get_rng_state(device) if device.type == "cuda" else None, iterations)
 
     def restore(self, device: torch.device) -> None:
-        """Put them where they stand in the unbroken run before its next step."""
+        """Set the generators as in an unbroken run before its next step."""
         torch.set_rng_state(self.cpu)
         for _ in range(self.iterations):
             torch.empty((), dtype=torch.int64).random_()
@@ -212,24 +212,24 @@ class Random(NamedTuple):
             torch.cuda.set_rng_state(self.cuda, device)
 
     def write(self, checkpoint: dict[str, Any]) -> None:
-        """Into a checkpoint."""
+        """Write to a checkpoint."""
         checkpoint[_RANDOM] = self._asdict()
 
     @classmethod
     def read(cls, checkpoint: Mapping[str, Any]) -> "Random":
-        """From a checkpoint.
+        """Read from a checkpoint.
 
         Raises:
-            UserError: if the states are missing or damaged.
+            UserError: for missing or damaged states.
         """
         try:
-            found = cls(**checkpoint[_RANDOM])
-            torch.Generator().set_state(found.cpu)
+            states = cls(**checkpoint[_RANDOM])
+            torch.Generator().set_state(states.cpu)
         except (KeyError, TypeError, RuntimeError) as error:
             raise UserError(f"ckpt_path: key {_RANDOM!r}: expected states of generators, found something else") from error
-        if not isinstance(found.iterations, int) or not 0 <= found.iterations <= 9 or not isinstance(found.cuda, Tensor | None):
+        if not isinstance(states.iterations, int) or not 0 <= states.iterations <= 9 or not isinstance(states.cuda, Tensor | None):
             raise UserError(f"ckpt_path: key {_RANDOM!r}: expected states of generators, found something else")
-        return found
+        return states
 
 
 def _signature(module: pl.LightningModule, more: Mapping[str, Any]) -> dict[str, Any]:
@@ -237,7 +237,7 @@ def _signature(module: pl.LightningModule, more: Mapping[str, Any]) -> dict[str,
 
 
 def sign(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write the module's class, and the settings that must match before it is loaded, into its checkpoint."""
+    """Write the module's class and the settings that must match into its checkpoint."""
     checkpoint[_KEY] = _signature(module, more)
 
 
@@ -245,9 +245,9 @@ def check_signature(module: pl.LightningModule, checkpoint: dict[str, Any], more
     """Refuse a checkpoint with another signature.
 
     Raises:
-        UserError: naming the first key that differs.
+        UserError: with the first key that differs.
     """
-    own, signature = _signature(module, more), checkpoint.get(_KEY, {})
-    for key in own | signature:  # a setting that one of them does not name is at its default there
-        if (found := signature.get(key)) != (expected := own.get(key)):
-            raise UserError(f"ckpt_path: key {key!r}: expected {expected}, found {found}; it is the checkpoint of something else")
+    expected, signature = _signature(module, more), checkpoint.get(_KEY, {})
+    for key in expected | signature:  # a missing setting has its default
+        if (value := signature.get(key)) != (setting := expected.get(key)):
+            raise UserError(f"ckpt_path: key {key!r}: expected {setting}, found {value}; it is the checkpoint of something else")

@@ -1,4 +1,4 @@
-"""Whether a learned concept belongs to a model."""
+"""Check that a learned concept fits a model."""
 
 from pathlib import Path
 
@@ -8,31 +8,31 @@ from ftl_lightning.learning.concept_model import ConceptModel
 
 
 def expect_concept(model: ConceptModel, concept: Concept, path: str | Path) -> None:
-    """Refuse a learned concept that belongs to another model.
+    """Refuse a learned concept of another model.
 
     Args:
-        model: that it is to be used with.
-        concept: that was read.
-        path: from where.
+        model: the model.
+        concept: the learned concept.
+        path: file of the concept.
 
     Raises:
-        UserError: if encoder, domain or pretrained model differ, or its sizes are not those of the model.
+        UserError: if encoder, domain, pretrained model or sizes differ.
     """
     of_model = {"encoder": model.config.encoder, "domain": model.config.domain, "pretrained": model.hash}
     for key, expected in of_model.items():
-        if (found := getattr(concept.origin, key)) != expected:
+        if (value := getattr(concept.origin, key)) != expected:
             raise UserError(
-                f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(found)!r}; learn it again"
+                f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(value)!r}; learn it again"
             )
     with about(path):
         expect_sizes(model, concept)
 
 
 def expect_sizes(model: ConceptModel, concept: Concept) -> None:
-    """Refuse a concept whose sizes are not those of a model.
+    """Refuse a concept whose sizes do not fit a model.
 
     Raises:
-        UserError: naming the key.
+        UserError: with the key.
     """
     if (width := concept.embeddings.shape[2]) != model.config.concept_dim:
         raise UserError(f"key 'embeddings': expected {model.config.concept_dim} numbers each, found {width}")

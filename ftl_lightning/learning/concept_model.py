@@ -1,4 +1,4 @@
-"""What every method's model has: a concept space, normalisation, and a view of behaviour."""
+"""Base class of models: concept space, normalisation, and view of behaviour."""
 
 import difflib
 from abc import ABC, abstractmethod
@@ -24,9 +24,9 @@ from ftl_lightning.representation import Shown, counted
 from ftl_lightning.tensor_file import bytes_hash, serialise
 
 KIND = "generative model"
-"""Of the file of a model's weights."""
+"""Kind of a file of model weights."""
 NEAREST = 3
-"""Training concepts that are told for a text that is none."""
+"""Number of similar training concepts in the error for an unknown text."""
 
 
 class Draws(NamedTuple):
@@ -37,24 +37,24 @@ class Draws(NamedTuple):
 
 
 class ConceptModel(Shown, nn.Module, ABC):
-    """A model of behaviour given a concept: what adapting, sampling and evaluation ask of every method.
+    """Concept-conditioned model of behaviour: interface for adaptation, sampling and evaluation.
 
     Args:
-        prepared: sizes and names, domain, normalisation, and embeddings in the model's concept space.
+        prepared: configuration, domain, normalisation, and embeddings in the model's concept space.
 
     Raises:
-        UserError: for options that do not go with the domain.
+        UserError: for options that the domain does not support.
 
     Attributes:
-        empty: the empty concept ``(n,)`` in the model's concept space.
+        empty: embedding ``(n,)`` of the empty concept (unconditional).
         training_embeddings: ``(training concept, n)`` in the model's concept space.
-        examples: of a user's own data, some demonstrations of each training concept, kept beside the weights.
+        examples: demonstrations of each training concept, saved with the weights, for a user's data.
     """
 
     method: ClassVar[Method]
-    """Whose model it is."""
+    """The model's method."""
     Config: ClassVar[type[ModelConfig]]
-    """Of the class's models."""
+    """Class of the model's configuration."""
     invertible: ClassVar[bool] = False
     """Whether concepts are learned through :meth:`losses` by gradient descent."""
     empty: Tensor
@@ -84,7 +84,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         yield self.method.name
         yield counted(len(self.config.training_concepts), "training concept")
         yield counted(sum(parameter.numel() for parameter in self.parameters()), "parameter")
-        if self.device.type != "meta":  # on paper it has no weights
+        if self.device.type != "meta":  # a meta model has no weights
             yield f"hash {self.hash}"
         yield f"on {self.device}"
 
@@ -97,13 +97,13 @@ class ConceptModel(Shown, nn.Module, ABC):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Generate behaviour of several compositions in one batch.
+        """Sample behaviour for several compositions in one batch.
 
         Args:
-            compositions: ``(K, ...)`` each; K may differ between them.
-            count: samples of each.
+            compositions: ``(K, ...)`` each; K may differ.
+            count: samples for each composition.
             sampling: sampler, steps and temperature.
-            generators: of the noise, one for each composition, so that its samples do not depend on what is sampled beside it.
+            generators: a noise generator for each composition, so that samples do not depend on the rest of the batch.
             observed: features ``(composition * count, *shape)`` by name, in the domain's units; ``None`` for none.
 
         Returns:
@@ -111,30 +111,30 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
 
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
-        """What is random in :meth:`losses`, alike for every run; ``None`` for a method that has nothing random."""
+        """Random numbers of :meth:`losses`, shared by all runs; ``None`` for a deterministic loss."""
         return None
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
-        """How badly concepts explain behaviour, for a method that learns them by gradient descent.
+        """Losses of behaviour under concepts, for inversion by gradient descent.
 
         Args:
             states: ``(run * sample, window, state)`` in the domain's units.
             observed: features ``(run * sample, *shape)`` by name.
             composition: ``(run, K, ...)``.
-            draws: of :meth:`draws`.
-            loss: whose squared error a diffusion model minimises.
+            draws: result of :meth:`draws`.
+            loss: target of a diffusion model's squared error.
 
         Returns:
             ``(run, sample)``.
 
         Raises:
-            UserError: for a method that learns none.
+            UserError: for a method without inversion.
         """
         raise UserError(f"model.pretrained: expected a model that concepts are learned through, found one of {self.method.name}")
 
     @property
     def traits(self) -> tuple[str, ...]:
-        """What tables tell of the model beside the method's name."""
+        """Suffixes of the method's name in tables."""
         return (self.config.view,) if self.config.view else ()
 
     @property
@@ -144,57 +144,57 @@ class ConceptModel(Shown, nn.Module, ABC):
 
     @property
     def window(self) -> int:
-        """States of a demonstration that are learned from together."""
+        """Number of states in a training window."""
         return self.config.horizon
 
     @property
     def max_steps(self) -> int | None:
-        """Most steps that a sampler can make, the T of diffusion; ``None`` for a method without."""
+        """Maximum number of sampler steps, the T of diffusion; ``None`` for other methods."""
         return None
 
     @property
     def device(self) -> torch.device:
-        """Where the model is."""
+        """The model's device."""
         return self.empty.device
 
     def concept(self, text: str) -> Tensor:
         """The embedding ``(n,)`` of a training concept.
 
         Raises:
-            UserError: for a text that is none, with the nearest that are some.
+            UserError: for an unknown text, with the nearest training concepts.
         """
         known = self.config.training_concepts
         if text not in known:
             near = difflib.get_close_matches(str(text), known, n=NEAREST, cutoff=0)
             raise UserError(
-                f"concept {shown(text)}: expected a training concept of the model: {'; '.join(short(one, 40) for one in near)} "
+                f"concept {shown(text)}: expected a training concept of the model: {'; '.join(short(text, 40) for text in near)} "
                 f"are the nearest of {len(known)}; list all: python -m ftl_lightning concepts MODEL"
             )
         return self.training_embeddings[self.config.training_concepts.index(text)]
 
     def points(self) -> list[Point]:
-        """The empty concept's embedding and the training concepts'."""
+        """Embeddings of the empty concept and the training concepts."""
         training = zip(self.config.training_concepts, self.training_embeddings, strict=True)
         return [Point("(empty)", EMPTY_CONCEPT, self.empty), *(Point(text, TRAINING_CONCEPT, each) for text, each in training)]
 
     def adaptable(self) -> dict[str, tuple[int, int]]:
-        """The weights that an adapter changes, see :func:`ftl_lightning.concepts.adapter.adaptable`; none for a method without."""
+        """Weights that an adapter can change, see :func:`ftl_lightning.concepts.adapter.adaptable`; none without adapters."""
         return {}
 
     def expect_adapter(self, adapter: LowRank) -> None:
         """Refuse an adapter that does not fit.
 
         Raises:
-            UserError: naming what it would change; for a method without adapters, any.
+            UserError: naming the weight; always for a method without adapters.
         """
         raise UserError(f"key 'adapter': expected none for a model of {self.method.name}, found one")
 
     def perturbed(self, states: Tensor, observed: Observed, draw: torch.Generator) -> tuple[Tensor, Observed]:
-        """What to learn from: behaviour with another present, if the model's configuration says so."""
+        """Training windows with the present state perturbed, if configured."""
         return (states, observed) if self._perturb is None else self._perturb(states, observed, draw)
 
     def encode(self, states: Tensor, observed: Observed) -> Tensor:
-        """Behaviour ``(sample, horizon, state)`` in the domain's units to what the network sees."""
+        """Map behaviour ``(sample, horizon, state)`` in the domain's units to the network's inputs."""
         if self.view is not None:
             states = self.view.encode(states, observed)
         return self.normalization.encode(states)
@@ -205,17 +205,17 @@ class ConceptModel(Shown, nn.Module, ABC):
         return states if self.view is None else self.view.decode(states, observed)
 
     def vector(self, observed: Observed) -> Tensor | None:
-        """What is observed as the network sees it: vectors one after another, then what is read of images ``(batch, m)``.
+        """Observation vector ``(batch, m)`` of the network: normalised vectors, then image encodings.
 
         Args:
-            observed: features by name, in the domain's units; :data:`~ftl_lightning.demonstrations.features.READ`, what
-                :meth:`of_images` read, may stand for the images.
+            observed: features by name, in the domain's units; :data:`~ftl_lightning.demonstrations.features.READ`, the result of
+                :meth:`of_images`, may replace the images.
 
         Returns:
-            ``None`` where nothing is observed.
+            ``None`` if nothing is observed.
 
         Raises:
-            UserError: if a feature is missing or of another shape.
+            UserError: for a missing feature or another shape.
         """
         if not self.config.observed:
             return None
@@ -229,11 +229,9 @@ class ConceptModel(Shown, nn.Module, ABC):
         return torch.cat(parts, dim=-1)
 
     def of_images(self, observed: Observed) -> Tensor | None:
-        """What is read of observed images ``(batch, n)``, for methods that look at them once and at vectors often; ``None`` where
-        none is observed.
-        """
-        found: Tensor | None = None if self.images is None else self.images(self._seen(observed))
-        return found
+        """Image encodings ``(batch, n)``, for methods that encode images once and vectors often; ``None`` without images."""
+        read: Tensor | None = None if self.images is None else self.images(self._seen(observed))
+        return read
 
     def _seen(self, observed: Observed) -> Observed:
         read = READ in observed
@@ -244,7 +242,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return observed
 
     def _dropped(self, vectors: Tensor) -> Tensor:
-        """The same where some of the vectors are hidden."""
+        """Apply feature dropout."""
         count, device = len(vectors), vectors.device
         for name, share in self.config.feature_dropout.items():
             kept = torch.ones_like(vectors)
@@ -259,17 +257,17 @@ class ConceptModel(Shown, nn.Module, ABC):
         return bytes_hash(serialise(KIND, self.stored(), {"domain": self.config.domain}))
 
     def stored(self) -> dict[str, Tensor]:
-        """What a file of it holds: weights in half precision, everything else as it is."""
+        """Tensors for a file: weights in half precision, buffers unchanged."""
         weights = dict(self.named_parameters())
         return {name: value.half() if name in weights else value for name, value in self.state_dict().items()}
 
 
 def _unread(features: Mapping[str, Feature], read: bool) -> Mapping[str, Feature]:
-    """The features that have to be observed, where images may have been read before."""
+    """Required features, without images if they are already encoded."""
     return {name: feature for name, feature in features.items() if not (read and feature.kind == "image")}
 
 
 def joined_vectors(observed: Observed, features: Mapping[str, Feature]) -> Tensor:
-    """The vectors among observed features, one after another ``(batch, m)``."""
+    """Concatenate the observed vectors ``(batch, m)``."""
     vectors = [observed[name].flatten(1) for name, feature in features.items() if feature.kind == "vector"]
     return torch.cat(vectors, dim=1)

@@ -1,4 +1,4 @@
-"""Whether demonstrations of a concept suffice, and which of them is odd: faults, scale, what the model knows, what is left out."""
+"""Check of a concept's demonstrations: faults, scale, known training concepts, and leave-one-out losses."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -21,11 +21,11 @@ from ftl_lightning.progress import bar
 from ftl_lightning.representation import counted
 
 MARGIN, MOST_OF = 0.97, 0.8
-"""A training concept explains a demonstration where its loss is at most so much of the empty concept's; it is known where it
-explains this share of them, and their mean.
+"""Maximum loss, relative to the unconditional (empty concept's) loss, of a demonstration that a training concept explains; minimum
+share of explained demonstrations for a known task.
 """
 MOST_FAULTS = 6
-"""Findings that are told of a concept, the gravest first."""
+"""Maximum number of reported findings, most severe first."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Known:
     """The training concept that explains demonstrations best.
 
     Attributes:
-        text: of the training concept.
-        losses: of each demonstration by the empty concept's ``(demo,)``.
+        text: text of the training concept.
+        losses: loss of each demonstration ``(demo,)``, relative to the unconditional loss.
     """
 
     text: str
@@ -42,33 +42,33 @@ class Known:
 
     @property
     def count(self) -> int:
-        """How many it explains better than the empty concept by a clear margin."""
+        """Number of demonstrations that it explains."""
         return sum(loss <= MARGIN for loss in self.losses)
 
     @property
     def clear(self) -> bool:
-        """Whether it explains (nearly) all."""
+        """Whether it explains nearly all demonstrations, and their mean loss."""
         mean = sum(self.losses) / len(self.losses)
         return self.count >= MOST_OF * len(self.losses) and mean <= MARGIN
 
     def __str__(self) -> str:
         mean = sum(self.losses) / len(self.losses)
-        told = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the empty concept's)"
+        best = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the empty concept's)"
         if self.clear:
-            return f"known: the model already explains them as {told}; if that is all you mean, no learning is needed"
-        return f"known: no training concept explains them all; the best is {told}"
+            return f"known: the model already explains them as {best}; if that is all you mean, no learning is needed"
+        return f"known: no training concept explains them all; the best is {best}"
 
 
 @dataclass(frozen=True)
 class Check:
-    """What a check found in demonstrations of a concept.
+    """Result of checking a concept's demonstrations.
 
     Attributes:
-        name: of the concept.
-        demonstrations: that were checked.
+        name: name of the concept.
+        demonstrations: checked demonstrations.
         findings: faults and notes, errors and warnings first.
-        known: the training concept that explains them best; ``None`` where no model was asked.
-        left_out: what concepts that are learned from some explain of the others; ``None`` where nothing was learned.
+        known: the training concept that explains them best; ``None`` without a model.
+        left_out: leave-one-out losses; ``None`` without learning.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Check:
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """What is likely a fault."""
+        """Likely faults."""
         return tuple(finding for finding in self.findings if finding.severity != "note")
 
     def __str__(self) -> str:
@@ -89,9 +89,9 @@ class Check:
         lines = [f"{self.name}: {counted(len(lengths), 'demonstration')} of {steps}, {counted(columns, 'column')}"]
         if not self.warnings:
             lines.append("  no faults: no gaps, jumps, stills, duplicates or outliers")
-        told = [f"  {'' if one.severity == 'note' else f'{one.severity}: '}{one}" for one in self.findings]
-        rest = len(told) - MOST_FAULTS
-        lines += told if rest <= 0 else [*told[:MOST_FAULTS], f"  and {rest} more"]
+        findings = [f"  {'' if finding.severity == 'note' else f'{finding.severity}: '}{finding}" for finding in self.findings]
+        rest = len(findings) - MOST_FAULTS
+        lines += findings if rest <= 0 else [*findings[:MOST_FAULTS], f"  and {rest} more"]
         lines += [] if self.known is None else [f"  {self.known}"]
         lines += [] if self.left_out is None else [f"  {line}" for line in self.left_out.lines() if line]
         return "\n".join(lines)
@@ -100,7 +100,7 @@ class Check:
 def known_as(
     model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, tell: Callable[[int], None]
 ) -> Known:
-    """The training concept that explains demonstrations best, by its mean loss."""
+    """The training concept with the lowest mean loss."""
     embeddings = model.training_embeddings[:, None, None]
     concepts = Composition(embeddings, torch.ones(embeddings.shape[:2], device=model.device))
     losses = relative_losses(model, demonstrations, concepts, settings, tell)
@@ -109,19 +109,19 @@ def known_as(
 
 
 def fit_findings(model: ConceptModel, demonstrations: Demonstrations) -> tuple[Finding, ...]:
-    """Whether demonstrations are as long as the model's plans, and on its scale."""
+    """Findings about the length and scale of demonstrations."""
     longer, longest = longer_than_plans(demonstrations, model), int(demonstrations.lengths.max())
-    found = [Finding(longer, "note")] if longer else []
+    findings = [Finding(longer, "note")] if longer else []
     if longest < model.window and not demonstrations.observed:
-        told = f"demonstrations of up to {longest} steps are shorter than the model's plans of {model.window}"
-        found.append(Finding(f"{told}; their last state is repeated", "note"))
-    return (*found, *scale_findings(model, demonstrations))
+        message = f"demonstrations of up to {longest} steps are shorter than the model's plans of {model.window}"
+        findings.append(Finding(f"{message}; their last state is repeated", "note"))
+    return (*findings, *scale_findings(model, demonstrations))
 
 
 def warnings_of(model: ConceptModel, demonstrations: Demonstrations) -> tuple[str, ...]:
-    """One line for each likely fault of demonstrations of one concept, before it is learned."""
-    found = (*check(demonstrations), *scale_findings(model, demonstrations))
-    return tuple(str(finding) for finding in found if finding.severity != "note")
+    """Lines about likely faults of one concept's demonstrations."""
+    findings = (*check(demonstrations), *scale_findings(model, demonstrations))
+    return tuple(str(finding) for finding in findings if finding.severity != "note")
 
 
 def check_with(
@@ -135,15 +135,15 @@ def check_with(
     """Check demonstrations of one concept with a model.
 
     Args:
-        model: that concepts are learned through.
-        demonstrations: that fit it, of one concept.
-        settings: how concepts are learned.
-        steps: of learning from subsets, at most; 0 to learn nothing.
-        found: before.
+        model: the frozen model.
+        demonstrations: demonstrations of one concept that fit the model.
+        settings: settings of the inversion.
+        steps: maximum number of gradient steps on subsets; 0 to learn nothing.
+        found: earlier findings.
         progress: show a bar.
 
     Raises:
-        UserError: for a model through which no concepts are learned.
+        UserError: for a model without inversion.
     """
     check_settings(model, settings)
     name = demonstrations.concepts[0]

@@ -1,4 +1,4 @@
-"""The forms that a concept may have, and how one is chosen by what its demonstrations say."""
+"""Forms of learned concepts, and selection of a form by leave-one-out error."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
@@ -19,26 +19,26 @@ from ftl_lightning.learning.relative_loss import relative_losses
 from ftl_lightning.learning.text_concept_model import TextConceptModel
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
-"""Of adapters and of their learning, where the settings name none."""
+"""Default rank, learning rate and steps of adapters."""
 MODE_SAMPLES, MODE_STEPS = 16, 400
-"""Noised demonstrations a step of a mode that is learned without an adapter, and steps, at most."""
+"""Noised demonstrations a step, and maximum number of steps, of modes without an adapter."""
 FOLDS, CLEAR, FEWER = 5, 0.4, 2
-"""Sets of embeddings that leave a demonstration out, at most; and how many where the loss of one set is less than the second, as
-a share of the empty concept's: it suffices then, and left-out demonstrations only decide what is composed.
+"""Maximum number of leave-one-out folds; relative loss of one set below which it suffices, so that folds only decide about
+composition; number of folds then. Losses are relative to the unconditional (empty concept's) loss.
 """
 TOLERANCE = 0.01
-"""Of the stopping rule, where the settings have none."""
+"""Default tolerance of early stopping."""
 OWN, BOTH, ALL = 0.8, 2.03, 3.27
-"""One set suffices if its loss on its own demonstrations, as a share of the empty concept's, is at most the first; or with that on
-left-out ones at most the second; or where there are sets in the span, with theirs on left-out ones at most the third. Chosen on
-relations that pretraining does not show, see docs/experiments-forms.md.
+"""One set suffices if its relative training loss is at most the first value; or if the sum of training and leave-one-out losses is
+at most the second, or with sets in the span, the sum including the span's leave-one-out loss at most the third. Chosen on relations
+not seen in pretraining, see docs/experiments-forms.md.
 """
 NARROW, WIDE = 0.65, 0.75
-"""Mixtures take the place of one set whose samples spread less than the first of what the demonstrations do; those that spread more
-than the second are stretched less."""
+"""Spread of samples, relative to demonstrations: below the first value mixtures replace one set; mixtures above the second are
+stretched less."""
 SPAN_LOSS = 1.03
-"""A concept is composed from a set in the span of the training concepts if sets there have at most so many times the loss of free
-ones on left-out demonstrations."""
+"""Maximum ratio of leave-one-out losses, in the span of the training concepts to free, to compose a concept from a set in the
+span."""
 
 Tell = Callable[[float], None]
 
@@ -51,9 +51,9 @@ def learn(
     tell: Tell = lambda loss: None,
     watch: Watch | None = None,
 ) -> dict[str, Concept]:
-    """:func:`~ftl_lightning.learning.inversion.invert`, with concepts in the form that the settings name.
+    """:func:`~ftl_lightning.learning.inversion.invert`, with concepts in the form of the settings.
 
-    Only what is learned first is watched.
+    Only the first inversion is watched.
     """
     check_settings(model, settings)
     warn_of_loss(model, settings)
@@ -62,7 +62,7 @@ def learn(
 
 
 def first_settings(settings: InversionSettings) -> InversionSettings:
-    """What is learned first: what the settings say in the paper's form, else one set without an adapter."""
+    """Settings of the first inversion: unchanged in the paper's form, else one set without an adapter."""
     if settings.form in (UNSAID, PAPER):
         return settings
     return _one_set(settings)
@@ -76,15 +76,15 @@ def formed(
     first: dict[str, Concept],
     tell: Tell = lambda loss: None,
 ) -> dict[str, Concept]:
-    """Concepts in the form that the settings name, and where that is to be chosen, in the one that the demonstrations ask for.
+    """Concepts in the form of the settings; for ``'auto'``, selected by leave-one-out error.
 
     Args:
-        model, demonstrations, settings, steps, tell: as of :func:`~ftl_lightning.learning.inversion.invert`.
-        first: what was learned by :func:`first_settings`.
+        model, demonstrations, settings, steps, tell: as in :func:`~ftl_lightning.learning.inversion.invert`.
+        first: concepts learned with :func:`first_settings`.
     """
     if settings.form in (UNSAID, PAPER, ONE):
         return first
-    with torch.inference_mode(False), torch.enable_grad():  # which a trainer turns off at the end of learning
+    with torch.inference_mode(False), torch.enable_grad():  # a trainer turns gradients off after training
         return _beyond_first(model, demonstrations, settings, steps, first, tell)
 
 
@@ -104,7 +104,7 @@ def _beyond_first(
 
 
 def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
-    """One set without an adapter; where the form is to be chosen it is learned for its loss alone, and stops by itself."""
+    """One set without an adapter; with early stopping for ``'auto'``, which needs its loss alone."""
     if settings.form == AUTO and settings.budget.tolerance is None:
         changes["tolerance"] = TOLERANCE
     return settings.changed(form=PAPER, modes=1, adapter=0, **changes)
@@ -118,41 +118,41 @@ def _with_modes(
     first: Mapping[str, Concept],
     tell: Tell,
 ) -> dict[str, Concept]:
-    """The first concepts with one set for each demonstration, learned without stopping: what samples are like depends on them."""
+    """The first concepts with a mode for each demonstration, learned without early stopping, since samples depend on modes."""
     alone = settings.from_one_start(form=PAPER, modes=1, adapter=0, samples=MODE_SAMPLES, tolerance=None)
     sets = learned_from(model, demonstrations, [[row] for row in range(len(demonstrations))], alone, min(steps, MODE_STEPS), tell)
-    found = {}
+    formed = {}
     for name, concept in first.items():
         rows = [row for row, text in enumerate(demonstrations.concepts) if text == name]
         modes = Modes(sets.embeddings[rows].cpu(), sets.weights[rows].cpu(), mixed=False)
-        found[name] = replace(concept, modes=modes if len(rows) > 1 else None)
-    return found
+        formed[name] = replace(concept, modes=modes if len(rows) > 1 else None)
+    return formed
 
 
 def _adapted(
     model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, mixed: bool, tell: Tell
 ) -> dict[str, Concept]:
-    """Concepts of one set and an adapter; or of mixtures that share one, and of a single demonstration there are none."""
-    own = settings.adapter
-    rank, rate = (own.rank, own.learning_rate) if own.rank else (RANK, RATE)
+    """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only)."""
+    adapter = settings.adapter
+    rank, rate = (adapter.rank, adapter.learning_rate) if adapter.rank else (RANK, RATE)
     changes = {"modes": "each" if mixed else 1, "adapter": rank, "adapter_learning_rate": rate, "tolerance": None}
-    found = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
+    concepts = invert(model, demonstrations, settings.from_one_start(form=PAPER, **changes), min(steps, ADAPTER_STEPS), tell)
     return {
         name: replace(concept, modes=replace(concept.modes, mixed=True, stretch=even_stretch(len(concept.modes))))
         if concept.modes
         else concept
-        for name, concept in found.items()
+        for name, concept in concepts.items()
     }
 
 
 @dataclass(frozen=True)
 class _Shares:
-    """Losses of one set of embeddings, as shares of the empty concept's on the same demonstrations.
+    """Losses of one set of embeddings, relative to the unconditional loss on the same demonstrations.
 
     Attributes:
-        own: on the demonstrations that it was learned from.
-        left_out: on demonstrations that it was not learned from, the mean over them; ``None`` of fewer than three.
-        in_span: the same of sets in the span of the training concepts; ``None`` for a model whose concepts are no texts, too.
+        own: training loss.
+        left_out: mean leave-one-out loss; ``None`` for fewer than three demonstrations.
+        in_span: mean leave-one-out loss in the span of the training concepts; ``None`` also for models without text concepts.
     """
 
     own: float
@@ -161,7 +161,7 @@ class _Shares:
 
     @property
     def suffices(self) -> bool:
-        """Whether one set says enough of what the demonstrations have in common."""
+        """Whether one set of embeddings suffices."""
         if self.own <= OWN or self.left_out is None:
             return self.own <= OWN
         both = self.own + self.left_out
@@ -169,12 +169,12 @@ class _Shares:
 
     @property
     def composes(self) -> bool:
-        """Whether a set in the span explains left-out demonstrations about as well as a free one."""
+        """Whether a set in the span has about the leave-one-out loss of a free set."""
         return self.left_out is not None and self.in_span is not None and self.in_span <= SPAN_LOSS * self.left_out
 
     @property
     def numbers(self) -> dict[str, float]:
-        """By name, so far as there are."""
+        """Available losses by name."""
         named = {"loss, own": self.own, "loss, left out": self.left_out, "loss, left out, in span": self.in_span}
         return {name: value for name, value in named.items() if value is not None}
 
@@ -187,7 +187,7 @@ def _loss_shares(
     first: Mapping[str, Concept],
     tell: Tell,
 ) -> dict[str, _Shares]:
-    """What one set of every concept says of its own demonstrations and of left-out ones."""
+    """Training and leave-one-out losses of one set for every concept."""
     every = {name: [row for row, text in enumerate(demonstrations.concepts) if text == name] for name in first}
     losses = {name: [_own_loss(model, _of(demonstrations, [name]), first[name], settings)] for name in first}
     left = {
@@ -199,8 +199,8 @@ def _loss_shares(
         learned = learned_from(model, demonstrations, folds, quickly(settings).changed(off_span=off_span), steps, tell)
         number = 0
         for name, rows in left.items():
-            own = slice(number, number + len(rows))
-            sets = Composition(learned.embeddings[own], learned.weights[own])
+            part = slice(number, number + len(rows))
+            sets = Composition(learned.embeddings[part], learned.weights[part])
             if rows:
                 losses[name].append(float(relative_losses(model, demonstrations.rows(rows), sets, settings).diagonal().mean()))
             number += len(rows)
@@ -208,7 +208,7 @@ def _loss_shares(
 
 
 def _own_loss(model: ConceptModel, demonstrations: Demonstrations, concept: Concept, settings: InversionSettings) -> float:
-    """Of one set of embeddings on the demonstrations that it was learned from."""
+    """Relative training loss of one set of embeddings."""
     weights = concept.weights if settings.omega != "learned" else concept.weights / settings.weights.scale
     alone = Composition(concept.embeddings[None], weights[None]).to(model.device)
     return float(relative_losses(model, demonstrations, alone, settings).mean())
@@ -227,16 +227,16 @@ def _chosen(
     first: Mapping[str, Concept],
     tell: Tell,
 ) -> dict[str, Concept]:
-    """Of every concept the form that its demonstrations ask for, with what was measured, and what it is composed from."""
-    own = {name: demonstrations.select(name) for name in first}
-    found = {
+    """Every concept in its selected form, with its measurements and its embeddings for composition."""
+    demonstrated = {name: demonstrations.select(name) for name in first}
+    chosen = {
         name: replace(concept, choice=Choice(ONE, "there is a single demonstration", {}))
         for name, concept in first.items()
-        if len(own[name]) < 2
+        if len(demonstrated[name]) < 2
     }
-    several = {name: concept for name, concept in first.items() if name not in found}
+    several = {name: concept for name, concept in first.items() if name not in chosen}
     if not several:
-        return found
+        return chosen
     shares = _loss_shares(model, _of(demonstrations, several), settings, steps, several, tell)
     forms: dict[str, dict[str, Concept]] = {name: {} for name in several}
     if rest := {name: concept for name, concept in several.items() if not shares[name].suffices}:
@@ -245,10 +245,10 @@ def _chosen(
     if enough := [name for name in several if name not in rest]:
         for name, concept in _adapted(model, _of(demonstrations, enough), settings, steps, False, tell).items():
             forms[name][ADAPTED] = concept
-    qualities = {name: measured(model, own[name], forms[name], settings.seed) for name in several}
+    qualities = {name: measured(model, demonstrated[name], forms[name], settings.seed) for name in several}
     if narrow := [name for name in enough if qualities[name][ADAPTED].spread < NARROW]:
         for name, concept in _adapted(model, _of(demonstrations, narrow), settings, steps, True, tell).items():
-            forms[name][MIXED], qualities[name][MIXED] = _narrowed(model, own[name], concept, settings.seed)
+            forms[name][MIXED], qualities[name][MIXED] = _narrowed(model, demonstrated[name], concept, settings.seed)
     span: Mapping[str, Concept] = {}
     if composable := [name for name, share in shares.items() if share.composes]:
         span = invert(model, _of(demonstrations, composable), _one_set(settings.from_one_start(), off_span=0.0), steps, tell)
@@ -257,30 +257,30 @@ def _chosen(
         composing = None
         if name in span:
             composing, because = (span[name].embeddings, span[name].weights), f"{because}; composed in the training span"
-        numbers = {f"{key}, {kind}": value for kind, one in qualities[name].items() for key, value in one.numbers.items()}
+        numbers = {f"{key}, {kind}": value for kind, quality in qualities[name].items() for key, value in quality.numbers.items()}
         rounded = {key: round(value, 4) for key, value in (shares[name].numbers | numbers).items()}
-        found[name] = replace(forms[name][form], choice=Choice(form, because, rounded), composing=composing)
-    return {name: found[name] for name in first}
+        chosen[name] = replace(forms[name][form], choice=Choice(form, because, rounded), composing=composing)
+    return {name: chosen[name] for name in first}
 
 
 def _narrowed(model: ConceptModel, demonstrations: Demonstrations, concept: Concept, seed: int) -> tuple[Concept, Quality]:
-    """Mixtures that spread about as much as the demonstrations do, if wider ones than that are learned, and their quality."""
+    """Mixtures, stretched less if they spread too widely, and their quality."""
     quality = measured(model, demonstrations, {MIXED: concept}, seed)[MIXED]
     if quality.spread <= WIDE or concept.modes is None:
         return concept, quality
-    stretch = max(WIDE / quality.spread * concept.modes.stretch, 1.0)  # not below plain mixtures
+    stretch = max(WIDE / quality.spread * concept.modes.stretch, 1.0)  # at least plain mixtures
     concept = replace(concept, modes=replace(concept.modes, stretch=stretch))
     return concept, measured(model, demonstrations, {MIXED: concept}, seed)[MIXED]
 
 
 def _choice(shares: _Shares, qualities: Mapping[str, Quality]) -> tuple[str, str]:
-    """The form, and why."""
-    told = f"{shares.own:.2f} of the empty concept's"
+    """The selected form and its reason."""
+    losses = f"{shares.own:.2f} of the empty concept's"
     if shares.left_out is not None:
-        told = f"{shares.left_out:.2f} of the empty concept's on left-out demonstrations, {shares.own:.2f} on its own"
+        losses = f"{shares.left_out:.2f} of the empty concept's on left-out demonstrations, {shares.own:.2f} on its own"
     if not shares.suffices:
-        return MODES, f"one set of embeddings does not explain the demonstrations (loss {told}), so samples stay close to them"
-    because, spread = f"one set of embeddings explains the demonstrations (loss {told})", qualities[ADAPTED].spread
+        return MODES, f"one set of embeddings does not explain the demonstrations (loss {losses}), so samples stay close to them"
+    because, spread = f"one set of embeddings explains the demonstrations (loss {losses})", qualities[ADAPTED].spread
     if MIXED in qualities and (mixed := qualities[MIXED].spread) > spread:
         return MIXED, f"{because}; its samples spread {spread:.2f} of what the demonstrations do, mixtures {mixed:.2f}"
     return ADAPTED, f"{because}; samples spread {spread:.2f} of what the demonstrations do"

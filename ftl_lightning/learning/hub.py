@@ -1,4 +1,4 @@
-"""Models and concepts on the Hugging Face Hub; all that is done there needs a network."""
+"""Models and concepts on the Hugging Face Hub; requires a network."""
 
 import re
 import tempfile
@@ -14,23 +14,23 @@ from ftl_lightning.shipped import FOLDERS
 from ftl_lightning.tensor_file import atomic
 
 MODEL_FILES = ("*.json", "*.safetensors", "*.md")
-"""Of a repository with a model, what is downloaded."""
+"""Files to download from a model's repository."""
 CONCEPT_FILES = (CONCEPT, "README.md")
-"""Of one with a concept."""
+"""Files to download from a concept's repository."""
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
 
 
 def is_repository(name: str) -> bool:
-    """Whether a name where no file is may be ``'owner/name'`` on the Hub; paths such as ``'./a'`` and ``'conf/a'`` never are."""
-    owner, slash, own = name.partition("/")
-    return bool(slash) and "/" not in own and owner not in FOLDERS and not owner.startswith((".", "~"))
+    """Whether a name may be ``'owner/name'`` on the Hub; paths such as ``'./a'`` and ``'conf/a'`` never are."""
+    owner, slash, rest = name.partition("/")
+    return bool(slash) and "/" not in rest and owner not in FOLDERS and not owner.startswith((".", "~"))
 
 
 def expect_repository(repository: object) -> str:
-    """Refuse what is no name of a repository to upload to.
+    """Refuse an invalid name of a repository.
 
     Raises:
-        UserError: with an example of one.
+        UserError: with an example.
     """
     if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
         raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
@@ -40,15 +40,15 @@ def expect_repository(repository: object) -> str:
 def download(
     repository: str, files: Sequence[str] = MODEL_FILES, expected: str = "a folder, a model that ships or one on the Hub"
 ) -> Path:
-    """The folder of the model or concept ``owner/name``, downloaded now or before.
+    """Download the model or concept ``owner/name``, or take it from the cache, and return its folder.
 
     Args:
-        repository: its name.
-        files: patterns of what is downloaded; nothing else is.
-        expected: what could have been named, for messages.
+        repository: name of the repository.
+        files: patterns of the files to download.
+        expected: expected kinds of names, for messages.
 
     Raises:
-        UserError: if it cannot be had.
+        UserError: if the download fails.
     """
     from huggingface_hub import snapshot_download
 
@@ -62,15 +62,15 @@ def upload(write: Callable[[Path], object], repository: str, private: bool = Fal
     """Upload a folder as ``owner/name``; needs a login.
 
     Args:
-        write: puts the files into a folder; not called where the name is none.
+        write: writes the files into a folder; not called for an invalid name.
         repository: the name.
-        private: whether only you see it, if it is new.
+        private: whether a new repository is private.
 
     Returns:
-        Where it is.
+        The address.
 
     Raises:
-        UserError: for a name that is none, or if it cannot be uploaded.
+        UserError: for an invalid name, or if the upload fails.
     """
     expect_repository(repository)
     with tempfile.TemporaryDirectory() as folder:
@@ -82,8 +82,8 @@ def upload(write: Callable[[Path], object], repository: str, private: bool = Fal
             hub.create_repo(repository, private=private, exist_ok=True)
             return str(hub.upload_folder(repo_id=repository, folder_path=folder))
         except Exception as error:
-            told = f"{repository}: expected a place on the Hub that you may write to, found none ({_reason(error)})"
-            raise UserError(f"{told}; log in first: hf auth login") from error
+            message = f"{repository}: expected a place on the Hub that you may write to, found none ({_reason(error)})"
+            raise UserError(f"{message}; log in first: hf auth login") from error
 
 
 def _reason(error: Exception) -> str:
@@ -91,7 +91,7 @@ def _reason(error: Exception) -> str:
 
 
 def card(model: ConceptModel) -> str:
-    """A short model card with the Hub's metadata."""
+    """Model card with the Hub's metadata."""
     texts = "\n".join(f"- {text}" for text in model.config.training_concepts)
     return (
         "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning]\n---\n"
@@ -103,7 +103,7 @@ def card(model: ConceptModel) -> str:
 
 
 def save_with_card(model: ConceptModel, folder: Path) -> None:
-    """Write a model's folder and, if there is none yet, a ``README.md`` into it."""
+    """Write a model's folder, and a ``README.md`` unless it exists."""
     save_model(model, folder)
     if not (readme := folder / "README.md").is_file():
         with atomic(readme) as temporary:

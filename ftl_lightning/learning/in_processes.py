@@ -1,4 +1,4 @@
-"""Learning many concepts in several processes, each its share of them. Concepts do not depend on what is learned beside them."""
+"""Learning concepts in several processes. Concepts do not depend on others in the batch."""
 
 import multiprocessing
 import tempfile
@@ -22,16 +22,16 @@ from ftl_lightning.progress import bar
 
 @dataclass(frozen=True)
 class _Share:
-    """What one process learns.
+    """Work of one process.
 
     Attributes:
-        folder: where it finds the demonstrations and writes its concepts.
-        model: folder or name of the pretrained one.
-        concepts: their texts, with the number of each one's file.
-        settings: how.
-        steps: of gradient descent.
-        device: to learn on.
-        vouched: modules that a person named.
+        folder: folder of the demonstrations and learned concepts.
+        model: folder or name of the pretrained model.
+        concepts: file numbers and texts of concepts.
+        settings: settings of the inversion.
+        steps: gradient steps.
+        device: device to learn on.
+        vouched: modules that the user trusts.
     """
 
     folder: str
@@ -51,20 +51,20 @@ def learned_in_processes(
     processes: int,
     devices: Iterable[torch.device] = (torch.device("cpu"),),
 ) -> dict[str, Concept]:
-    """The concepts that the model's learner makes of some demonstrations, learned in several processes.
+    """Learn the concepts of the demonstrations in several processes.
 
-    They are those of one process but for rounding: sums are taken over other numbers of rows.
+    Equal to a single process up to rounding: sums have other numbers of rows.
 
     Args:
-        model: folder or name of the pretrained one.
-        demonstrations: with concept texts, which name the concepts.
-        settings: how.
-        steps: of gradient descent.
-        processes: at most; there are no more than concepts.
-        devices: processes take them in turn.
+        model: folder or name of the pretrained model.
+        demonstrations: demonstrations; their concept texts name the concepts.
+        settings: settings of the inversion.
+        steps: gradient steps.
+        processes: maximum number of processes; at most one for each concept.
+        devices: devices, assigned in turn.
 
     Raises:
-        UserError: what the learner raises; or that a process ended before it was done.
+        UserError: raised by the learner, or if a process ended early.
     """
     names, devices = tuple(dict.fromkeys(demonstrations.concepts)), tuple(devices)
     numbered = tuple(enumerate(names))
@@ -74,7 +74,7 @@ def learned_in_processes(
             _Share(folder, model, numbered[first::processes], settings, steps, str(devices[first % len(devices)]), trust.vouched())
             for first in range(min(processes, len(names)))
         ]
-        # Started anew: a process that is split off would share the threads and devices of this one.
+        # Spawned, since a forked process would share threads and devices.
         with (
             ProcessPoolExecutor(len(shares), multiprocessing.get_context("spawn")) as pool,
             bar("concepts", len(names)) as advance,
@@ -98,18 +98,18 @@ def _file(folder: str, number: int) -> Path:
 
 
 def _learn(share: _Share) -> str:
-    """Write a share's concepts; returns a mistake of the user's, or nothing."""
-    silence()  # the first process has said what there is to say of the demonstrations
+    """Learn and write a share's concepts; return the message of a ``UserError``, or an empty string."""
+    silence()  # the first process has printed all notes
     torch.set_num_threads(1)
     with trust.vouching(share.vouched):
         try:
             model = load_model(share.model).to(share.device)
             every = Demonstrations.load(Path(share.folder) / _DEMONSTRATIONS)
             names = {name for _, name in share.concepts}
-            own = every.rows([row for row, name in enumerate(every.concepts) if name in names])
-            found = model.method.learn()(model, own, share.settings, share.steps)
+            demonstrations = every.rows([row for row, name in enumerate(every.concepts) if name in names])
+            learned = model.method.learn()(model, demonstrations, share.settings, share.steps)
             for number, name in share.concepts:
-                found[name].save(_file(share.folder, number))
+                learned[name].save(_file(share.folder, number))
         except UserError as error:
             return str(error)
     return ""

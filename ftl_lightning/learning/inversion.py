@@ -1,4 +1,4 @@
-"""Inversion: learning concepts from a few demonstrations by gradient descent through the frozen model (Eq. 2 of the paper)."""
+"""Inversion: gradient descent on concept embeddings through the frozen model (Eq. 2 of the paper)."""
 
 import logging
 from collections.abc import Callable
@@ -37,23 +37,23 @@ from ftl_lightning.seeding import generator, task_key
 _LOG = logging.getLogger(__name__)
 
 FINAL_SAMPLES = 128
-"""Noised demonstrations on which a learned concept is judged, the same for all restarts."""
+"""Number of noised demonstrations for the final loss, the same for all restarts."""
 HELD_OUT = 32
-"""Noised demonstrations whose loss decides when a run stops."""
+"""Number of noised demonstrations for the stopping loss."""
 
 
 Watch = Callable[[int, float, Callable[[], dict[str, Concept]]], None]
-"""Called after a step with its number from 1, its mean loss, and what gives the concepts so far by name."""
+"""Callback after a step: the step's number from 1, its mean loss, and a function that returns the concepts so far by name."""
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Embeddings that are learned from some demonstrations.
+    """One restart of one set of embeddings.
 
     Attributes:
-        concept: its place among the concepts.
-        rows: of its demonstrations.
-        mode: its number from 1; 0 for the embeddings that are learned from all demonstrations of the concept.
+        concept: index of the concept.
+        rows: rows of its demonstrations.
+        mode: number of the mode from 1; 0 for the set that is learned from all demonstrations of the concept.
     """
 
     concept: int
@@ -62,19 +62,19 @@ class _Run:
 
 
 class Inversion(nn.Module):
-    """K embeddings and their weights for every concept of some demonstrations, all in one batch.
+    """K embeddings and guidance weights for every concept of the demonstrations, in one batch.
 
-    Its only parameters are ``embeddings (run, K, knots, n)`` and, unless omega is fixed, ``weights (run, K)``; with an adapter,
-    its factors for each concept and restart too. A run is a concept, or a mode of one, and a restart. Modes are learned through
-    their concept's adapter and do not change it. The model is frozen and no part of it.
+    Parameters: ``embeddings (run, K, knots, n)``; ``weights (run, K)`` unless omega is fixed; the adapter's factors for each
+    concept and restart. A run is one restart of a concept or of a mode. Modes use their concept's adapter without changing it.
+    The frozen model is not a submodule.
 
     Args:
-        model: that concepts are learned through.
-        demonstrations: with concept texts, which name the concepts to learn.
-        settings: how.
+        model: the frozen model.
+        demonstrations: demonstrations; their concept texts name the concepts to learn.
+        settings: settings of the inversion.
 
     Raises:
-        UserError: for a model without text concepts that is to learn near their span.
+        UserError: if ``off_span`` is below 1 for a model without text concepts.
     """
 
     basis: Tensor
@@ -85,7 +85,7 @@ class Inversion(nn.Module):
     def __init__(self, model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> None:
         super().__init__()
         check_settings(model, settings)
-        self._model = (model,)  # in a tuple, or it would be a part of this module
+        self._model = (model,)  # a tuple, so that it is not registered as a submodule
         self.demonstrations, self.settings = demonstrations, settings
         self.concepts = tuple(dict.fromkeys(demonstrations.concepts))
         training = model.training_embeddings
@@ -94,9 +94,9 @@ class Inversion(nn.Module):
         self.register_buffer("basis", basis, persistent=False)
         self.runs = self._runs()
         self.register_buffer("_modes", torch.tensor([run.mode > 0 for run in self.runs]), persistent=False)
-        # Those that go on after screening; kept in checkpoints, as nothing else tells.
+        # The runs that survive screening; a buffer, so that checkpoints keep them.
         self.register_buffer("screened", torch.ones(len(self.runs), dtype=torch.bool) if settings.budget.screening else None)
-        # A generator for each concept, so that its start does not depend on what is learned beside it. Its modes start alike.
+        # A generator for each concept: its start does not depend on the rest of the batch. Its modes share the start.
         shape = (settings.budget.restarts, settings.components, model.config.concept_dim)
         draws = [generator("cpu", settings.seed, 0, task_key(name)) for name in self.concepts]
         starts = [torch.randn(shape, generator=draw) for draw in draws]
@@ -111,7 +111,7 @@ class Inversion(nn.Module):
             self.weights = nn.Parameter(torch.full(runs, float(settings.weights.initial)))
         else:
             self.register_buffer("weights", torch.full(runs, float(settings.omega)), persistent=False)
-        # Factors of an adapter of each concept and restart: of each weight ``up (adapter, outputs, rank)``, first 0, and ``down``.
+        # Adapter factors for each concept and restart: ``up (adapter, outputs, rank)``, initially 0, and ``down`` of each weight.
         self.factors = nn.ParameterList()
         sizes = model.adaptable() if settings.adapter.rank else {}
         self._names = list(sizes)
@@ -125,29 +125,29 @@ class Inversion(nn.Module):
             self.stopping = Stopping(self.embeddings, self.weights, settings.budget.tolerance)
 
     def _runs(self) -> list[_Run]:
-        """Of each concept the run of all its demonstrations, then those of its modes; restarts of a run stand together."""
-        texts, modes, found = self.demonstrations.concepts, self.settings.modes.sets, []
+        """Runs by concept: first all its demonstrations, then its modes. Restarts of a run are adjacent."""
+        texts, modes, runs = self.demonstrations.concepts, self.settings.modes.sets, []
         for concept, name in enumerate(self.concepts):
             rows = tuple(row for row, text in enumerate(texts) if text == name)
             count = min(modes, len(rows)) if isinstance(modes, int) else len(rows)
             parts = [rows, *((rows[mode::count] for mode in range(count)) if count > 1 else ())]
-            found += [_Run(concept, part, mode) for mode, part in enumerate(parts) for _ in range(self.settings.budget.restarts)]
-        return found
+            runs += [_Run(concept, part, mode) for mode, part in enumerate(parts) for _ in range(self.settings.budget.restarts)]
+        return runs
 
     @property
     def model(self) -> ConceptModel:
-        """That concepts are learned through."""
+        """The frozen model."""
         return self._model[0]
 
     def parametrised(self, embeddings: Tensor) -> Tensor:
-        """Embeddings ``(run, K, knots, n)`` after their part off the span is scaled."""
+        """Scale the part of embeddings ``(run, K, knots, n)`` that is off the training span."""
         if self.settings.embeddings.off_span == 1:
             return embeddings
         inside = embeddings @ self.basis.T @ self.basis
         return inside + self.settings.embeddings.off_span * (embeddings - inside)
 
     def adapter(self, number: int) -> LowRank | None:
-        """An adapter by its number, see :attr:`_adapter_of`; ``None`` where there are none."""
+        """The adapter with this number, see :attr:`_adapter_of`; ``None`` without adapters."""
         factors = [factor[number] for factor in self.factors]
         if not factors:
             return None
@@ -155,25 +155,25 @@ class Inversion(nn.Module):
         return LowRank(named, self.settings.adapter.scope == "all")
 
     def _adapter_of(self, run: int) -> int:
-        """The number of a run's adapter: concepts' one after another, those of a concept's restarts together."""
+        """Number of a run's adapter, ordered by concept, then restart."""
         restarts = self.settings.budget.restarts
         return self.runs[run].concept * restarts + run % restarts
 
     def _losses(self, samples: int, draw: torch.Generator, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
-        """The model's loss (ours is Eq. 2) for every sample ``(run, samples)``. Runs share what is random in it and, as a share of
-        a demonstration's length, the windows' starts.
+        """The model's loss (Eq. 2) of every sample ``(run, samples)``. Runs share noise, timesteps and the relative start of
+        windows.
 
         Args:
-            samples: noised demonstrations of each run, evenly spread over its own.
-            draw: of noise, timesteps and windows.
-            embeddings: of every run ``(run, K, knots, n)``.
-            weights: of every run ``(run, K)``.
-            chosen: which runs ``(run,)`` of bool; ``None`` for all.
+            samples: noised demonstrations of each run, spread evenly over its demonstrations.
+            draw: generator of noise, timesteps and windows.
+            embeddings: embeddings of every run ``(run, K, knots, n)``.
+            weights: weights of every run ``(run, K)``.
+            chosen: bool mask of runs ``(run,)``; ``None`` for all.
         """
         runs = self.runs
         if chosen is not None:
             embeddings, weights = embeddings[chosen], weights[chosen]
-            runs = [run for run, own in zip(runs, chosen.tolist(), strict=True) if own]
+            runs = [run for run, kept in zip(runs, chosen.tolist(), strict=True) if kept]
         model, device = self.model, self.embeddings.device
         window = model.window
         draws = model.draws(samples, self.settings.loss.timestep_power, draw)
@@ -185,64 +185,64 @@ class Inversion(nn.Module):
         states, seen = model.perturbed(states.to(device), moved(observed, device), draw)
         composition = Composition(self.parametrised(embeddings), weights)
         if self.factors:
-            own = range(len(self.runs)) if chosen is None else chosen.nonzero()[:, 0].tolist()
-            numbers = [self._adapter_of(run) for run in own]
+            indices = range(len(self.runs)) if chosen is None else chosen.nonzero()[:, 0].tolist()
+            numbers = [self._adapter_of(run) for run in indices]
             different = list(dict.fromkeys(numbers))
             adapters = [adapter for number in different if (adapter := self.adapter(number))]
-            if all(self.runs[run].mode for run in own):  # which learn through it and leave it as it is
+            if all(self.runs[run].mode for run in indices):  # modes do not change the adapter
                 adapters = [adapter.detached() for adapter in adapters]
             number = torch.tensor([1 + different.index(number) for number in numbers], device=device)[:, None]
             composition = replace(composition, adapters=tuple(adapters), adapter=number.expand_as(weights))
         return model.losses(states, seen, composition, draws, self.settings.loss.kind)
 
     def losses(self, samples: int, draw: torch.Generator, chosen: Tensor | None = None) -> Tensor:
-        """:meth:`_losses` of the embeddings and weights that are being learned."""
+        """:meth:`_losses` of the current parameters."""
         return self._losses(samples, draw, self.embeddings, self.weights, chosen)
 
     def step_losses(self, step: int) -> Tensor:
-        """The mean losses of a training step ``(run,)``, of the runs that have not stopped.
+        """Mean losses of a training step ``(run,)``, over the active runs.
 
         Raises:
-            UserError: if they are not finite.
+            UserError: if the mean is not finite.
         """
         if self.stopping is not None and step == 0:
             self.stopping.begin(self._held_out(self.embeddings, self.weights, None))
-        found = []
-        for samples, own in ((self.settings.budget.samples, ~self._modes), (self.settings.modes.samples, self._modes)):
-            chosen = own if self.stopping is None else own & self.stopping.going
+        losses = []
+        for samples, mask in ((self.settings.budget.samples, ~self._modes), (self.settings.modes.samples, self._modes)):
+            chosen = mask if self.stopping is None else mask & self.stopping.going
             chosen = chosen if self.screened is None else chosen & self.screened
             if chosen.any():
-                # Anew for the modes, which would otherwise depend on whether any other run goes on.
+                # A new generator for the modes, so that they do not depend on whether other runs are active.
                 draw = generator(self.embeddings.device, self.settings.seed, 1, step)
                 with self._reduced():
-                    found.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
-        losses = torch.cat(found)
-        mean = losses.detach().mean()
+                    losses.append(self.losses(samples, draw, None if chosen.all() else chosen).mean(dim=1))
+        every = torch.cat(losses)
+        mean = every.detach().mean()
         if not mean.isfinite():
             raise UserError(f"inversion: the loss became {mean.item()} at step {step}; lower model.budget.learning_rate")
-        return losses
+        return every
 
     def _reduced(self) -> AbstractContextManager[None]:
-        """Products in bfloat16, where the settings say so; a trainer may say so too."""
+        """Autocast to bfloat16 if the settings ask for it."""
         reduced = self.settings.budget.precision == REDUCED
         return torch.autocast(self.embeddings.device.type, torch.bfloat16) if reduced else nullcontext()
 
     def stepped(self, step: int) -> bool:
-        """Take note of a step that was made, by its number from 0.
+        """Record a completed step, numbered from 0.
 
         Returns:
-            Whether any run goes on.
+            Whether any run is still active.
         """
         if self.screened is not None and step + 1 == self.settings.budget.screening:
             losses = self._held_out(self.embeddings, self.weights, None).unflatten(0, (-1, self.settings.budget.restarts))
             self.screened = functional.one_hot(losses.argmin(dim=1), losses.shape[1]).bool().flatten()
             if self.stopping is not None:
-                self.stopping.going &= self.screened  # or nothing would be left to step once the others stop
+                self.stopping.going &= self.screened  # otherwise no run would be left to step once the others stop
         return self.stopping is None or self.stopping.stepped(step, self.embeddings, self.weights, self._held_out)
 
     @torch.no_grad()
     def _held_out(self, embeddings: Tensor, weights: Tensor, chosen: Tensor | None) -> Tensor:
-        """Mean losses ``(run,)`` on noise that no step sees."""
+        """Mean losses ``(run,)`` on held-out noise."""
         draw = generator(self.embeddings.device, self.settings.seed, 3)
         return self._losses(HELD_OUT, draw, embeddings, weights, chosen).mean(dim=1)
 
@@ -255,7 +255,7 @@ class Inversion(nn.Module):
         return [(self.embeddings, self.settings.budget.learning_rate), *weights, *factors]
 
     def optimizer(self, steps: int) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        """Adam, weights with a rate of their own, and its cosine decay over so many steps, or no decay where runs are stopped."""
+        """Adam with a learning rate for each parameter group, and cosine decay over ``steps``; no decay with early stopping."""
         optimizer = torch.optim.Adam([{"params": [parameter], "lr": rate} for parameter, rate in self.rates])
         if self.settings.budget.tolerance is not None:
             return optimizer, torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
@@ -263,13 +263,13 @@ class Inversion(nn.Module):
 
     @torch.no_grad()
     def learned(self) -> dict[str, Concept]:
-        """The concepts by name: of each run, the restart with the lowest loss on common noise.
+        """Concepts by name, each from the restart with the lowest loss on common noise.
 
         Raises:
-            UserError: for a concept that is not finite.
+            UserError: if a concept is not finite.
         """
         restarts = self.settings.budget.restarts
-        # Where there were fewer steps than a round has, there is no best one yet.
+        # Before the first round ends, there is no best one.
         source = self if self.stopping is None or not self.stopping.rounds else self.stopping
         raw, weights = source.embeddings.detach(), source.weights.detach()
         losses = self._final(raw, weights)
@@ -282,47 +282,47 @@ class Inversion(nn.Module):
         kind = "learned" if self.settings.omega == "learned" else "fixed"
         if kind == "learned":
             weights = weights * self.settings.weights.scale
-        found, pretrained = {}, self.model.hash
+        concepts, pretrained = {}, self.model.hash
         for index, name in enumerate(self.concepts):
             whole, *modes = [run for run in best.tolist() if self.runs[run].concept == index]
             mixed = auto and bool(explained(empty[whole], losses[whole], losses[modes].mean()) >= EXPLAINED)
-            found[name] = Concept(
+            concepts[name] = Concept(
                 embeddings[whole].cpu(),
                 weights[whole].cpu(),
                 origin(self.model, self.demonstrations, name, kind, losses[whole].item(), pretrained),
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
                 adapter.copied() if (adapter := self.adapter(self._adapter_of(whole))) else None,
             )
-            found[name].expect_finite(f"inversion: concept {name!r}")
-        return found
+            concepts[name].expect_finite(f"inversion: concept {name!r}")
+        return concepts
 
     def _final(self, embeddings: Tensor, weights: Tensor) -> Tensor:
-        """Mean losses ``(run,)`` on noise that is common to all runs and always the same."""
+        """Mean losses ``(run,)`` on fixed noise, common to all runs."""
         draw = generator(self.embeddings.device, self.settings.seed, 2)
         return self._losses(FINAL_SAMPLES, draw, embeddings, weights, None).mean(dim=1)
 
 
 def explained(empty: Tensor, one: Tensor, modes: Tensor) -> Tensor:
-    """The share of what several modes lower the empty concept's loss by that one set of embeddings lowers it by."""
+    """Gain of one set over the unconditional (empty concept's) loss, as a share of the modes' gain."""
     return (empty - one) / (empty - modes)
 
 
 def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
-    """Refuse settings that do not go with a model.
+    """Refuse settings that a model does not support.
 
     Raises:
-        UserError: naming the key.
+        UserError: with the key.
     """
     if not model.invertible:
         raise UserError(f"model.pretrained: expected a model that concepts are learned through, found one of {model.method.name}")
     if settings.embeddings.off_span < 1 and not isinstance(model, TextConceptModel):
-        found = settings.embeddings.off_span
+        share = settings.embeddings.off_span
         raise UserError(
-            f"model.embeddings.off_span: expected 1 (free) for {model.method.name}, whose concepts are no texts, found {found}"
+            f"model.embeddings.off_span: expected 1 (free) for {model.method.name}, whose concepts are no texts, found {share}"
         )
     if (knots := settings.embeddings.knots) > 1 and not model.over_time:
-        told = f"expected 1 for this model, whose concepts do not vary over a plan, found {knots}"
-        raise UserError(f"model.embeddings.knots: {told}")
+        message = f"expected 1 for this model, whose concepts do not vary over a plan, found {knots}"
+        raise UserError(f"model.embeddings.knots: {message}")
     if settings.form in (AUTO, ADAPTED, MIXED) and not model.adaptable():
         raise UserError(f"model.form: expected {PAPER}, {ONE} or {MODES} for {model.method.name}, found {settings.form}")
     if settings.adapter.rank and not model.adaptable():
@@ -330,7 +330,7 @@ def check_settings(model: ConceptModel, settings: InversionSettings) -> None:
 
 
 def warn_of_loss(model: ConceptModel, settings: InversionSettings) -> None:
-    """Say where concepts are to be learned by another loss than the model was."""
+    """Log a warning if the loss differs from that of pretraining."""
     pretrained = model.config.training.get("model", {}).get("loss", settings.loss.kind)
     if pretrained != settings.loss.kind:
         _LOG.warning(
@@ -341,24 +341,24 @@ def warn_of_loss(model: ConceptModel, settings: InversionSettings) -> None:
 def origin(
     model: ConceptModel, demonstrations: Demonstrations, name: str, weights: str, loss: float, pretrained: str = ""
 ) -> Origin:
-    """Where a concept comes from.
+    """Origin of a learned concept.
 
     Args:
-        model: it was learned through.
-        demonstrations: among which are its own.
-        name: the concept.
+        model: the pretrained model.
+        demonstrations: demonstrations, including the concept's.
+        name: name of the concept.
         weights: ``'fixed'`` or ``'learned'``.
-        loss: at the end of learning.
-        pretrained: the model's hash, of which a concept more takes as long as several steps; empty where it is not known.
+        loss: final loss.
+        pretrained: the model's hash, if known (hashing takes as long as several steps).
     """
-    own = demonstrations.select(name)
+    selected = demonstrations.select(name)
     return Origin(
         name=name,
         domain=model.config.domain,
         encoder=model.config.encoder,
         pretrained=pretrained or model.hash,
-        demonstrations=own.hash,
-        count=len(own),
+        demonstrations=selected.hash,
+        count=len(selected),
         weights=weights,
         loss=loss,
     )
@@ -372,22 +372,22 @@ def invert(
     tell: Callable[[float], None] = lambda loss: None,
     watch: Watch | None = None,
 ) -> dict[str, Concept]:
-    """Learn every concept of some demonstrations, without a trainer; the same numbers as with one.
+    """Learn every concept of the demonstrations without a trainer; same numbers as with a trainer.
 
     Args:
-        model: frozen.
-        demonstrations: with concept texts, which name the concepts.
-        settings: how.
-        steps: of gradient descent.
+        model: the frozen model.
+        demonstrations: demonstrations; their concept texts name the concepts.
+        settings: settings of the inversion.
+        steps: gradient steps.
         tell: called with the mean loss after each step.
-        watch: called after each step too; it may look at the concepts so far, which changes nothing.
+        watch: called after each step; reading the concepts so far changes nothing.
     """
     inversion = Inversion(model, demonstrations, settings).to(model.device)
     groups = [Group(parameter, rate) for parameter, rate in inversion.rates]
     for step in range(steps):
         losses = inversion.step_losses(step)
-        # A sum over runs: each run's gradient is what it would be if it were learned alone.
-        # An adapter also has factors of what reads observed features, which happens once a plan, outside of the branches.
+        # A sum over runs, so that runs do not affect each other's gradients.
+        # Adapter factors of the encoder of observed features, which runs once a plan, may have no gradient.
         gradients = torch.autograd.grad(losses.sum(), [group.parameter for group in groups], materialize_grads=True)
         for group, gradient in zip(groups, gradients, strict=True):
             group.step(gradient, None if settings.budget.tolerance is not None else (step, steps))

@@ -1,4 +1,4 @@
-"""Inversion as a LightningModule: curves, checkpoints that resume exactly, and evaluation at the end."""
+"""Inversion as a LightningModule: curves, exact resumption from checkpoints, and final evaluation."""
 
 from typing import Any, Literal
 
@@ -33,30 +33,30 @@ from ftl_lightning.option_groups import flat, groups_of
 
 _USUAL = InversionSettings()
 _FORMS = {AUTO: CHOSEN, MODES: WITH_MODES, ADAPTED: WITH_ADAPTER, MIXED: f"{WITH_MODES} {WITH_ADAPTER}"}
-"""Words of tables for the forms that decide about modes and adapter."""
+"""Names in tables of the forms that override modes and adapter."""
 
 
 class InversionModule(ExactResume, Adaptation):
-    """Learns K embeddings and their weights for every concept of an :class:`~ftl_lightning.domains.data.InversionData`.
+    """Learn K embeddings and their weights for every concept of an :class:`~ftl_lightning.domains.data.InversionData`.
 
-    Its only parameters are those of an :class:`~ftl_lightning.learning.inversion.Inversion`. The pretrained model is frozen and
+    The only parameters are those of an :class:`~ftl_lightning.learning.inversion.Inversion`. The pretrained model is frozen and
     not part of a checkpoint.
 
     Args:
         pretrained: folder of the pretrained model.
-        components: K.
+        components: number of components K.
         omega: fixed guidance weight of every component, or ``'learned'``.
-        embeddings: where they are looked for.
-        weights: how they are learned, and those of training concepts.
-        modes: several sets of embeddings of a concept.
-        adapter: of the denoiser.
-        budget: how much is computed.
-        loss: what is minimised.
+        embeddings: options of the embeddings.
+        weights: options of the guidance weights.
+        modes: options of several sets of embeddings.
+        adapter: options of the denoiser's adapter.
+        budget: compute budget.
+        loss: options of the loss.
         output: folder for the learned concepts; ``None`` for ``concepts`` in the log folder.
-        seed: decides starts, noise and timesteps.
-        form: of the concepts: ``paper`` for what the other options say, ``auto`` for the one that the demonstrations ask for, or
-            one of those that it is chosen from: ``one set``, ``modes``, ``adapter``, ``mixtures``. Empty for ``auto`` where
-            demonstrations come from a file and nothing is said of modes and adapter, else for ``paper``.
+        seed: seed of starts, noise and timesteps.
+        form: form of the concepts: ``paper`` follows the other options; ``auto`` selects ``one set``, ``modes``, ``adapter`` or
+            ``mixtures`` by leave-one-out error; or name a form. Empty for ``auto`` if demonstrations come from a file without
+            options for modes and adapter, else for ``paper``.
     """
 
     learns = True
@@ -89,7 +89,7 @@ class InversionModule(ExactResume, Adaptation):
             "loss": loss,
         }
         self.save_hyperparameters(ignore=groups_of(INVERSION))
-        # Configurations from before there were these keep their hash.
+        # Configurations older than these options keep their hash.
         usual = {"start": _USUAL.embeddings.start, "screening": _USUAL.budget.screening, "precision": _USUAL.budget.precision}
         self.save_hyperparameters({name: value for name, value in flat(groups, INVERSION).items() if value != usual.get(name)})
         self.settings = InversionSettings(
@@ -111,12 +111,12 @@ class InversionModule(ExactResume, Adaptation):
 
     @property
     def method(self) -> str:
-        """The model's; with an adapter of the whole network it is fine-tuning."""
+        """The model's method; fine-tuning with an adapter of the whole network."""
         return FINE_TUNED if self._fine_tuned else super().method
 
     @property
     def form(self) -> str:
-        """The paper's form has one set of embeddings, alike at all times; other forms stand beside it in tables."""
+        """Form in tables; empty for the paper's form, one set of embeddings constant over time."""
         if self._fine_tuned:
             return ""
         decided = _FORMS.get(self.settings.form)
@@ -141,9 +141,9 @@ class InversionModule(ExactResume, Adaptation):
         return ", ".join([*self.model.traits, form, *modes, *knots, *scale, *adapter, *training])
 
     def configure_model(self) -> None:
-        """Create the parameters once the demonstrations are known. Does nothing the second time."""
+        """Create the parameters once the demonstrations are known, and only once."""
         if "inversion" not in self._modules:
-            with torch.device("cpu"):  # where the demonstrations are; Lightning moves the parameters afterwards
+            with torch.device("cpu"):  # with the demonstrations; Lightning moves the parameters afterwards
                 super().configure_model()
                 if self._own:
                     self.settings = self.settings.for_own(bool(self.model.adaptable()))
@@ -152,18 +152,18 @@ class InversionModule(ExactResume, Adaptation):
     def training_step(self, step: int) -> Tensor:
         losses = self.inversion.step_losses(self.global_step)
         self.log("train/loss", losses.detach().mean(), prog_bar=True)
-        # A sum over runs: each run's gradient is what it would be if it were learned alone.
+        # A sum over runs, so that runs do not affect each other's gradients.
         return losses.sum()
 
     def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
-        """Make no step where a checkpoint is resumed in which every concept had stopped."""
+        """Skip the step if every concept had stopped in the resumed checkpoint."""
         stopping = self.inversion.stopping
         return None if stopping is None or stopping.going.any() else -1
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
-        """Take note of every step, and stop when no concept gains any more.
+        """Record every step, and stop once all runs have stopped.
 
-        Here and not at the end of the batch, when a checkpoint may have been written that would not know of the step.
+        Not at the end of the batch, after a checkpoint may have been written without the step.
         """
         step = self.global_step
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
@@ -171,12 +171,12 @@ class InversionModule(ExactResume, Adaptation):
             self.trainer.should_stop = True
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """Adam with cosine decay; weights have a rate of their own."""
+        """Adam with cosine decay and a separate learning rate for the weights."""
         optimizer, decay = self.inversion.optimizer(int(self.trainer.estimated_stepping_batches))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse the checkpoint of another module, model, concepts or kind of weights; the frozen model is in none."""
+        """Refuse a checkpoint of another module, model, concepts or kind of weights; the frozen model is not included."""
         super().on_load_checkpoint(checkpoint)
         self._found = {}
 
@@ -196,7 +196,7 @@ class InversionModule(ExactResume, Adaptation):
         }
 
     def on_validation_start(self) -> None:
-        """While learning, of what is learned first: other forms are learned once, at the end."""
+        """Validate the first inversion while fitting; other forms are learned once, at the end."""
         self._found = self.inversion.learned() if self.trainer.state.fn == TrainerFn.FITTING else self.learned()
 
     def learned(self) -> dict[str, Concept]:
@@ -220,7 +220,7 @@ class InversionModule(ExactResume, Adaptation):
 
     @property
     def _steps(self) -> int:
-        """Of gradient descent, at most."""
+        """Maximum number of gradient steps."""
         return int(self.trainer.datamodule.hparams["steps"])  # type: ignore[attr-defined]
 
     def training_weight(self, task: EvaluationTask) -> float:

@@ -1,4 +1,4 @@
-"""How concepts are learned: the settings of an inversion, in groups."""
+"""Settings of an inversion, in groups."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,20 +12,20 @@ from ftl_lightning.option_groups import replaced
 from ftl_lightning.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
 
 EXPLAINED = 0.4
-"""Share of the modes' gain from which on one set of embeddings is taken to say enough; chosen on validation suites."""
+"""Minimum gain of one set of embeddings, as a share of the modes' gain, to use mixtures; chosen on validation suites."""
 MOST = 1000
-"""Components, knots, restarts, or ranks of an adapter."""
+"""Maximum number of components, knots and restarts, and maximum rank of an adapter."""
 
 UNSAID, PAPER, AUTO = "", "paper", "auto"
-"""Of a concept's form: what goes with where demonstrations come from, see :meth:`InversionSettings.for_own`; what the other options
-say, the paper's unless they add to it; the one that the demonstrations ask for."""
+"""Rules for a concept's form: by the source of demonstrations, see :meth:`InversionSettings.for_own`; by the other options (the
+paper's form by default); selected by leave-one-out error."""
 ONE, MODES, ADAPTED, MIXED = "one set", "modes", "adapter", "mixtures"
-"""Forms: one set of embeddings; one for each demonstration, of which one is drawn; one set and a small adapter of the denoiser; one
-for each demonstration and an adapter that they share, with samples from mixtures."""
+"""Forms: one set of embeddings; a set for each demonstration, drawn at random; one set and a low-rank adapter of the denoiser; a
+set for each demonstration and a shared adapter, with samples from mixtures."""
 MEAN, CONCEPTS = STARTS = "mean", "concepts"
-"""Where embeddings start."""
+"""Initial embeddings."""
 FULL, REDUCED = PRECISIONS = "32-true", "bf16-mixed"
-"""Of products while concepts are learned."""
+"""Precision of matrix products in learning."""
 FORMS = (UNSAID, PAPER, AUTO, ONE, MODES, ADAPTED, MIXED)
 
 INVERSION: Mapping[str, str] = {
@@ -51,22 +51,22 @@ INVERSION: Mapping[str, str] = {
     "timestep_power": "loss.timestep_power",
     "training_omega": "weights.training",
 }
-"""Place of each option of a group, ``'group.option'``, by its flat name in results, checkpoints and the Python API."""
+"""Grouped options ``'group.option'`` by their flat names in results, checkpoints and the Python API."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmbeddingOptions:
-    """Where embeddings are looked for.
+    """Parametrisation and initial values of embeddings.
 
     Attributes:
-        knots: embeddings of a component at even times of the plan, between which the denoiser interpolates; 1 is the paper's form.
-            For denoisers that see time, such as the temporal U-Net.
-        off_span: how freely embeddings leave the affine span of the training embeddings: 1 is the paper's free form, 0 keeps
-            them in the span, between the two the part off the span is scaled, which slows its learning down.
-        initial_spread: embeddings start at the mean of the training embeddings plus so much normal noise a column.
-        start: ``'mean'`` for there, or ``'concepts'``: restart r starts at the r-th training embedding, with the noise. What
-            a network chooses by the concept, such as a thing that behaviour aims at, is steep between concepts and flat around
-            their mean.
+        knots: embeddings of a component at even times of the plan, interpolated by the denoiser; 1 is the paper's form. For
+            denoisers with a time axis, such as the temporal U-Net.
+        off_span: scale of the part of embeddings off the affine span of the training embeddings: 1 (the paper's form) is free, 0
+            keeps embeddings in the span, values between slow the learning of that part.
+        initial_spread: standard deviation of the initial noise in each column.
+        start: ``'mean'`` starts at the mean of the training embeddings, ``'concepts'`` starts restart r at the r-th training
+            embedding, both with noise. A network's choice by the concept, such as a goal object, is steep between concepts and
+            flat around their mean.
     """
 
     knots: int = 1
@@ -85,15 +85,15 @@ class EmbeddingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class WeightOptions:
-    """How guidance weights are learned where omega is ``'learned'``, and those of training concepts.
+    """Guidance weights: learning, if omega is ``'learned'``, and those of training concepts.
 
     Attributes:
-        initial: where learned weights start (the paper draws them from U(0, 1)).
-        learning_rate: of the weights; with the embeddings' rate they collapse.
-        scale: what learned weights are multiplied by at the end; a fixed omega stays. Where the loss does not reach zero, plans
-            regress towards the training distribution; more than 1 counters that.
-        training: guidance weight of training concepts composed with a learned one; ``None`` for the paper's rule: the fixed omega,
-            or 1 where weights are learned.
+        initial: initial value of learned weights (the paper draws them from U(0, 1)).
+        learning_rate: learning rate of the weights; with the embeddings' rate they collapse.
+        scale: final factor of learned weights; a fixed omega is not scaled. If the loss does not reach zero, plans regress
+            towards the training distribution; a factor above 1 counters that.
+        training: guidance weight of training concepts composed with a learned concept; ``None`` for the paper's rule: the fixed
+            omega, or 1 with learned weights.
     """
 
     initial: float = 1.0
@@ -114,10 +114,10 @@ class ModeOptions:
     """Several sets of embeddings of a concept, see :class:`~ftl_lightning.concepts.modes.Modes`.
 
     Attributes:
-        sets: 1 is the paper's form; otherwise beside it, from the same start, a set is learned from every demonstration
-            (``'each'``), or from every n-th one for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes where
-            one set explains the demonstrations at least :data:`EXPLAINED` as well as they do, and from single modes elsewhere.
-        samples: noised demonstrations a step of the run of a mode.
+        sets: 1 is the paper's form; otherwise a set is also learned, from the same start, for every demonstration (``'each'``), or
+            from every n-th demonstration for n sets. ``'auto'`` is ``'each'``, with samples from mixtures of the modes if one set
+            has at least :data:`EXPLAINED` of the modes' gain, and from single modes otherwise.
+        samples: noised demonstrations a step for a mode.
     """
 
     sets: int | Literal["each", "auto"] = 1
@@ -135,13 +135,13 @@ class ModeOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class AdapterOptions:
-    """A low-rank change of the denoiser (LoRA), learned beside the embeddings.
+    """Low-rank adapter (LoRA) of the denoiser, learned with the embeddings.
 
     Attributes:
-        rank: 0, the paper's form, for none.
-        learning_rate: of its factors.
-        scope: ``'concept'`` for the concept's own branches alone; ``'all'`` changes everything that the concept is composed with
-            too, as fine-tuning does, to compare with.
+        rank: rank; 0, the paper's form, for no adapter.
+        learning_rate: learning rate of its factors.
+        scope: ``'concept'`` adapts the concept's branches alone; ``'all'`` adapts every composed branch, as fine-tuning does, for
+            comparison.
     """
 
     rank: int = 0
@@ -159,20 +159,20 @@ class AdapterOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetOptions:
-    """How much is computed for a concept.
+    """Compute budget of a concept.
 
     Attributes:
         samples: noised demonstrations a step and run, spread over the run's demonstrations and timesteps.
-        restarts: independent starts of each concept; the one with the lowest loss on common noise is kept.
-        screening: steps after which, of each concept, the restart with the lowest loss on held-out noise goes on alone; 0 for none.
-        learning_rate: of the embeddings (Adam).
-        tolerance: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than this share of
-            all that it has fallen; the learning rate is constant then, and the result is the mean over the best round, see
-            :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not count; of fewer steps than
-            a round has, the last one does. ``None`` for all steps, the rate decaying to 0.
-        precision: of the network's products in a step, with the names of Lightning's trainer: ``'32-true'``, or ``'bf16-mixed'``
-            for bfloat16, half the time where a processor or GPU multiplies it, see ``docs/speed.md``. Stopping and the loss that
-            is told are in single precision.
+        restarts: independent starts of each concept; the restart with the lowest loss on common noise is kept.
+        screening: steps after which only the restart of each concept with the lowest held-out loss continues; 0 for none.
+        learning_rate: learning rate of the embeddings (Adam).
+        tolerance: early stopping: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than
+            this share of its total decrease. The learning rate is constant and the result is the mean over the best round, see
+            :class:`~ftl_lightning.learning.stopping.Stopping`. Steps after the last whole round do not count; without a whole
+            round the last step does. ``None`` for all steps, with the rate decaying to 0.
+        precision: precision of the network's products in a step, named as in Lightning's trainer: ``'32-true'``, or
+            ``'bf16-mixed'`` for bfloat16, half the time with hardware support, see ``docs/speed.md``. Stopping and the reported
+            loss are in single precision.
     """
 
     samples: int = 32
@@ -195,14 +195,14 @@ class BudgetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LossOptions:
-    """What is minimised.
+    """Training loss.
 
     Attributes:
-        kind: whose squared error, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. The others weigh noisy timesteps, at which the
-            concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
-        timestep_power: timesteps are drawn as T (1 - u^power), u even in [0, 1). 1 spreads them evenly (the paper's); with 3 half
-            of them fall in the noisiest eighth. There the concept alone tells what to do; at low noise the plan reveals the goal,
-            so the empty concept already has a low loss: a local minimum.
+        kind: target of the squared error, ``'epsilon'`` (Eq. 2), ``'v'`` or ``'clean'``. ``'v'`` and ``'clean'`` weigh noisy
+            timesteps, at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        timestep_power: timesteps are drawn as T (1 - u^power), u uniform in [0, 1). 1 (the paper's) is uniform; with 3 half of them
+            fall in the noisiest eighth. There the concept alone decides; at low noise the plan reveals the goal, so the
+            unconditional loss is already low: a local minimum.
     """
 
     kind: str = "epsilon"
@@ -216,23 +216,23 @@ class LossOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class InversionSettings:
-    """How concepts are learned.
+    """Settings of an inversion.
 
     Attributes:
-        components: K.
+        components: number of components K.
         omega: fixed guidance weight of every component, or ``'learned'``.
-        embeddings: where they are looked for.
-        weights: how they are learned.
-        modes: several sets of embeddings.
-        adapter: of the denoiser.
-        budget: how much is computed.
-        loss: what is minimised.
-        seed: decides starts, noise and timesteps.
-        form: of concepts, one of :data:`FORMS`, see :mod:`ftl_lightning.learning.forms`. ``'auto'`` and the forms behind it decide
-            about modes and adapter; of an adapter that the options name, rank and learning rate are taken over.
+        embeddings: options of the embeddings.
+        weights: options of the guidance weights.
+        modes: options of several sets of embeddings.
+        adapter: options of the denoiser's adapter.
+        budget: compute budget.
+        loss: options of the loss.
+        seed: seed of starts, noise and timesteps.
+        form: form of concepts, from :data:`FORMS`, see :mod:`ftl_lightning.learning.forms`. ``'auto'`` and the forms after it
+            override modes and adapter; an adapter's rank and learning rate are kept if given.
 
     Raises:
-        UserError: at construction, for a value that is none.
+        UserError: at construction, for an invalid value.
     """
 
     components: int = 2
@@ -257,20 +257,20 @@ class InversionSettings:
             raise UserError("model.adapter.rank: expected model.budget.tolerance null beside it, found a number")
 
     def for_own(self, choose: bool) -> Self:
-        """The same for demonstrations of one's own: where nothing is said of form, modes and adapter, the form is chosen.
+        """Settings for a user's demonstrations: the form is ``'auto'`` unless form, modes or adapter are given.
 
         Args:
-            choose: whether the model takes adapters, and nobody says otherwise.
+            choose: whether the form may be chosen; requires a model with adapters.
         """
         unsaid = self.form == UNSAID and self.modes.sets == 1 and not self.adapter.rank
         return replace(self, form=AUTO) if unsaid and choose else self
 
     def from_one_start(self, **options: Any) -> Self:
-        """The same with one start, at the mean of the training embeddings, and some options changed, see :meth:`changed`."""
+        """Copy with a single start at the mean of the training embeddings, and other changes, see :meth:`changed`."""
         return self.changed(start=MEAN, restarts=1, screening=0, **options)
 
     def changed(self, **options: Any) -> Self:
-        """The same with some options changed, given by their flat names (:data:`INVERSION`)."""
+        """Copy with options changed by their flat names (:data:`INVERSION`)."""
         return replaced(self, options, INVERSION)
 
 
@@ -284,4 +284,4 @@ GROUPS: Mapping[str, type] = MappingProxyType(
         "loss": LossOptions,
     }
 )
-"""The groups by name."""
+"""Option groups by name."""

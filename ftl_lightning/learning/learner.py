@@ -1,4 +1,4 @@
-"""Learning concepts without a trainer: what a method offers to the Python API."""
+"""Protocol for learning concepts without a trainer."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -10,7 +10,7 @@ from ftl_lightning.learning.inversion_settings import InversionSettings
 
 
 class Learner(Protocol):
-    """Learns every concept of some demonstrations."""
+    """Learns every concept of the demonstrations."""
 
     def __call__(
         self,
@@ -21,12 +21,12 @@ class Learner(Protocol):
         tell: Callable[[float], None] = ...,
         /,
     ) -> dict[str, Concept]:
-        """The concepts by name.
+        """Learned concepts by name.
 
         Args:
-            model: frozen.
-            demonstrations: with concept texts, which name the concepts.
-            settings: how; a method without gradient descent does not look at them.
-            steps: of gradient descent.
+            model: the frozen model.
+            demonstrations: demonstrations; their concept texts name the concepts.
+            settings: settings of the inversion; ignored without gradient descent.
+            steps: gradient steps.
             tell: called with the mean loss after each step.
         """

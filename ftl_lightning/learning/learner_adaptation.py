@@ -1,4 +1,4 @@
-"""Adapting a model by its method's learner alone, without training steps."""
+"""Adaptation by a method's learner alone, without training steps."""
 
 from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.learning.adaptation import Adaptation
@@ -7,12 +7,12 @@ from ftl_lightning.learning.learner import Learner
 
 
 class LearnerAdaptation(Adaptation):
-    """Concepts are what the method's learner makes of demonstrations at once; nothing is trained.
+    """Learn concepts by the method's learner; nothing is trained.
 
     Args:
         pretrained: folder of the pretrained model.
         output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
-        seed: of the evaluation's rows, and of what is random in the learner.
+        seed: seed of the evaluation's rows and of the learner.
     """
 
     def __init__(self, pretrained: str, output: str | None = None, seed: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""How well a concept that is learned from some demonstrations explains those that were left out."""
+"""Leave-one-out losses of concepts on left-out demonstrations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,29 +15,29 @@ from ftl_lightning.learning.inversion_settings import PAPER, InversionSettings
 from ftl_lightning.learning.relative_loss import generated_loss, relative_losses
 
 MOST = 12
-"""Demonstrations of which this is asked: of each, several concepts are learned."""
+"""Maximum number of demonstrations; several concepts are learned for each."""
 SAMPLES, TOLERANCE = 16, 0.03
-"""Of learning quickly from a subset: noised demonstrations of a step, and when to stop."""
+"""Fast learning: noised demonstrations a step, and stopping tolerance."""
 ODD, HARMED = 1.7, 1.2
-"""An odd demonstration's left-out loss is so many times the largest of the others, and of the empty concept's."""
+"""Minimum ratios of an odd demonstration's left-out loss to the largest other loss, and to the unconditional loss."""
 COVERED = 0.95
-"""Of the empty concept's loss: a demonstration is explained by a concept whose loss is less."""
+"""Relative loss below which a demonstration is explained."""
 FAR = 10.0
-"""A task is far from anything pretrained where the loss of those learned from is so many times that of what the model generates."""
+"""Minimum ratio of the training loss to the loss of generated behaviour for a task far from pretraining."""
 FALLING = 0.05
-"""Share that the loss of those left out falls by for one more demonstration, from which on more are likely to help."""
+"""Minimum relative fall of the left-out loss for one more demonstration, for more to be likely to help."""
 
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Losses of demonstrations relative to the empty concept's on the same noise; 1 is no better than nothing, less is better.
+    """Losses of demonstrations relative to the unconditional (empty concept's) loss on the same noise; lower is better.
 
     Attributes:
-        left_out: of each demonstration, under the concept that was learned from all others ``(demo,)``.
-        learned_from: of each, the mean under the concepts that were learned from it and all others but one ``(demo,)``.
-        curve: the mean of those left out by the number of demonstrations that were learned from, without the odd one.
-        odd: the demonstration that differs from the others, from 0; ``None`` where none does.
-        generated: of what the model generates itself, see :func:`~ftl_lightning.learning.relative_loss.generated_loss`.
+        left_out: left-out loss of each demonstration ``(demo,)``, under the concept learned from all others.
+        learned_from: training loss of each demonstration ``(demo,)``, the mean over concepts that leave another one out.
+        curve: mean left-out loss by the number of training demonstrations, without the odd demonstration.
+        odd: index of the demonstration that differs from the others; ``None`` without any.
+        generated: loss of generated behaviour, see :func:`~ftl_lightning.learning.relative_loss.generated_loss`.
     """
 
     left_out: tuple[float, ...]
@@ -48,38 +48,38 @@ class LeaveOneOut:
 
     @property
     def distance(self) -> float:
-        """How many times the loss of what the model generates the loss of those learned from is, without the odd one.
+        """Ratio of the training loss, without the odd demonstration, to the loss of generated behaviour.
 
-        That of those left out is also large where demonstrations are too few to tell what is meant.
+        The left-out loss is also large for too few demonstrations.
         """
         kept = [loss for row, loss in enumerate(self.learned_from) if row != self.odd]
         return sum(kept) / len(kept) / max(self.generated, 1e-12)
 
     @property
     def far(self) -> bool:
-        """Whether the model has seen nothing like them: no concept explains even those that it is learned from."""
+        """Whether the task is far from pretraining: concepts do not even explain their training demonstrations."""
         return self.distance >= FAR
 
     @property
     def covered(self) -> int:
-        """How many demonstrations are explained by the concept that was learned from the others."""
+        """Number of demonstrations explained by the concept learned from the others."""
         return sum(loss < COVERED for loss in self.left_out)
 
     @property
     def falling(self) -> bool:
-        """Whether the last demonstrations still lowered the loss of those left out."""
+        """Whether the last demonstrations still lowered the left-out loss."""
         (fewer, before), (more, after) = ([(0, 1.0), *self.curve.items()])[-2:]
         return before - after > FALLING * (more - fewer) * before
 
     def lines(self) -> list[str]:
-        """In plain words."""
+        """Report, one line for each result."""
         count = len(self.left_out)
-        out, own = sum(self.left_out) / count, sum(self.learned_from) / count
-        told = f"left out: the concept learned from the others explains {self.covered} of {count}"
+        out, inside = sum(self.left_out) / count, sum(self.learned_from) / count
+        summary = f"left out: the concept learned from the others explains {self.covered} of {count}"
         missed = [row for row, loss in enumerate(self.left_out) if loss >= COVERED]
-        told += f", not {numbered(missed)}" if 0 < len(missed) < count else ""
-        told += f" (loss {out:.2f} of the empty"
-        told += f" concept's, {own:.2f} where it is learned from, too)" if count > 2 else " concept's)"
+        summary += f", not {numbered(missed)}" if 0 < len(missed) < count else ""
+        summary += f" (loss {out:.2f} of the empty"
+        summary += f" concept's, {inside:.2f} where it is learned from, too)" if count > 2 else " concept's)"
         odd = "odd: none is explained much worse than the others"
         if self.odd is not None:
             others = max(loss for row, loss in enumerate(self.left_out) if row != self.odd)
@@ -93,11 +93,11 @@ class LeaveOneOut:
         times = f"where it is learned from them, they have {self.distance:.1f} times the loss of what the model generates"
         near = f"distance: {times} (from {FAR:.0f} on: far from anything pretrained)"
         far = f"far: {times}: nothing pretrained is like this; look at samples, they may do something else"
-        return [told, *([odd] if count > 2 else []), more, far if self.far else near]
+        return [summary, *([odd] if count > 2 else []), more, far if self.far else near]
 
 
 def subsets(count: int) -> list[tuple[int, ...]]:
-    """Of so many demonstrations: those of one, two, three and all but one, each demonstration as often as any other."""
+    """Subsets of 1, 2, 3 and ``count - 1`` demonstrations, each demonstration equally often."""
     sizes = sorted({size for size in (1, 2, 3, count - 1) if 0 < size < count})
     return [tuple(sorted((start + step) % count for step in range(size))) for size in sizes for start in range(count)]
 
@@ -110,31 +110,31 @@ def learned_from(
     steps: int,
     tell: Callable[[float], None] = lambda loss: None,
 ) -> Composition:
-    """One set of embeddings from each of some subsets, all in one batch: ``(subset, K, ...)`` on the model's device.
+    """Learn one set of embeddings for each subset, in one batch: ``(subset, K, ...)`` on the model's device.
 
     Args:
-        model: through which concepts are learned.
-        demonstrations: of one concept or several.
+        model: the frozen model.
+        demonstrations: demonstrations of one concept or several.
         chosen: rows of each subset.
-        settings: how, in the paper's form.
-        steps: of gradient descent, at most.
+        settings: settings in the paper's form.
+        steps: maximum number of gradient steps.
         tell: called with the mean loss after each step.
     """
     parts = [replace(demonstrations.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
-    learned = list(invert(model, concatenate(parts), settings, steps, tell).values())
-    every = Composition(torch.stack([one.embeddings for one in learned]), torch.stack([one.weights for one in learned]))
+    sets = list(invert(model, concatenate(parts), settings, steps, tell).values())
+    every = Composition(torch.stack([each.embeddings for each in sets]), torch.stack([each.weights for each in sets]))
     return every.to(model.device)
 
 
 def quickly(settings: InversionSettings) -> InversionSettings:
-    """The same for sets of embeddings that only have to tell good from bad."""
+    """Settings for fast learning of sets that only need comparable losses."""
     return settings.from_one_start(
         form=PAPER,
         modes=1,
         adapter=0,
         samples=min(settings.budget.samples, SAMPLES),
         tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
-        guidance_scale=1.0,  # it is for generating, not for explaining
+        guidance_scale=1.0,  # only generation uses it
     )
 
 
@@ -145,18 +145,18 @@ def leave_one_out(
     steps: int,
     tell: Callable[[float], None] = lambda loss: None,
 ) -> LeaveOneOut:
-    """Learn the concept from subsets, all in one batch, and measure each on what was left out.
+    """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
 
     Args:
-        model: through which concepts are learned.
-        demonstrations: two or more of one concept; the first :data:`MOST` count.
-        settings: how concepts are learned; of modes, adapters and restarts none is used.
-        steps: of gradient descent, at most.
+        model: the frozen model.
+        demonstrations: two or more of one concept; the first :data:`MOST` are used.
+        settings: settings of the inversion; modes, adapters and restarts are ignored.
+        steps: maximum number of gradient steps.
         tell: called with the mean loss after each step.
     """
     count = min(len(demonstrations), MOST)
-    own, chosen = demonstrations.rows(list(range(count))), subsets(count)
-    losses = relative_losses(model, own, learned_from(model, own, chosen, quickly(settings), steps, tell), settings)
+    used, chosen = demonstrations.rows(list(range(count))), subsets(count)
+    losses = relative_losses(model, used, learned_from(model, used, chosen, quickly(settings), steps, tell), settings)
     without = torch.tensor([[row not in rows for row in range(count)] for rows in chosen])
     sizes = torch.tensor([len(rows) for rows in chosen])
     last = sizes == count - 1
@@ -166,17 +166,17 @@ def leave_one_out(
     kept = without.clone()
     if odd is not None:
         kept[:, odd] = False
-        kept[~without[:, odd]] = False  # what was learned from it
+        kept[~without[:, odd]] = False  # concepts learned from it
     curve = {
         size: float(losses[sizes == size][kept[sizes == size]].mean())
         for size in sorted(set(sizes.tolist()))
         if kept[sizes == size].any()
     }
-    return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, own, settings))
+    return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, used, settings))
 
 
 def odd_one(losses: Tensor) -> int | None:
-    """The demonstration whose left-out loss ``(demo,)`` is far above those of the others."""
+    """Index of the demonstration with a left-out loss ``(demo,)`` far above the others'; ``None`` without any."""
     if len(losses) < 3:
         return None
     worst = int(losses.argmax())

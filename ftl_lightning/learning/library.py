@@ -1,6 +1,6 @@
-"""The concepts that a model can be asked for by name: its training concepts, learned ones that ship with it, and saved ones.
+"""Library of a model's concepts by name: training concepts, shipped learned concepts, and saved concepts.
 
-Files are read as data, and no more than what they say of themselves. Only concepts of this very model count.
+Files are read as data, and only their headers. Concepts of other models are excluded.
 """
 
 import collections
@@ -21,14 +21,14 @@ from ftl_lightning.tensor_file import data_folder, visible
 
 Kind = Literal["training", "shipped", "saved"]
 CONCEPT = "concept.safetensors"
-"""The file of a concept that is shared, in a folder of its own."""
+"""File name of a shared concept, in its folder."""
 HEADINGS = ("name", "kind", "demonstrations", "form", "accuracy", "model", "file")
 NEAREST = 3
-"""Names that are told in place of one that is unknown."""
+"""Number of suggestions for an unknown name."""
 MOST_LETTERS = 60
-"""Of a name in the table."""
+"""Maximum length of a name in the table."""
 LONGEST_STEM = 60
-"""Letters of a concept's name that its file's takes over."""
+"""Maximum length of a file's stem."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,14 @@ class Entry:
     """A concept of a library.
 
     Attributes:
-        name: in words, of a learned concept that of its demonstrations.
-        kind: ``'training'``; ``'shipped'``, learned and in the model's own folder; or ``'saved'``, learned and in another folder.
-        model: hash of the model that it belongs to.
-        count: demonstrations that it was learned from; ``None`` for a training concept.
-        form: such as ``'one set'`` or ``'adapter'``; empty for a training concept.
-        accuracy: share of right samples, 0 to 1, where its file says so.
-        metric: of which domain's metric; empty where there is no accuracy.
-        path: its file; ``None`` for a training concept.
+        name: name in words; for a learned concept the text of its demonstrations.
+        kind: ``'training'``; ``'shipped'``, learned and in the model's folder; or ``'saved'``, learned and in another folder.
+        model: hash of the model.
+        count: number of demonstrations; ``None`` for a training concept.
+        form: form, such as ``'one set'`` or ``'adapter'``; empty for a training concept.
+        accuracy: share of right samples, 0 to 1, if recorded.
+        metric: the accuracy's domain metric; empty without an accuracy.
+        path: file; ``None`` for a training concept.
     """
 
     name: str
@@ -57,12 +57,12 @@ class Entry:
 
     @property
     def stem(self) -> str:
-        """Its file's name without the ending, or its folder's where all such files have the same; empty without a file."""
+        """Name of the file without its ending, or of the folder of a shared concept; empty without a file."""
         return "" if self.path is None else self.path.parent.name if self.path.name == CONCEPT else self.path.stem
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """What a table tells of it, under :data:`HEADINGS`."""
+        """Cells of a table row under :data:`HEADINGS`."""
         rate = "-" if self.accuracy is None else f"{self.accuracy:.2f}{f' ({short(self.metric, 20)})' if self.metric else ''}"
         count = "-" if self.count is None else str(self.count)
         path = "-" if self.path is None else str(self.path)
@@ -75,9 +75,9 @@ class Library(Shown):
     """Concepts of one model.
 
     Attributes:
-        entries: training concepts first, then those that ship, then saved ones.
-        others: how many files hold concepts of other models.
-        damaged: a line for each file that cannot be read.
+        entries: training concepts, then shipped, then saved concepts.
+        others: number of files with concepts of other models.
+        damaged: a line for each unreadable file.
     """
 
     entries: tuple[Entry, ...]
@@ -97,12 +97,12 @@ class Library(Shown):
 
     @property
     def learned(self) -> tuple[Entry, ...]:
-        """Without the training concepts."""
+        """Entries without the training concepts."""
         return tuple(entry for entry in self if entry.path is not None)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What else lies in its folders, in a line each."""
+        """Lines about other and damaged files."""
         others = f"{counted(self.others, 'concept')} of other models"
         return (*((f"not listed: {others}",) if self.others else ()), *self.damaged)
 
@@ -110,32 +110,35 @@ class Library(Shown):
         return table(self.entries)
 
     def learned_as(self, name: str) -> Entry | None:
-        """The learned concept of this exact name, or else in a file of this name (without its ending).
+        """The learned concept with this exact name, or else with this file stem.
 
         Raises:
-            UserError: naming the files, if there are several.
+            UserError: with the files, if there are several.
         """
-        for found in ([one for one in self.learned if one.name == name], [one for one in self.learned if one.stem == name]):
-            if len(found) > 1:
-                told = " and ".join(short(str(one.path), 100) for one in found[:2])
-                more = f" and {len(found) - 2} more" if len(found) > 2 else ""
-                raise UserError(f"concept {shown(name, 40)}: expected one, found {told}{more}; give one of these files")
-            if found:
-                return found[0]
+        for matches in (
+            [entry for entry in self.learned if entry.name == name],
+            [entry for entry in self.learned if entry.stem == name],
+        ):
+            if len(matches) > 1:
+                files = " and ".join(short(str(entry.path), 100) for entry in matches[:2])
+                more = f" and {len(matches) - 2} more" if len(matches) > 2 else ""
+                raise UserError(f"concept {shown(name, 40)}: expected one, found {files}{more}; give one of these files")
+            if matches:
+                return matches[0]
         return None
 
     def nearest(self, name: str) -> list[str]:
-        """Names of concepts that are most like one; of several with one name, those of their files."""
-        often = collections.Counter(one.name for one in self.learned)
-        known = dict.fromkeys(one.stem if often[one.name] > 1 and one.stem else one.name for one in self)
+        """The concept names most similar to ``name``; file stems for equal names."""
+        often = collections.Counter(entry.name for entry in self.learned)
+        known = dict.fromkeys(entry.stem if often[entry.name] > 1 and entry.stem else entry.name for entry in self)
         return difflib.get_close_matches(name, known, n=NEAREST, cutoff=0)
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Concepts, an entry each, in aligned columns under :data:`HEADINGS`.
+    """Table of concepts in aligned columns under :data:`HEADINGS`.
 
     Args:
-        entries: of a :class:`Library`.
+        entries: entries of a :class:`Library`.
     """
     rows = [HEADINGS, *(entry.cells for entry in entries)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -143,44 +146,44 @@ def table(entries: Sequence[Entry]) -> str:
 
 
 def concepts_folder() -> Path:
-    """Where a user's own concepts are kept: ``concepts`` in :func:`~ftl_lightning.tensor_file.data_folder`."""
+    """Folder of a user's concepts: ``concepts`` in :func:`~ftl_lightning.tensor_file.data_folder`."""
     return data_folder() / "concepts"
 
 
 def kept_file(model: str, name: str) -> Path:
-    """Where a concept of a model is kept in :func:`concepts_folder`: that of the same name, or a new file."""
+    """File of a model's concept in :func:`concepts_folder`: the file with the same concept name, or a new file."""
     folder, stem = concepts_folder() / model, file_name(name)[:LONGEST_STEM].strip(".") or "concept"
     paths = (folder / f"{stem}{f'_{number}' if number else ''}.safetensors" for number in itertools.count())
     return next(path for path in paths if not path.exists() or _name_in(path) == name)
 
 
 def _name_in(path: Path) -> str:
-    """The name of the concept in a file; empty where none can be read."""
+    """Name of the concept in a file; empty if unreadable."""
     try:
-        told = summary(path)
+        content = summary(path)
     except (UserError, OSError):
         return ""
-    return "" if told is None else told.origin.name
+    return "" if content is None else content.origin.name
 
 
 def library(model: str, training: Sequence[str], own: Path | None = None, folders: Iterable[str | Path] = ()) -> Library:
-    """The concepts of a model.
+    """Library of a model's concepts.
 
     Args:
-        model: hash of it.
-        training: texts of its training concepts.
-        own: the model's folder, whose files ``*.safetensors`` are looked at; ``None`` where it has none.
-        folders: with saved concepts, as files ``*.safetensors`` or in folders within; those of :func:`concepts_folder` are always
-            looked at.
+        model: hash of the model.
+        training: texts of the training concepts.
+        own: the model's folder, with shipped concepts ``*.safetensors``; ``None`` without a folder.
+        folders: folders of saved concepts ``*.safetensors``, directly or in subfolders; :func:`concepts_folder` is always
+            searched.
 
     Raises:
-        UserError: for one of ``folders`` that is none.
+        UserError: for an entry of ``folders`` that is not a folder.
     """
     places = [Path(folder) for folder in folders]
     for place in places:
         if not place.is_dir():
-            found = "a file" if place.exists() else "nothing"
-            raise UserError(f"folder: expected a folder of learned concepts, found {found} at {short(str(place), 150)}")
+            actual = "a file" if place.exists() else "nothing"
+            raise UserError(f"folder: expected a folder of learned concepts, found {actual} at {short(str(place), 150)}")
     files: list[tuple[Kind, Path]] = [("shipped", path) for path in visible(own, "*.safetensors")] if own is not None else []
     for place in (*places, concepts_folder()):
         files += [("saved", path) for pattern in ("*.safetensors", "*/*.safetensors") for path in visible(place, pattern)]
@@ -191,16 +194,16 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
             continue
         seen.add(real)
         try:
-            told = summary(path)
+            content = summary(path)
         except (UserError, OSError) as error:
             damaged.append(f"not listed: {error}" if isinstance(error, UserError) else f"not listed: {path}: {error.strerror}")
             continue
-        if told is None:
+        if content is None:
             continue
-        origin, quality = told.origin, told.quality
+        origin, quality = content.origin, content.quality
         if origin.pretrained != model:
             others += 1
             continue
         rate, metric = (None, "") if quality is None or quality.right is None else (quality.right, quality.metric)
-        entries.append(Entry(origin.name, kind, model, origin.count, told.form, rate, metric, path))
+        entries.append(Entry(origin.name, kind, model, origin.count, content.form, rate, metric, path))
     return Library(tuple(entries), others, tuple(damaged))

@@ -1,4 +1,4 @@
-"""What a method is: one declaration that a package offers through the entry-point group ``ftl_lightning.methods``."""
+"""Declaration of a method, registered in the entry-point group ``ftl_lightning.methods``."""
 
 import importlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 from ftl_lightning.errors import UserError, about
 
-if TYPE_CHECKING:  # a declaration is read without torch
+if TYPE_CHECKING:  # declarations do not need torch
     from ftl_lightning.domains.domain import Domain
 
 INVERSION = "ftl_lightning.learning.forms:learn"
-"""The learner of methods whose concepts are learned by gradient descent."""
+"""Learner by gradient descent."""
 
 
 @dataclass(frozen=True)
 class Form:
-    """A form of a method's concepts that the paper does not have, which tables show beside the method's own.
+    """A form of a method's concepts beyond the paper's, with a row in tables.
 
     Attributes:
-        name: in the results' column ``form``, such as ``'with modes'``.
-        option: of the adaptation's hyper-parameters, the one that decides.
-        usual: its value in the paper's form.
+        name: name in the results' column ``form``, such as ``'with modes'``.
+        option: the adaptation's hyper-parameter that decides.
+        usual: value of the option in the paper's form.
     """
 
     name: str
@@ -33,21 +33,20 @@ class Form:
 class Method:
     """A way to learn tasks from a few demonstrations.
 
-    ``model``, ``pretraining``, ``adaptation``, ``learner`` and ``suits`` are ``'package.module:NAME'``, imported when they are
-    needed.
+    ``model``, ``pretraining``, ``adaptation``, ``learner`` and ``suits`` are ``'package.module:NAME'``, imported on demand.
 
     Attributes:
-        name: in tables and results.
-        kind: of its pretrained models, as their ``config.json`` says. A method that adapts another's models has that one's kind.
+        name: name in tables and results.
+        kind: kind of the pretrained models, as in ``config.json``. A method that adapts another method's models has their kind.
         adaptation: the LightningModule of ``invert``, an :class:`~ftl_lightning.learning.adaptation.Adaptation`.
-        model: the network, a :class:`~ftl_lightning.learning.concept_model.ConceptModel`; empty where it is another method's.
-        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.learning.pretraining.Pretraining`; empty where the
-            network is another method's.
-        learner: how concepts are learned without a trainer, a :class:`~ftl_lightning.learning.learner.Learner`; gradient descent
-            through the model's losses unless it says otherwise.
-        forms: of its concepts, in the order in which their names are joined.
-        configurations: folder of its configuration files, one for each domain; empty for none.
-        suits: a function of a domain that raises a ``UserError`` for one that the method cannot do; empty if it can do all.
+        model: the network, a :class:`~ftl_lightning.learning.concept_model.ConceptModel`; empty for another method's network.
+        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.learning.pretraining.Pretraining`; empty for another
+            method's network.
+        learner: learner without a trainer, a :class:`~ftl_lightning.learning.learner.Learner`; by default gradient descent on
+            the model's losses.
+        forms: forms of its concepts, in the order in which their names are joined.
+        configurations: folder of configuration files, one for each domain; empty for none.
+        suits: a function of a domain that raises a ``UserError`` for an unsupported domain; empty if all are supported.
     """
 
     name: str
@@ -61,14 +60,14 @@ class Method:
     suits: str = ""
 
     def expect_settings(self, names: Iterable[str]) -> None:
-        """Refuse settings of an inversion where concepts are not learned by gradient descent.
+        """Refuse inversion settings for a method without gradient descent.
 
         Raises:
-            UserError: naming the first.
+            UserError: with the first setting.
         """
         if self.learner != INVERSION and (name := next(iter(names), None)) is not None:
-            told = f"as {self.name} learns without gradient descent, found {name}"
-            raise UserError(f"learn: expected no settings of an inversion, {told}")
+            reason = f"as {self.name} learns without gradient descent, found {name}"
+            raise UserError(f"learn: expected no settings of an inversion, {reason}")
 
     def model_class(self) -> Any:
         """The network's class."""
@@ -83,21 +82,21 @@ class Method:
         return self._named(self.adaptation)
 
     def learn(self) -> Any:
-        """How concepts are learned without a trainer."""
+        """The learner without a trainer."""
         return self._named(self.learner)
 
     def expect_domain(self, domain: "Domain") -> None:
-        """Refuse a domain that the method cannot do.
+        """Refuse an unsupported domain.
 
         Raises:
-            UserError: saying what it lacks.
+            UserError: with what the domain lacks.
         """
         if self.suits:
             with about(f"method {self.name}"):
                 self._named(self.suits)(domain)
 
     def form(self, hparams: Mapping[str, Any]) -> str:
-        """The form of concepts that are learned with these options; empty for the paper's."""
+        """Form of concepts for these options; empty for the paper's form."""
         return " ".join(form.name for form in self.forms if hparams[form.option] != form.usual)
 
     def _named(self, reference: str) -> Any:

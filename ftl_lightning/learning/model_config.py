@@ -1,4 +1,4 @@
-"""The configuration of a pretrained model: what its ``config.json`` says."""
+"""Configuration of a pretrained model, its ``config.json``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,27 +14,27 @@ from ftl_lightning.schema import expect_type, read_json
 from ftl_lightning.shipped import missing_model
 
 CONFIG = "config.json"
-"""In a model's folder."""
+"""File name in a model's folder."""
 VERSION = 2
 """Version of the configuration's format."""
 LONGEST = 10_000
-"""States in a plan; networks over time have the same weights for any number."""
+"""Maximum number of states in a plan; networks over time have the same weights for any horizon."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig(Sizes):
-    """What is needed to build a model before its weights are read, beside the sizes; each method adds what its network needs.
+    """Configuration to build a model before its weights are read; each method adds options of its network.
 
     Attributes:
         domain: name of the domain.
-        training_concepts: texts, in the order of the model's table of training embeddings.
+        training_concepts: texts, in the order of the model's training embeddings.
         encoder: identity of the text encoder.
-        view: name of the domain's view that the model sees behaviour with; empty for as it is.
-        perturb: the present is perturbed while learning, see :class:`~ftl_lightning.domains.domain.View`.
-        image_encoder: arguments of the observed images' encoders, see :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`.
-        feature_dropout: of observed vectors by name, how often each is hidden (0 after normalisation) in training.
-        metrics: of a user's own data, what plans are judged by, see :mod:`ftl_lightning.domains.from_file`.
-        training: how it was trained, for the record.
+        view: name of the domain's view; empty for none.
+        perturb: whether training perturbs the present state, see :class:`~ftl_lightning.domains.domain.View`.
+        image_encoder: arguments of the image encoders, see :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`.
+        feature_dropout: dropout probability of observed vectors by name (0 after normalisation) in training.
+        metrics: metrics of plans for a user's data, see :mod:`ftl_lightning.domains.from_file`.
+        training: training options, for the record.
 
     Raises:
         UserError: at construction, for a size out of its range.
@@ -58,10 +58,10 @@ class ModelConfig(Sizes):
 
 
 def find_view(domain: Domain, name: str) -> View | None:
-    """A domain's view by its name; ``None`` for the empty one.
+    """A domain's view by name; ``None`` for the empty name.
 
     Raises:
-        UserError: for a name that is none.
+        UserError: for an unknown name.
     """
     if not name:
         return None
@@ -71,28 +71,28 @@ def find_view(domain: Domain, name: str) -> View | None:
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:
-    """What the configuration of a pretrained model says, with its ``format``, ``hash`` and ``kind``: data; nothing is made of it.
+    """Read the configuration of a pretrained model, with its ``format``, ``hash`` and ``kind``, as plain data.
 
     Raises:
-        UserError: naming the file, if it is missing or something else.
+        UserError: with the file, if it is missing or invalid.
     """
     path = Path(folder) / CONFIG
     if not path.exists():
         raise UserError(missing_model(folder))
-    found = read_json(path)
+    content = read_json(path)
     with about(path):
-        if not isinstance(found, dict) or found.get("format") != VERSION:
+        if not isinstance(content, dict) or content.get("format") != VERSION:
             raise UserError(f"expected the configuration of a pretrained model, found something else (its format is not {VERSION})")
         for key in ("kind", "hash", "domain"):
-            expect_type(found.get(key), str, key)
-        return found
+            expect_type(content.get(key), str, key)
+        return content
 
 
 def expect_domain(config: ModelConfig, domain: Domain) -> None:
-    """Refuse sizes that are not those of the domain's behaviour.
+    """Refuse sizes that differ from the domain's.
 
     Raises:
-        UserError: naming the key.
+        UserError: with the key.
     """
     if config.state_dim != (columns := len(domain.plans.columns)):
         raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
@@ -102,5 +102,5 @@ def expect_domain(config: ModelConfig, domain: Domain) -> None:
     expected = domain.observed if view is None else view.features
     for name, feature in config.observed.items():
         if name not in expected or not feature.fits(expected[name]):
-            told = expected[name].words if name in expected else f"one of {', '.join(expected) or 'no features'}"
-            raise UserError(f"key 'observed.{short(name)}': expected {told}, found {short(feature.words)}")
+            wanted = expected[name].words if name in expected else f"one of {', '.join(expected) or 'no features'}"
+            raise UserError(f"key 'observed.{short(name)}': expected {wanted}, found {short(feature.words)}")

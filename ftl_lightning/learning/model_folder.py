@@ -1,4 +1,4 @@
-"""The folder that a pretrained model is kept in: ``config.json``, ``model.safetensors``, and examples of a user's own data."""
+"""Folder of a pretrained model: ``config.json``, ``model.safetensors``, and examples of a user's data."""
 
 import json
 from dataclasses import asdict
@@ -21,21 +21,19 @@ from ftl_lightning.tensor_file import alone, expect_finite, file_hash, load_tens
 
 M = TypeVar("M", bound=ConceptModel)
 EXAMPLES = "demonstrations.safetensors"
-"""In the folder of a model of a user's own data."""
+"""File name of the examples in a model's folder."""
 
 
 def save_model(model: ConceptModel, folder: str | Path) -> None:
-    """Write ``config.json`` and ``model.safetensors``, each whole or not at all; weights in half precision.
-
-    Where there are examples, they are written too.
+    """Write ``config.json``, ``model.safetensors`` and any examples, each atomically; weights in half precision.
 
     Raises:
-        UserError: before anything is written, for weights that are not finite or too large for half precision.
+        UserError: before writing, for weights that are not finite or too large for half precision.
     """
     folder, stored = Path(folder), model.stored()
     expect_finite(stored, str(folder), "nothing was written; train it anew")
     header = {"format": VERSION, "hash": model.hash, "kind": model.method.kind}
-    with alone(folder):  # of two that are written to the same folder, the files of one
+    with alone(folder):  # concurrent writes do not mix
         save_tensors(folder / WEIGHTS, KIND, stored, {"domain": model.config.domain})
         if model.examples is not None:
             model.examples.save(folder / EXAMPLES)
@@ -47,18 +45,18 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
 
     Args:
         kind: the model's class.
-        folder: to read.
-        domain: in place of the one that the folder names; ``None`` for that, if an installed package offers it or a person
-            names it beside the folder.
+        folder: folder to read.
+        domain: replaces the folder's domain; ``None`` for the folder's, which must be installed or given by the user with the
+            folder.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, or the two files do not belong together.
+        UserError: with the file, if it is missing or damaged, or if the files do not match.
     """
     path = Path(folder) / CONFIG
     content = read_config(folder)
     with about(path):
-        if (found := content.pop("kind")) != kind.method.kind:
-            raise UserError(f"key 'kind': expected {kind.method.kind!r}, found {found!r}, the model of another method")
+        if (actual := content.pop("kind")) != kind.method.kind:
+            raise UserError(f"key 'kind': expected {kind.method.kind!r}, found {actual!r}, the model of another method")
         if domain is None and content["domain"] != OWN:
             domain = domain_of_file(content["domain"])
         del content["format"]
@@ -66,9 +64,9 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
         config = from_mapping(kind.Config, content, "")
     weights = Path(folder) / WEIGHTS
     tensors, _ = load_tensors(weights, KIND)
-    if (found := file_hash(weights)) != expected_hash:
+    if (actual := file_hash(weights)) != expected_hash:
         raise UserError(
-            f"{weights}: expected the hash {short(expected_hash)} that {CONFIG} names, found {found}; copy both files again"
+            f"{weights}: expected the hash {short(expected_hash)} that {CONFIG} names, found {actual}; copy both files again"
         )
     examples = Demonstrations.load(Path(folder) / EXAMPLES) if config.domain == OWN else None
     with about(path):
@@ -77,7 +75,7 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
         elif domain is None:
             domain = domain_of_file(config.domain)
         expect_domain(config, domain)
-        # First on paper: a file of a few bytes can name sizes that no memory holds.
+        # First on the meta device: a small file can name sizes beyond any memory.
         with torch.device("meta"), at_most(sum(value.numel() for value in tensors.values())):
             expected = kind(blank(config, domain)).state_dict()
     with about(weights):

@@ -1,4 +1,4 @@
-"""What is asked of a model's weights that are read from a file, before a network is made for them."""
+"""Checks of a model's weights from a file, before the network is built."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,19 +11,19 @@ from ftl_lightning.errors import UserError, short
 from ftl_lightning.learning.model_config import CONFIG
 
 WEIGHTS = "model.safetensors"
-"""In a model's folder."""
+"""File name in a model's folder."""
 MOST_PARAMETERS = 10_000
-"""Of tensors that are learned in a model that is read from files."""
+"""Maximum number of parameter tensors in a model from a file."""
 SPARE = 4
-"""So many times the numbers of a file may be made while a network is built: layers that are stacked afterwards are made twice."""
+"""Maximum ratio of built numbers to numbers in the file: layers that are stacked afterwards are built twice."""
 
 
 @contextmanager
 def at_most(numbers: int) -> Iterator[None]:
-    """Build a network of about so many numbers; larger ones are not built to their end.
+    """Build a network of about ``numbers`` numbers; abort for larger networks.
 
     Raises:
-        UserError: for a network that is larger, or that cannot be built.
+        UserError: for a network that is larger or cannot be built.
     """
     tensors, left = 0, SPARE * numbers
 
@@ -39,25 +39,25 @@ def at_most(numbers: int) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except Exception as error:  # torch and the networks raise many kinds for sizes that do not go together
+    except Exception as error:  # torch and the networks raise many kinds for inconsistent sizes
         raise UserError(f"expected sizes that make a network, found others ({short(str(error), 100)})") from error
     finally:
         handle.remove()
 
 
 def expect_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Refuse tensors that are not those of a model, or hold numbers that are none.
+    """Refuse tensors that do not fit a model or are not finite.
 
     Raises:
-        UserError: naming the first one.
+        UserError: with the first such tensor.
     """
     for name in [*expected, *found]:
         if name not in found or name not in expected:
-            told = "expected it, found nothing" if name not in found else "expected nothing, found it"
-            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: {told}")
-        own, like = found[name], expected[name]
-        if own.shape != like.shape or own.is_floating_point() != like.is_floating_point():
-            kinds = [f"{str(one.dtype).removeprefix('torch.')} {tuple(one.shape)}" for one in (like, own)]
+            message = "expected it, found nothing" if name not in found else "expected nothing, found it"
+            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: {message}")
+        tensor, like = found[name], expected[name]
+        if tensor.shape != like.shape or tensor.is_floating_point() != like.is_floating_point():
+            kinds = [f"{str(each.dtype).removeprefix('torch.')} {tuple(each.shape)}" for each in (like, tensor)]
             raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: expected {kinds[0]}, found {kinds[1]}")
-        if own.is_floating_point() and own.numel() and not torch.stack(own.aminmax()).isfinite().all():
+        if tensor.is_floating_point() and tensor.numel() and not torch.stack(tensor.aminmax()).isfinite().all():
             raise UserError(f"key {short(name)!r}: expected finite numbers, found others; take another copy of both files")

@@ -1,4 +1,4 @@
-"""What a network is built for."""
+"""Inputs for building a network."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar
@@ -16,14 +16,14 @@ K = TypeVar("K", bound=ModelConfig)
 
 @dataclass(frozen=True)
 class Prepared(Generic[C]):
-    """What a network is built for.
+    """Inputs for building a network.
 
     Attributes:
-        config: sizes and names.
-        domain: whose behaviour it learns.
-        normalization: of states.
-        embeddings: of concepts ``(1 + training concepts, n)``, the empty one first.
-        observed: normalisation of the observed vectors, one after another; ``None`` where there are none.
+        config: configuration.
+        domain: domain of the model.
+        normalization: normalisation of states.
+        embeddings: concept embeddings ``(1 + training concepts, n)``, the empty concept first.
+        observed: normalisation of the observed vectors; ``None`` without any.
     """
 
     config: C
@@ -33,22 +33,22 @@ class Prepared(Generic[C]):
     observed: Normalization | None = None
 
     def configured(self, kind: type[K], **options: Any) -> "Prepared[K]":
-        """The same for a method's network.
+        """Copy with the configuration of a method's network.
 
         Args:
-            kind: of its configuration.
-            options: what the configuration says beside or in place of what every model's does.
+            kind: class of the configuration.
+            options: additional or replaced fields of the configuration.
         """
         known = {field.name: getattr(self.config, field.name) for field in fields(self.config)}
         return Prepared(kind(**known | options), self.domain, self.normalization, self.embeddings, self.observed)
 
     def embedded(self, embeddings: Tensor) -> "Prepared[C]":
-        """The same with other embeddings ``(1 + training concepts, n)``."""
+        """Copy with other embeddings ``(1 + training concepts, n)``."""
         return replace(self, embeddings=embeddings)
 
 
 def blank(config: K, domain: Domain) -> Prepared[K]:
-    """For a network whose weights and buffers are read afterwards: zeros."""
+    """Zeros, for a network whose weights and buffers are read afterwards."""
     states, vectors = torch.zeros(config.state_dim), torch.zeros(config.measured_dim)
     return Prepared(
         config,

@@ -1,4 +1,4 @@
-"""Pretrained models by the folder they are kept in, whatever their method."""
+"""Loading of pretrained models of any method."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,15 +15,15 @@ from ftl_lightning.shipped import pretrained_folder
 
 
 def load_model(folder: str | Path, domain: Domain | str | None = None) -> ConceptModel:
-    """Read a model; it is frozen.
+    """Load a frozen model.
 
     Args:
-        folder: that :func:`~ftl_lightning.learning.model_folder.save_model` wrote, or the name of one that ships.
-        domain: whose behaviour it is, in place of what the folder says: a name, ``'package.module:DOMAIN'``, or the domain itself.
-            A folder alone gets no domain but those that installed packages offer, see :mod:`ftl_lightning.trust`.
+        folder: folder written by :func:`~ftl_lightning.learning.model_folder.save_model`, or the name of a shipped model.
+        domain: replaces the folder's domain: a name, ``'package.module:DOMAIN'``, or a domain. A folder alone can only name
+            domains of installed packages, see :mod:`ftl_lightning.trust`.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged, of an unknown method, or its files do not belong together.
+        UserError: with the file, if it is missing, damaged or of an unknown method, or if the files do not match.
     """
     folder = pretrained_folder(folder)
     kind = read_config(folder)["kind"]
@@ -33,9 +33,9 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:
-    """The folder of the model with this hash below one of some places; of several, one whose domain is known.
+    """Find the folder of the model with this hash below ``places``; a known domain is preferred.
 
-    The configurations of all folders there are read as data; nothing that they name is imported.
+    Configurations are read as data; nothing that they name is imported.
 
     Raises:
         UserError: if there is none.
@@ -49,6 +49,6 @@ def find_model(model_hash: str, places: Sequence[Path]) -> Path:
         if content["hash"] == model_hash:
             matches.append((path.parent, content["domain"]))
     if not matches:
-        told = ", ".join(map(str, places))
-        raise UserError(f"pretrained: expected the model with the hash {model_hash} below {told}, found none; name its folder")
+        searched = ", ".join(map(str, places))
+        raise UserError(f"pretrained: expected the model with the hash {model_hash} below {searched}, found none; name its folder")
     return next((folder for folder, domain in matches if domain == OWN or is_known(domain)), matches[0][0])

@@ -1,4 +1,4 @@
-"""Pretraining: a model of behaviour given concepts is fitted to a domain's demonstrations, by whatever method."""
+"""Pretraining of a concept-conditioned model on a domain's demonstrations, for any method."""
 
 import copy
 import math
@@ -39,30 +39,29 @@ M = TypeVar("M", bound=ConceptModel)
 
 
 class Pretraining(ExactResume, ABC, Generic[M]):
-    """Fits a model to a domain's demonstrations; what the model is and what it minimises, a method says.
+    """Base module that fits a method's model to a domain's demonstrations.
 
-    ``model`` holds the running average of the weights, which is what is validated, exported and adapted; the published code uses
-    the raw weights, which are ``raw``'s. Sizes come from the data module, so layers are built when a trainer attaches both.
+    ``model`` holds the exponential moving average (EMA) of the weights and is validated, exported and adapted; ``raw`` holds the
+    raw weights, which the published code uses. Layers are built once the data module, which decides sizes, is attached.
 
     Args:
-        learning_rate: of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
-        warmup_steps: of the learning rate; 0 for none.
-        weight_decay: of AdamW.
-        ema_decay: of the running average; it starts lower.
-        guidance: weight omega with which training concepts are generated in evaluation.
-        view: name of the domain's view that behaviour is seen with, see :class:`ftl_lightning.domains.domain.View`; empty for as
-            it stands in files.
-        perturb: learn from presents that the view perturbs, here and in inversion.
+        learning_rate: learning rate of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
+        warmup_steps: steps of the warm-up; 0 for none.
+        weight_decay: weight decay of AdamW.
+        ema_decay: decay of the EMA; it starts lower.
+        guidance: guidance weight omega of training concepts in evaluation.
+        view: name of the domain's view, see :class:`ftl_lightning.domains.domain.View`; empty for data as in files.
+        perturb: perturb the present state by the view, here and in inversion.
         output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
-        seed: decides initial weights, and what is random in the loss as a function of the step.
-        image_encoder: arguments of the observed images' encoders, see
-            :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`; its defaults for ``None``.
-        feature_dropout: of observed vectors by name, the probability with which each is hidden in training; none for ``None``.
-            The published code hides the pose of a robot's hand with 0.4.
-        privileged: weights by name: what is read of images has to tell what training demonstrations show beside what is observed,
-            see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
-        told: share of each step's windows whose images are not looked at: what an encoder might read of them is told by what is
-            privileged. Such a window costs a fraction of one with an image.
+        seed: seed of the initial weights, and of the loss's noise as a function of the step.
+        image_encoder: arguments of the image encoders, see :class:`~ftl_lightning.diffusion.image_encoder.ImageEncoder`; its
+            defaults for ``None``.
+        feature_dropout: dropout probability of observed vectors by name; none for ``None``. The published code hides the end
+            effector's pose with 0.4.
+        privileged: loss weights by name: image encoders are trained to predict privileged information of training
+            demonstrations, see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
+        told: share of each step's windows whose image encoding is replaced by privileged information. Such a window costs a
+            fraction of a window with an image.
 
     Raises:
         UserError: at construction, for a value out of its range.
@@ -71,17 +70,17 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     model: M
     raw: M
     flat: ClassVar[Mapping[str, str]] = {}
-    """Of options in groups, where each is by its flat name, ``'group.option'``, see :mod:`ftl_lightning.option_groups`."""
+    """Grouped options ``'group.option'`` by flat name, see :mod:`ftl_lightning.option_groups`."""
     form: str = ""
-    """Words behind the name in tables, of a method that has several forms."""
+    """Suffix of the method's name in tables, if it has several forms."""
     variant: str = ""
-    """What tells it apart from others of the same method in tables."""
+    """Variant of the method in tables."""
     concepts: tuple[str, ...] = ()
     """Names of learned concepts; pretraining learns none."""
     unused: Tensor | None
-    """A parameter of nothing, where the model has none that could be learned."""
+    """Dummy parameter for a model without learnable parameters."""
     stride: int = 1
-    """States of a window from one that is learned from to the next."""
+    """Stride between the states of a window."""
 
     def __init__(
         self,
@@ -100,7 +99,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         told: float = 0.0,
     ) -> None:
         super().__init__()
-        # Configurations from before there was anything privileged keep their hash.
+        # Configurations without privileged information keep their hash.
         self.save_hyperparameters(
             ignore=[*groups_of(self.flat), *([] if privileged else ["privileged"]), *([] if told else ["told"])]
         )
@@ -125,17 +124,17 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     @abstractmethod
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> M:
-        """The method's model with fresh weights.
+        """Build the method's model with initial weights.
 
         Args:
-            prepared: what every model is built for, with the text encoder's embeddings; a method adds what its network needs by
+            prepared: configuration and text embeddings; a method adds options of its network by
                 :meth:`~ftl_lightning.learning.prepared.Prepared.configured`.
-            data: what it learns from.
+            data: training data.
         """
 
     @abstractmethod
     def losses(self, model: M, batch: Batch, draw: torch.Generator) -> Tensor:
-        """What is minimised, on a batch ``(batch,)`` that has been perturbed; ``model`` is in training mode while fitting."""
+        """Losses ``(batch,)`` of a perturbed batch; ``model`` is in training mode while fitting."""
 
     def _perturbed_losses(self, model: M, batch: Batch, draw: torch.Generator) -> tuple[Tensor, Batch]:
         states, observed = model.perturbed(batch.states, batch.observed, draw)
@@ -143,9 +142,9 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         return self.losses(model, seen, draw), seen
 
     def configure_model(self) -> None:
-        """Build the layers once the data are known. Does nothing the second time."""
+        """Build the layers once the data are known, and only once."""
         if "model" not in self._modules:
-            with torch.device("cpu"):  # where the data are; Lightning moves the layers afterwards
+            with torch.device("cpu"):  # with the data; Lightning moves the layers afterwards
                 self._configure()
 
     def _configure(self) -> None:
@@ -183,12 +182,12 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             metrics=dict(data.metrics),
             training={
                 "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
-                # Where somebody's recordings lie says nothing of the model.
+                # The folder of recordings does not affect the model.
                 "data": {key: value for key, value in data.hparams.items() if key != "root" and not key.startswith("_")},
                 "max_steps": self.trainer.max_steps,
             },
         )
-        # The initial weights are a function of the seed, wherever in a process this is called.
+        # The initial weights depend on the seed alone.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             resolution = data.domain.plans.resolution
@@ -204,21 +203,21 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         self.raw = copy.deepcopy(self.model)
         self.teaching.attach(self.raw.images)
         if not any(parameter.requires_grad for parameter in self.raw.parameters()):
-            # Of a model that memorises: steps are still counted, so there has to be something that they are of.
+            # A model that memorises: the optimiser still needs a parameter to count steps.
             self.unused = torch.nn.Parameter(torch.zeros(()))
         self.model.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> Self:
-        """Switch modes; the average is always in evaluation mode."""
+        """Switch modes; the EMA model is always in evaluation mode."""
         super().train(mode)
         if "model" in self._modules:
             self.model.eval()
         return self
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Let a resumed run draw what the unbroken one draws: dropout takes from the global generators.
+        """Restore the global generators, which dropout uses, so that a resumed run equals an unbroken run.
 
-        Here and not earlier, since beginning to iterate a loader draws from them too.
+        Not earlier, since starting to iterate a loader draws from them too.
         """
         self._validated = False
         if self._random is not None:
@@ -226,7 +225,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             self._random = None
 
     def on_validation_start(self) -> None:
-        """Take note that a checkpoint from now on is one after validation."""
+        """Record that later checkpoints follow a validation."""
         self._validated = True
 
     def training_step(self, batch: Batch) -> Tensor:
@@ -239,8 +238,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         losses, seen = self._perturbed_losses(self.raw, looked_at, draw)
         if unseen is not None:
             states, observed = self.raw.perturbed(unseen.states, unseen.observed, draw)
-            told = unseen._replace(states=states, observed=self.teaching.told(self.domain, observed, draw))
-            losses = torch.cat((losses, self.losses(self.raw, told, draw)))
+            privileged = unseen._replace(states=states, observed=self.teaching.told(self.domain, observed, draw))
+            losses = torch.cat((losses, self.losses(self.raw, privileged, draw)))
         loss = losses.mean()
         whole = mean(loss)
         if not whole.isfinite():
@@ -255,7 +254,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         return loss if self.unused is None else loss + 0 * self.unused
 
     def optimizer_step(self, *arguments: Any, **options: Any) -> None:
-        """Step, then update the running average; here, so that no checkpoint falls between the two."""
+        """Step and update the EMA, so that no checkpoint falls between the two."""
         super().optimizer_step(*arguments, **options)
         decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
         if self.unused is None:
@@ -263,7 +262,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                 torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
 
     def _evaluation_step(self, batch: Batch, name: str) -> None:
-        # The same noise every time, so that the curve shows the model and not the draw. Each process computes the whole set's.
+        # Fixed noise, so that the curve shows the model alone. Each process evaluates the whole set.
         loss = self._perturbed_losses(self.model, batch, generator(self.device, self.seed))[0].mean()
         self.log(name, loss, prog_bar=True, batch_size=len(batch.states), sync_dist=True)
 
@@ -291,7 +290,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_fit_end(self) -> None:
-        """Write the averaged model for ``invert`` and ``sample``."""
+        """Write the EMA model for ``invert`` and ``sample``."""
         folder = self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
         if self.trainer.is_global_zero:
             save_model(self.model, folder)
@@ -303,11 +302,11 @@ class Pretraining(ExactResume, ABC, Generic[M]):
 
     @property
     def domain(self) -> Domain:
-        """Whose behaviour it is."""
+        """The model's domain."""
         return self.model.domain
 
     def composition(self, task: EvaluationTask) -> Composition | None:
-        """What generates a task, or ``None`` if it needs a learned concept."""
+        """Composition for a task; ``None`` if it needs a learned concept."""
         if task.learned:
             return None
         embeddings = torch.stack([self.model.concept(text)[None] for text in (*task.texts, *task.without)])
@@ -315,50 +314,50 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         return Composition(embeddings, embeddings.new_tensor(weights))
 
     def demonstrated(self, concept: str) -> Demonstrations | None:
-        """What a concept was learned from: nothing is learned here."""
+        """Demonstrations of a learned concept: ``None`` in pretraining."""
         return None
 
     def concept_points(self) -> list[Point]:
-        """Every embedding, for the projector."""
+        """All embeddings, for the projector."""
         return self.model.points()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint, and keep where the global generators stand."""
+        """Sign the checkpoint and store the global generators' states."""
         super().on_save_checkpoint(checkpoint)
         loop = self.trainer.fit_loop
         validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
         Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse the checkpoint of another module or of a model of another form."""
+        """Refuse a checkpoint of another module or model configuration."""
         super().on_load_checkpoint(checkpoint)
         self._random = Random.read(checkpoint)
 
     def signature(self) -> dict[str, Any]:
-        """What decides the form of a checkpoint's parameters, and what they mean."""
+        """Configuration that decides the shapes and meaning of a checkpoint's parameters."""
         different = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
 
 
 def expect_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
-    """The probabilities themselves.
+    """Check and return the probabilities.
 
     Raises:
-        UserError: for a name that is no observed vector's.
+        UserError: for a name that is not an observed vector.
     """
     vectors = [name for name, feature in features.items() if feature.kind == "vector"]
     for name in shares:
         if name not in vectors:
-            told = f"one of {', '.join(vectors)}" if vectors else "nothing, as no vector is observed"
-            raise UserError(f"model.feature_dropout: expected {told}, found {name!r}")
+            expected = f"one of {', '.join(vectors)}" if vectors else "nothing, as no vector is observed"
+            raise UserError(f"model.feature_dropout: expected {expected}, found {name!r}")
     return dict(shares)
 
 
 def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
-    """Refuse training concepts without demonstrations, for methods whose concepts are demonstrations.
+    """Refuse training concepts without demonstrations, for in-context methods.
 
     Raises:
-        UserError: naming the first one.
+        UserError: with the first such concept.
     """
     if absent := [text for text in concepts if text not in set(shown)]:
         raise UserError(
@@ -368,10 +367,10 @@ def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
 
 
 def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
-    """Refuse concepts that the text encoder cannot tell apart, such as those that differ in capitals alone.
+    """Refuse concepts with equal text embeddings, such as texts that differ in capitals alone.
 
     Raises:
-        UserError: naming two of them.
+        UserError: with two such concepts.
     """
     for number, text in enumerate(concepts):
         same = (embeddings[:number] == embeddings[number]).all(dim=1).nonzero()

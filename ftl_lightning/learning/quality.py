@@ -1,4 +1,4 @@
-"""Does generated behaviour look like the demonstrations? Measures that need nothing but the two, and what they mean in words."""
+"""Quality of samples relative to demonstrations: measures and their description in words."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -21,31 +21,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COPIES, COLLAPSED, ROUGH = 0.2, 0.5, 1.5
-"""Novelty and spread below which, and roughness above which samples are called so."""
+"""Thresholds: minimum novelty, minimum spread, maximum roughness."""
 SCATTERED = 2.0
-"""Spread above which samples are called so."""
+"""Threshold: maximum spread."""
 GENERATED, SHOWN = 40, 16
-"""Samples that are looked at, and those that are drawn."""
+"""Number of generated samples, and of samples in a figure."""
 SAMPLING = Sampling("dpm_solver", 10, 1.0)
-"""How they are generated: quickly, and as widely as the model does."""
+"""Sampling: fast, at temperature 1."""
 SMOOTH = 0.01
-"""Second differences by the size of a plan, of which nobody sees less."""
+"""Minimum visible roughness: second differences relative to the size of a plan."""
 _LEAST = 1e-9
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What samples of a concept are like beside the demonstrations that it was learned from.
+    """Quality of a concept's samples relative to its demonstrations.
 
     Attributes:
-        novelty: how far a sample is from the nearest demonstration, as a share of how far demonstrations are from their nearest
-            others (mean over samples; means over demonstrations): 0 for copies, about 1 for behaviour that is as new as the
-            demonstrations are to each other. Where what is observed is given, the demonstration whose it is does not count, as
-            being like that may be right.
-        spread: standard deviation over samples as a share of the demonstrations' own, unbiased, all columns and times together: 0
-            where all samples are the same.
-        roughness: second differences over time, relative to how much a plan varies, as a share of the demonstrations' (medians);
-            less than :data:`SMOOTH` cannot be seen and counts as that. 1 for plans of fewer than three states.
+        novelty: mean distance of samples to the nearest demonstration, divided by the mean distance between nearest
+            demonstrations: 0 for copies, about 1 for samples as different as demonstrations. With observations, the demonstration
+            that a sample's observation comes from is excluded, since similarity may be right.
+        spread: standard deviation over samples divided by that over demonstrations, unbiased, over all columns and times: 0 for
+            equal samples.
+        roughness: median of second differences over time relative to a plan's variation, divided by the demonstrations'; clipped
+            below at :data:`SMOOTH`, which is invisible. 1 for plans of fewer than three states.
     """
 
     novelty: float
@@ -54,12 +53,12 @@ class Quality:
 
     @classmethod
     def of(cls, samples: Tensor, demonstrations: Tensor, observed: Tensor | None = None) -> Self:
-        """Compare them.
+        """Compare samples with demonstrations.
 
         Args:
-            samples: ``(sample, horizon, state)``, columns on comparable scales, such as a model's normalised ones.
+            samples: ``(sample, horizon, state)``, columns on comparable scales, such as a model's normalised columns.
             demonstrations: ``(demo, horizon, state)``, two or more.
-            observed: the demonstration of which each sample sees what is observed ``(sample,)`` int64; ``None`` for none.
+            observed: index of the demonstration that each sample's observation comes from ``(sample,)`` int64; ``None`` for none.
 
         Raises:
             ValueError: for fewer than two demonstrations.
@@ -78,23 +77,23 @@ class Quality:
 
     @property
     def words(self) -> str:
-        """In plain words, such as ``'collapsed (spread 0.31)'``; what is fine is told as a number alone."""
-        told = [
+        """Description, such as ``'spread 0.31 (collapsed)'``; without a remark within the thresholds."""
+        words = [
             f"spread {self.spread:.2f}{_remark(self.spread, COLLAPSED, 'collapsed', SCATTERED, 'scattered')}",
             f"novelty {self.novelty:.2f}{_remark(self.novelty, COPIES, 'copies')}",
             f"roughness {self.roughness:.2f}{_remark(self.roughness, 0, '', ROUGH, 'rougher than your demonstrations')}",
         ]
-        return ", ".join(told)
+        return ", ".join(words)
 
     @property
     def numbers(self) -> Mapping[str, float]:
-        """By name."""
+        """Measures by name."""
         return asdict(self)
 
 
 def roughness(plans: Tensor) -> Tensor:
-    """Median over plans ``(plan, horizon, state)`` of root mean square second differences over time by that of the plan's
-    deviation from its mean; plans that do not vary do not count.
+    """Median over plans ``(plan, horizon, state)`` of the root mean square (RMS) of second differences over time, divided by the
+    RMS deviation from the plan's mean. Constant plans are excluded.
     """
     size = (plans - plans.mean(dim=1, keepdim=True)).square().mean(dim=(1, 2)).sqrt()
     second = plans.diff(n=2, dim=1).square().mean(dim=(1, 2)).sqrt()
@@ -103,12 +102,12 @@ def roughness(plans: Tensor) -> Tensor:
 
 
 def _roughness_share(samples: Tensor, demonstrations: Tensor) -> float:
-    one, other = (roughness(plans).clamp(min=SMOOTH) for plans in (samples, demonstrations))
-    return float(one / other)
+    sampled, demonstrated = (roughness(plans).clamp(min=SMOOTH) for plans in (samples, demonstrations))
+    return float(sampled / demonstrated)
 
 
 def _share(value: Tensor, whole: Tensor) -> float:
-    """1 where both are nothing."""
+    """Ratio; 1 if both are 0."""
     return float(value / whole) if whole > _LEAST else 1.0 if value <= _LEAST else float(value / _LEAST)
 
 
@@ -117,23 +116,23 @@ def _remark(value: float, least: float, below: str, most: float = torch.inf, abo
 
 
 def measured(model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int) -> dict[str, Quality]:
-    """The quality of some concepts by name, in what the model's network sees, which compares columns of any unit.
+    """Quality of concepts by name, in the network's normalised inputs, so that columns are comparable.
 
     Args:
-        model: that generates them.
-        demonstrations: two or more, which samples are compared with and from whose initial states they start.
-        concepts: by name.
-        seed: of the samples.
+        model: generative model.
+        demonstrations: two or more, which also provide the initial states.
+        concepts: concepts by name.
+        seed: seed of the samples.
     """
     known = _encoded(model, *first_windows(demonstrations, model.config.horizon))
     plans, starts = generated(model, demonstrations, concepts, seed)
-    return {name: Quality.of(_encoded(model, own, starts), known, _observed(demonstrations)) for name, own in plans.items()}
+    return {name: Quality.of(_encoded(model, samples, starts), known, _observed(demonstrations)) for name, samples in plans.items()}
 
 
 def generated(
     model: ConceptModel, demonstrations: Demonstrations, concepts: Mapping[str, Concept], seed: int
 ) -> tuple[dict[str, Tensor], InitialStates]:
-    """Samples of some concepts ``(GENERATED, horizon, state)`` by name, and where each starts; arguments as of :func:`measured`."""
+    """Samples of concepts ``(GENERATED, horizon, state)`` by name, and their initial states; arguments as in :func:`measured`."""
     names = list(concepts)
     starts = demonstrations.initial_states.take(_turns(demonstrations))
     seen = {key: value.repeat(len(names), *(1,) * (value.dim() - 1)) for key, value in starts.observed.items()}
@@ -145,17 +144,17 @@ def generated(
 
 
 def _turns(demonstrations: Demonstrations) -> Tensor:
-    """The demonstration that each sample starts like ``(GENERATED,)``."""
+    """Index of the demonstration with each sample's initial state ``(GENERATED,)``."""
     return torch.arange(GENERATED) % len(demonstrations)
 
 
 def _observed(demonstrations: Demonstrations) -> Tensor | None:
-    """The same where anything is observed."""
+    """The same; ``None`` without observations."""
     return _turns(demonstrations) if demonstrations.observed else None
 
 
 def first_windows(demonstrations: Demonstrations, horizon: int) -> tuple[Tensor, InitialStates]:
-    """The first states of demonstrations ``(demo, horizon, state)``, and where they start."""
+    """First windows of demonstrations ``(demo, horizon, state)``, and their initial states."""
     rows = torch.arange(len(demonstrations))
     return demonstrations.windows(rows, torch.zeros_like(rows), horizon)[0], demonstrations.initial_states
 
@@ -166,16 +165,16 @@ def _encoded(model: ConceptModel, plans: Tensor, starts: InitialStates) -> Tenso
 
 @dataclass(frozen=True)
 class Inspection:
-    """Samples of a learned concept beside its demonstrations.
+    """Samples of a learned concept with its demonstrations.
 
     Attributes:
-        quality: what they are like.
-        right: name and value of the domain's first metric that tells how many are right; ``None`` where none can.
+        quality: quality of the samples.
+        right: name and value of the domain's first success metric; ``None`` without such a metric.
         demonstrations: ``(demo, horizon, state)``, in the domain's units.
         samples: ``(GENERATED, horizon, state)``.
-        starts: where each sample starts.
-        domain: whose pictures they are drawn with.
-        name: of the concept.
+        starts: initial state of each sample.
+        domain: domain that draws the pictures.
+        name: name of the concept.
     """
 
     quality: Quality
@@ -187,34 +186,34 @@ class Inspection:
     name: str
 
     def __str__(self) -> str:
-        told = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}, "
-        return f"{told}{self.quality.words} ({len(self.samples)} samples)"
+        metric = "" if self.right is None else f"{self.right[0]} {self.right[1]:.2f}, "
+        return f"{metric}{self.quality.words} ({len(self.samples)} samples)"
 
     @property
     def record(self) -> QualityRecord:
-        """What a concept's file keeps of it."""
+        """Record for a concept's file."""
         metric, right = ("", None) if self.right is None else self.right
         return QualityRecord(len(self.samples), **self.quality.numbers, metric=metric, right=right)
 
     def figure(self) -> "Figure":
-        """Demonstrations above some of the samples."""
+        """Figure of demonstrations above samples."""
         shown = slice(0, SHOWN)
         observed = bool(self.domain.observed)
-        known = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # samples start like these, in turn
+        known = self.starts.take(slice(0, len(self.demonstrations))) if observed else None  # initial states of samples, in turn
         demonstrations = Drawn("demonstrations", self.demonstrations, known)
         samples = Drawn("samples", self.samples[shown], self.starts.take(shown) if observed else None)
         return beside(self.domain.show, demonstrations, samples, f"{self.name}: {self}")
 
 
 def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstrations, concept: Concept, seed: int) -> Inspection:
-    """Look at samples of a learned concept.
+    """Inspect samples of a learned concept.
 
     Args:
-        model: that generates them.
-        domain: whose first metric that says so tells how many are right, where it can judge by the concept's name.
-        demonstrations: two or more, that it was learned from.
-        concept: the learned one.
-        seed: of the samples.
+        model: generative model.
+        domain: domain whose first success metric judges samples, if it can read the concept's name.
+        demonstrations: two or more demonstrations of the concept.
+        concept: learned concept.
+        seed: seed of the samples.
     """
     name = concept.origin.name
     every, starts = generated(model, demonstrations, {name: concept}, seed)
@@ -222,6 +221,6 @@ def inspected(model: ConceptModel, domain: Domain, demonstrations: Demonstration
     right = None
     if domain.metrics and domain.concepts.reads(name):
         measured = domain.measure(name, plans, starts if domain.observed else None)
-        right = next(((key, float(own.float().mean())) for key, own in measured.items() if own.dtype == torch.bool), None)
+        right = next(((key, float(values.float().mean())) for key, values in measured.items() if values.dtype == torch.bool), None)
     quality = Quality.of(_encoded(model, plans, starts), _encoded(model, known, first), _observed(demonstrations))
     return Inspection(quality, right, known, plans, starts, domain, name)

@@ -1,4 +1,4 @@
-"""How well concepts explain demonstrations: the loss of each under each, relative to the empty concept's on the same noise."""
+"""Losses of demonstrations under concepts, relative to the unconditional (empty concept's) loss on the same noise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,22 +15,22 @@ from ftl_lightning.learning.inversion_settings import InversionSettings
 from ftl_lightning.seeding import generator
 
 TOGETHER = 4096
-"""Noised demonstrations in a batch."""
+"""Maximum number of noised demonstrations in a batch."""
 GENERATED = Sampling("dpm_solver", 10)
-"""How behaviour is generated that demonstrations are compared with."""
+"""Sampling of the behaviour in :func:`generated_loss`."""
 COMPARED = 8
-"""Training concepts at most whose behaviour that is."""
+"""Maximum number of training concepts in :func:`generated_loss`."""
 
 
 @dataclass(frozen=True)
 class _Noised:
-    """Windows of demonstrations, and noise: alike for every demonstration and concept.
+    """Windows of demonstrations, and noise shared by all demonstrations and concepts.
 
     Attributes:
-        model, kind: whose loss it is, and of what.
-        states, seen: of windows ``(demo * sample, window, state)``, demonstration after demonstration.
+        model, kind: model and kind of the loss.
+        states, seen: windows ``(demo * sample, window, state)``, ordered by demonstration, and their observations.
         draws: timesteps and noise.
-        demonstrations: how many there are.
+        demonstrations: number of demonstrations.
     """
 
     model: ConceptModel
@@ -42,7 +42,7 @@ class _Noised:
 
     @classmethod
     def of(cls, model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, samples: int) -> "_Noised":
-        """So many noised windows of each demonstration."""
+        """Draw ``samples`` noised windows of each demonstration."""
         count, device = len(demonstrations), model.device
         draw = generator(device, settings.seed, 4)
         draws = model.draws(samples, settings.loss.timestep_power, draw)
@@ -56,7 +56,7 @@ class _Noised:
         return cls(model, settings.loss.kind, states, seen, draws, count)
 
     def losses(self, concepts: Composition, states: Tensor | None = None) -> Tensor:
-        """``(concept, demo)`` on the processor, of each demonstration's windows or of other states in their place."""
+        """Mean losses ``(concept, demo)`` on the CPU, of the windows or of ``states`` in their place."""
         runs = len(concepts.weights)
         repeated = {name: values.repeat(runs, *[1] * (values.dim() - 1)) for name, values in self.seen.items()}
         shown = self.states.repeat(runs, 1, 1) if states is None else states
@@ -64,7 +64,7 @@ class _Noised:
         return losses.unflatten(1, (self.demonstrations, -1)).mean(dim=2).cpu()
 
     def empty(self, concepts: Composition) -> Tensor:
-        """Losses of the empty concept ``(1, demo)``; of concepts the shape counts."""
+        """Unconditional losses ``(1, demo)``; only the shape of ``concepts`` is used."""
         nothing = Composition(concepts.embeddings[:1], torch.zeros_like(concepts.weights[:1]))
         return self.losses(nothing).clamp(min=1e-12)
 
@@ -77,42 +77,42 @@ def relative_losses(
     settings: InversionSettings,
     tell: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
-    """Losses by the empty concept's: less than 1 where a concept explains a demonstration better than nothing does.
+    """Losses relative to the unconditional loss; below 1 if a concept explains a demonstration.
 
-    Noise, timesteps and starts of windows are the same for all demonstrations and concepts.
+    Noise, timesteps and starts of windows are shared by all demonstrations and concepts.
 
     Args:
-        model: whose loss it is.
-        demonstrations: that fit the model.
+        model: model of the loss.
+        demonstrations: demonstrations that fit the model.
         concepts: ``(concept, K, ...)``, on the model's device.
-        settings: kind of loss and timesteps, and the number of noised samples of each demonstration: twice the samples of a step.
+        settings: kind of loss, timesteps, and samples a step; each demonstration gets twice as many noised samples.
         tell: called with the number of concepts after each batch.
 
     Returns:
-        ``(concept, demo)`` on the processor.
+        ``(concept, demo)`` on the CPU.
     """
     noised = _Noised.of(model, demonstrations, settings, _samples(settings))
     empty = noised.empty(concepts)
-    found, size = [], max(1, TOGETHER // len(noised.states))
+    losses, size = [], max(1, TOGETHER // len(noised.states))
     for first in range(0, len(concepts.weights), size):
         chosen = slice(first, first + size)
-        found.append(noised.losses(Composition(concepts.embeddings[chosen], concepts.weights[chosen])))
-        tell(len(found[-1]))
-    return torch.cat(found) / empty
+        losses.append(noised.losses(Composition(concepts.embeddings[chosen], concepts.weights[chosen])))
+        tell(len(losses[-1]))
+    return torch.cat(losses) / empty
 
 
 @torch.no_grad()
 def generated_loss(model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings) -> float:
-    """The loss of what a model generates itself, in the units of :func:`relative_losses`: how low a loss can be.
+    """Loss of generated behaviour, in the units of :func:`relative_losses`: a lower bound of losses.
 
-    Behaviour of training concepts is generated from where the demonstrations' windows start. A concept that is learned as well
-    as those that were pretrained explains demonstrations about as well as they explain that.
+    Behaviour of training concepts is generated from the windows' initial states. A concept learned as well as in pretraining has
+    about this loss.
 
     Args:
-        model, demonstrations, settings: as of :func:`relative_losses`.
+        model, demonstrations, settings: as in :func:`relative_losses`.
 
     Returns:
-        the median over training concepts, :data:`COMPARED` at most.
+        Median over at most :data:`COMPARED` training concepts.
     """
     embeddings = model.training_embeddings[:, None, None]
     chosen = torch.linspace(0, len(embeddings) - 1, min(COMPARED, len(embeddings))).round().long()
@@ -123,12 +123,12 @@ def generated_loss(model: ConceptModel, demonstrations: Demonstrations, settings
         concept = Composition(embeddings[number : number + 1], ones)
         alone = Composition(concept.embeddings[0], concept.weights[0])
         draws = [generator(model.device, settings.seed, 5, number)]
-        own = model.sample([alone], len(noised.states), GENERATED, draws, noised.seen)[0]
-        means.append(noised.losses(concept, own).mean())
+        plans = model.sample([alone], len(noised.states), GENERATED, draws, noised.seen)[0]
+        means.append(noised.losses(concept, plans).mean())
     empty = noised.empty(Composition(embeddings[:1], ones))
     return float(torch.stack(means).median() / empty.mean())
 
 
 def _samples(settings: InversionSettings) -> int:
-    """Noised samples of each demonstration."""
+    """Number of noised samples of each demonstration."""
     return max(2 * settings.budget.samples, 16)

@@ -1,4 +1,4 @@
-"""Resuming exactly: a run that was interrupted ends with the same bytes as the unbroken one."""
+"""Exact resumption: an interrupted run ends with the same bytes as an unbroken run."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -11,39 +11,39 @@ from ftl_lightning.tensor_file import expect_finite
 
 
 class ExactResume(pl.LightningModule, ABC):
-    """Signs checkpoints, refuses those of something else or with numbers that are not finite, and looks at what was restored."""
+    """Sign checkpoints, refuse foreign or non-finite checkpoints, and check the restored state."""
 
     prefix: ClassVar[str] = ""
-    """Names of all parameters that a checkpoint holds begin so."""
+    """Prefix of the parameters in a checkpoint."""
     doing: ClassVar[str] = "training"
-    """What is interrupted, in messages."""
+    """Name of the activity in messages."""
     resumed_from = 0
-    """The step of the checkpoint that was loaded; 0 for none."""
+    """Step of the loaded checkpoint; 0 for none."""
 
     @abstractmethod
     def signature(self) -> Mapping[str, Any]:
         """Settings that must match before a checkpoint is loaded."""
 
     def on_train_start(self) -> None:
-        """Look at what was restored, if anything."""
+        """Check the restored state."""
         check_restored(self, self.resumed_from)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint and leave out what it does not hold.
+        """Sign the checkpoint and keep only parameters with the prefix.
 
         Raises:
-            UserError: if a parameter is not finite; the checkpoint that is there stays.
+            UserError: if a parameter is not finite; an existing checkpoint is kept.
         """
         sign(self, checkpoint, self.signature())
         state = {name: value for name, value in checkpoint["state_dict"].items() if name.startswith(self.prefix)}
         checkpoint["state_dict"] = state
-        # Losses that a concept has not reached yet are infinite: of what is learned in part, parameters alone are looked at.
+        # Buffers of losses may still be infinite: with a prefix, only parameters are checked.
         learned = dict(self.named_parameters()) if self.prefix else state
         learned = {name: value for name, value in learned.items() if name in state}
         expect_finite(learned, f"{self.doing}: step {self.global_step}", "nothing was saved of it; lower the learning rate")
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse the checkpoint of another module or with other parameters."""
+        """Refuse a checkpoint of another module or with other parameters."""
         check_signature(self, checkpoint, self.signature())
         check_parameters(checkpoint["state_dict"], self, self.prefix)
         self.resumed_from = checkpoint["global_step"]

@@ -1,4 +1,4 @@
-"""When an inversion stops: each run by itself, once its loss on held-out noise no longer falls."""
+"""Early stopping of an inversion: each run stops once its loss on held-out noise no longer falls."""
 
 from collections.abc import Callable
 
@@ -6,27 +6,27 @@ import torch
 from torch import Tensor, nn
 
 ROUND = 10
-"""Steps between two looks at the loss on held-out noise."""
+"""Steps between two evaluations of the held-out loss."""
 IDLE = 2
-"""Rounds that gain too little before a run stops."""
+"""Patience: rounds with too small a gain before a run stops."""
 
 
 class Stopping(nn.Module):
-    """The mean of every run's embeddings and weights over the round of :data:`ROUND` steps that had the least held-out loss.
+    """Mean embeddings and weights of every run over its round of :data:`ROUND` steps with the lowest held-out loss.
 
-    The mean over a round takes the place of a decaying learning rate, which would have to know the number of steps. All that is
-    kept is in buffers, so that checkpoints resume exactly.
+    The mean over a round replaces a decaying learning rate, which would need the number of steps. The state is in buffers, so
+    that checkpoints resume exactly.
 
     Args:
-        embeddings: where runs start ``(run, K, knots, n)``.
-        weights: where the weights of runs start ``(run, K)``.
-        tolerance: a run stops when :data:`IDLE` rounds one after another gained less than this share of its whole gain.
+        embeddings: initial embeddings ``(run, K, knots, n)``.
+        weights: initial weights ``(run, K)``.
+        tolerance: a run stops when :data:`IDLE` consecutive rounds gain less than this share of its total gain.
 
     Attributes:
-        going: the runs ``(run,)`` that have not stopped.
-        embeddings, weights: the best of every run so far.
+        going: mask of active runs ``(run,)``.
+        embeddings, weights: best of every run so far.
         least: their held-out losses ``(run,)``.
-        rounds: how many have ended.
+        rounds: number of completed rounds.
     """
 
     going: Tensor
@@ -53,21 +53,21 @@ class Stopping(nn.Module):
         self.register_buffer("_weight_sums", torch.zeros_like(self.weights))
 
     def begin(self, losses: Tensor) -> None:
-        """Take note of the held-out losses ``(run,)`` before the first step."""
+        """Record the initial held-out losses ``(run,)``."""
         self.least[:] = losses
         self._first[:] = losses
 
     @torch.no_grad()
     def stepped(self, step: int, embeddings: Tensor, weights: Tensor, held_out: Callable[[Tensor, Tensor, Tensor], Tensor]) -> bool:
-        """Take note of a step, and at the end of a round stop the runs that gain no more.
+        """Record a step, and at the end of a round stop runs without gain.
 
         Args:
-            step: its number from 0.
-            embeddings, weights: of every run after it.
-            held_out: ``(embeddings, weights, runs) -> losses`` of the runs that are true among ``runs (run,)``.
+            step: number of the step from 0.
+            embeddings, weights: parameters of every run after the step.
+            held_out: ``(embeddings, weights, runs) -> losses`` of the runs in the mask ``runs (run,)``.
 
         Returns:
-            Whether any run goes on.
+            Whether any run is active.
         """
         self._sums += embeddings
         self._weight_sums += weights
@@ -77,7 +77,7 @@ class Stopping(nn.Module):
         mean, weight_mean = self._sums / ROUND, self._weight_sums / ROUND
         losses = torch.full_like(self.least, torch.inf)
         losses[self.going] = held_out(mean, weight_mean, self.going)
-        better = losses < self.least  # of none that has stopped
+        better = losses < self.least  # false for stopped runs
         gained = (self.least - losses).clamp(min=0)
         self.embeddings[better], self.weights[better], self.least[better] = mean[better], weight_mean[better], losses[better]
         little = gained <= self.tolerance * (self._first - self.least)

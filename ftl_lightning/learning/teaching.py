@@ -1,4 +1,4 @@
-"""Pretraining with privileged information: encoders of images are taught what is where in training demonstrations."""
+"""Pretraining with privileged information: image encoders are trained to predict positions in training demonstrations."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,11 +15,11 @@ from ftl_lightning.ranges import LARGEST_FACTOR, expect_range
 
 
 class Teaching:
-    """What is read of images has to tell, and what stands for images that are not looked at.
+    """Auxiliary losses of image encodings, and replacement of encodings by privileged information.
 
     Args:
-        weights: of errors by name, see :class:`~ftl_lightning.domains.domain.Privileged`; empty to teach nothing.
-        share: of each step's windows whose images are not looked at.
+        weights: loss weights by name, see :class:`~ftl_lightning.domains.domain.Privileged`; empty for none.
+        share: share of each step's windows without encoded images.
 
     Raises:
         UserError: for a weight or share out of its range, or a share without exactly one name.
@@ -34,12 +34,12 @@ class Teaching:
             raise UserError(f"model.told: expected less than 1, and one name in model.privileged, found {share}")
 
     def expect_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
-        """Refuse to teach images what the domain does not show, or what no encoder of points reads."""
+        """Refuse names that the domain does not provide or the encoder of ``images`` cannot predict."""
         for name in self.weights:
             known = domain.privileged.get(name)
             if known is None or images is None:
-                told = ", ".join(domain.privileged) if images is not None else "none, as no image is observed"
-                raise UserError(f"model.privileged: expected {told or 'none'} (domain {domain.name}), found {short(name)!r}")
+                names = ", ".join(domain.privileged) if images is not None else "none, as no image is observed"
+                raise UserError(f"model.privileged: expected {names or 'none'} (domain {domain.name}), found {short(name)!r}")
             if images.size != known.feature.size:
                 raise UserError(
                     f"model.privileged.{name}: expected image_encoder of {known.feature.shape[0]} points, "
@@ -49,7 +49,7 @@ class Teaching:
                 raise UserError(f"model.told: expected 0, as nothing tells what is read of {name!r}, found {self.share}")
 
     def attach(self, images: ImageEncoders | None) -> None:
-        """Remember what encoders read, from now on."""
+        """Keep the outputs of image encoders."""
         if self.weights and images is not None:
             images.register_forward_hook(self._keep)
 
@@ -57,11 +57,11 @@ class Teaching:
         self._read = read
 
     def errors(self, domain: Domain, observed: Observed) -> dict[str, Tensor]:
-        """By name, how badly what was read last tells what the images show: the mean over samples."""
+        """Mean errors of the last image encodings by name."""
         return {name: domain.privileged[name].error(self._read, observed[name]).mean() for name in self.weights}
 
     def apart(self, domain: Domain, batch: Batch) -> tuple[Batch, Batch | None]:
-        """The windows of a step whose images are looked at, one at least, and the others, without their images."""
+        """Split a batch into windows with encoded images, at least one, and windows without images."""
         count = max(1, round((1 - self.share) * len(batch.states)))
         if count >= len(batch.states):
             return batch, None
@@ -71,7 +71,7 @@ class Teaching:
         return first, Batch(batch.states[count:], batch.concepts[count:], unseen)
 
     def told(self, domain: Domain, observed: Observed, draw: torch.Generator) -> dict[str, Tensor]:
-        """What is observed of windows without images, with what an encoder might read of them."""
+        """Add simulated image encodings to the observations of windows without images."""
         (name,) = self.weights
         tell = domain.privileged[name].told
         assert tell is not None

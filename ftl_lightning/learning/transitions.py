@@ -1,4 +1,4 @@
-"""What one-step methods have in common: they learn what follows a state, and unroll it into a plan."""
+"""Base of one-step methods: predict the next state, and unroll it into a plan."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.learning.concept_model import ConceptModel
 from ftl_lightning.learning.model_config import ModelConfig
 
-if TYPE_CHECKING:  # it comes with Lightning, which models do without
+if TYPE_CHECKING:  # it needs Lightning, models do not
     from ftl_lightning.domains.data import PretrainingData
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepConfig(ModelConfig):
-    """What one-step methods need beside what every model does; their ``horizon`` is that of the plans they unroll.
+    """Configuration of one-step methods; ``horizon`` is that of the unrolled plans.
 
     Attributes:
-        stride: states of a demonstration from the one that is given to the one that is predicted; between them plans are straight.
+        stride: states from the given to the predicted state; plans are linear between them.
     """
 
     stride: int = 1
@@ -39,61 +39,61 @@ class StepConfig(ModelConfig):
 
     @property
     def window(self) -> int:
-        """States of a demonstration that a transition spans."""
+        """Number of states that a transition spans."""
         return 1 if self.horizon == 1 else 1 + self.stride
 
     @property
     def moments(self) -> int:
-        """States of a transition: the present and the next, or the only one of a domain without time."""
+        """Number of states in a transition: present and next, or a single state in a domain without time."""
         return min(self.horizon, 2)
 
 
 def expect_present(domain: Domain) -> None:
-    """Refuse domains of which nothing is observed.
+    """Refuse domains without observations.
 
     Raises:
-        UserError: naming the domain.
+        UserError: with the domain.
     """
     if not domain.observed:
         raise UserError(f"domain: expected one with observed features, found {domain.name}: there is no present to go on from")
 
 
 def expect_present_or_moment(domain: Domain) -> None:
-    """Refuse domains of which nothing is observed, unless plans are single states, which need no present.
+    """Refuse domains without observations, unless plans are single states.
 
     Raises:
-        UserError: naming the domain.
+        UserError: with the domain.
     """
     if domain.plans.horizon > 1:
         expect_present(domain)
 
 
 def expect_window(config: StepConfig, data: "PretrainingData") -> None:
-    """Refuse windows that do not hold a transition.
+    """Refuse windows that are not a transition.
 
     Raises:
-        UserError: naming the key.
+        UserError: with the key.
     """
     if data.horizon != config.window:
         raise UserError(f"data.horizon: expected {config.window} (states that a transition spans), found {data.horizon}")
 
 
 def unroll(model: ConceptModel, config: StepConfig, predict: Callable[[Tensor | None], Tensor], observed: Observed) -> Tensor:
-    """Plans ``(batch, horizon, state)`` in the domain's units.
+    """Unroll transitions to plans ``(batch, horizon, state)`` in the domain's units.
 
     Args:
-        model: whose transitions they are.
-        config: the model's.
+        model: one-step model.
+        config: its configuration.
         predict: ``observed vectors as the model sees them (batch, m) or None -> transitions (batch, moments, state)``, normalised.
         observed: features ``(batch, *shape)`` by name, in the domain's units.
     """
     if (read := model.of_images(observed)) is not None:
-        observed = {**observed, READ: read}  # of the start: what follows is imagined, and no picture shows it
+        observed = {**observed, READ: read}  # the start alone has images
     first = model.decode(predict(model.vector(observed)), observed)
     if config.horizon == 1 or (config.horizon, config.stride) == (2, 1):
         return first
     ((name, columns),) = [(name, feature.state) for name, feature in model.domain.observed.items() if feature.state]
-    present = {other: values.clone() for other, values in observed.items()}
+    present = {feature: values.clone() for feature, values in observed.items()}
     states = [observed[name][:, columns], first[:, -1]]
     while len(states) < 1 + -(-(config.horizon - 1) // config.stride):
         present[name][:, columns] = states[-1]

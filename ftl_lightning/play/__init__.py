@@ -1,1 +1,1 @@
-"""``play``: a page on one's own machine on which a person shows behaviour, sees it learned, and mixes it."""
+"""``play``: a local page on which a person demonstrates behaviour, sees it learned, and mixes it."""

@@ -1,4 +1,4 @@
-"""What the server answers, and to what."""
+"""Routes of the page's server, and the handlers of its requests."""
 
 import asyncio
 import json
@@ -24,13 +24,13 @@ from ftl_lightning.printing import line, say
 from ftl_lightning.schema import from_mapping, parse_json
 
 MOST_ASKED, MOST_OPENED = 4 * 2**20, 64 * 2**20
-"""Bytes of a question, and of a file that is opened."""
+"""Maximum bytes of a request, and of an uploaded file."""
 MOST_WAITING = 32
-"""Questions that wait for one that is being answered; more are sent away."""
+"""Maximum number of pending requests; further requests are refused."""
 WAIT = 0.5
-"""Seconds after which it is asked whether anybody still waits for what is learned."""
+"""Seconds between checks whether the client still waits for learning."""
 SERVED = "; connect-src 'self'; frame-ancestors 'none'"
-"""What a page that is served may do beside the policy of every page: ask this server."""
+"""Addition to the policy of every page: a served page may send requests to this server."""
 
 ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
     "scene": (requests.Pose, Workspace.scene),
@@ -41,7 +41,7 @@ ANSWERS: Mapping[str, tuple[type, Callable[[Workspace, Any], Any]]] = {
     "clear": (requests.Nothing, Workspace.clear),
     "sample": (requests.Sample, Workspace.sample),
 }
-"""What is posted as JSON: its form, and who answers."""
+"""Type and handler of requests with a JSON body."""
 
 MISTAKES = (
     UserError,
@@ -55,15 +55,15 @@ MISTAKES = (
     TypeError,
     ValueError,
 )
-"""What is told in one line; the server goes on."""
+"""Exceptions that are reported in one line; the server continues."""
 
 
 class Desk:
-    """The workspaces of the models that were opened, the last one of which is worked in, one question at a time.
+    """Workspaces of the opened models. Requests are handled in the current workspace, one at a time.
 
     Args:
-        models: names of those that can be opened, the first one at first.
-        make: makes the workspace of a model; called in a thread.
+        models: names of models that can be opened; the first is the initial model.
+        make: creates the workspace of a model; called in a thread.
     """
 
     def __init__(self, models: Sequence[str], make: Callable[[str], Workspace]) -> None:
@@ -74,10 +74,10 @@ class Desk:
         self.ended = threading.Event()
 
     async def work(self, do: Callable[[Workspace], Any]) -> Any:
-        """Do something in the workspace, in a thread.
+        """Call a function with the current workspace, in a thread.
 
         Raises:
-            HTTPException: where too many wait already.
+            HTTPException: if too many requests are pending.
         """
         if self._waiting >= MOST_WAITING:
             raise HTTPException(429, "too many questions at a time; wait for an answer")
@@ -94,10 +94,10 @@ class Desk:
         return self._opened[model]
 
     def open(self, model: str) -> dict[str, Any]:
-        """Turn to another model; what was done with this one is kept.
+        """Switch to another model; the workspace of the previous model is kept.
 
         Raises:
-            UserError: for a model that is none of those that can be opened.
+            UserError: for a model that cannot be opened.
         """
         if model not in self._models:
             raise UserError(f"model: expected one of {', '.join(self._models)}, found {short(model)!r}")
@@ -106,7 +106,7 @@ class Desk:
         return self.state(workspace)
 
     def state(self, workspace: Workspace) -> dict[str, Any]:
-        """What the page shows at first."""
+        """Initial state of the page."""
         return workspace.state() | {"models": [{"name": name, "title": _title(name)} for name in self._models]}
 
 
@@ -124,14 +124,14 @@ def guarded(
     end: Callable[[], None],
     begin: Begin | None = None,
 ) -> Starlette:
-    """An application that answers one page of this machine's own.
+    """Application that answers requests of a single page.
 
     Args:
-        routes: what it answers, beside ending.
-        token: that questions carry.
-        hosts: ``host:port`` by which it may be asked.
+        routes: routes besides the end of the program.
+        token: required in requests.
+        hosts: ``host:port`` that requests may name.
         end: ends the program.
-        begin: done at the beginning, while the page may be asked already; ``None`` for nothing.
+        begin: run at the start, while requests are already answered; ``None`` for nothing.
     """
 
     async def ended(request: Request) -> Response:
@@ -147,19 +147,19 @@ def guarded(
 
     every = [*routes, Route("/api/end", ended, methods=["POST"])]
     handlers: Any = {HTTPException: _refused, **dict.fromkeys(MISTAKES, _mistaken)}
-    found = Starlette(routes=every, exception_handlers=handlers, lifespan=lifespan)
-    found.add_middleware(Guard, token=token, hosts=frozenset(hosts))
-    return found
+    application = Starlette(routes=every, exception_handlers=handlers, lifespan=lifespan)
+    application.add_middleware(Guard, token=token, hosts=frozenset(hosts))
+    return application
 
 
 async def first_page(request: Request) -> Response:
-    """The page itself; what it shows it asks for."""
+    """The page itself, which requests its content afterwards."""
     nonce = secrets.token_urlsafe(16)
     return HTMLResponse(page(nonce), headers={"content-security-policy": POLICY.format(nonce=nonce) + SERVED})
 
 
 def viewing(shown: Mapping[str, Any]) -> list[Route]:
-    """Routes of a page that shows one thing: the answer to ``/api/state``."""
+    """Routes of a page with a fixed state, the answer to ``/api/state``."""
 
     async def state(request: Request) -> Response:
         return JSONResponse(shown)
@@ -168,23 +168,23 @@ def viewing(shown: Mapping[str, Any]) -> list[Route]:
 
 
 def reading(text: str) -> list[Route]:
-    """Routes of a whole page that asks for nothing."""
+    """Routes of a complete page without requests."""
 
     async def whole(request: Request) -> Response:
-        return HTMLResponse(text)  # which has a policy of its own
+        return HTMLResponse(text)  # contains its policy
 
     return [Route("/", whole)]
 
 
 def playing(desk: Desk) -> list[Route]:
-    """Routes of the page on which a person shows, learns and mixes."""
+    """Routes of the page for demonstrating, learning and mixing."""
 
     async def state(request: Request) -> Response:
         return JSONResponse(await desk.work(desk.state))
 
     async def opened(request: Request) -> Response:
-        asked = from_mapping(requests.Open, await _asked(request), "")
-        return JSONResponse(await desk.work(lambda _: desk.open(asked.model)))
+        body = from_mapping(requests.Open, await _body(request), "")
+        return JSONResponse(await desk.work(lambda _: desk.open(body.model)))
 
     async def thumbnail(request: Request) -> Response:
         return JSONResponse(await desk.work(lambda workspace: workspace.thumbnail(_id(request))))
@@ -201,18 +201,18 @@ def playing(desk: Desk) -> list[Route]:
         return JSONResponse(await desk.work(desk.state))
 
     async def forget(request: Request) -> Response:
-        asked = from_mapping(requests.Named, await _asked(request), "")
-        await desk.work(lambda workspace: workspace.forget(asked))
+        body = from_mapping(requests.Named, await _body(request), "")
+        await desk.work(lambda workspace: workspace.forget(body))
         return JSONResponse(await desk.work(desk.state))
 
     async def rename(request: Request) -> Response:
-        asked = from_mapping(requests.Renamed, await _asked(request), "")
-        await desk.work(lambda workspace: workspace.rename(asked))
+        body = from_mapping(requests.Renamed, await _body(request), "")
+        await desk.work(lambda workspace: workspace.rename(body))
         return JSONResponse(await desk.work(desk.state))
 
     async def learn(request: Request) -> Response:
-        asked = from_mapping(requests.Learn, await _asked(request), "")
-        return StreamingResponse(_learned(desk, request, asked), media_type="application/x-ndjson")
+        body = from_mapping(requests.Learn, await _body(request), "")
+        return StreamingResponse(_learned(desk, request, body), media_type="application/x-ndjson")
 
     return [
         Route("/", first_page),
@@ -233,8 +233,8 @@ def _answering(desk: Desk, name: str) -> Callable[[Request], Any]:
     kind, do = ANSWERS[name]
 
     async def answer(request: Request) -> Response:
-        asked = from_mapping(kind, await _asked(request), "")
-        return JSONResponse(await desk.work(lambda workspace: do(workspace, asked)))
+        body = from_mapping(kind, await _body(request), "")
+        return JSONResponse(await desk.work(lambda workspace: do(workspace, body)))
 
     return answer
 
@@ -243,26 +243,26 @@ def _id(request: Request) -> str:
     return request.query_params.get("id", "")
 
 
-async def _asked(request: Request) -> Any:
+async def _body(request: Request) -> Any:
     return parse_json(await body_of(request, MOST_ASKED), "a question in JSON")
 
 
 def _attached(name: str, content: bytes) -> Response:
-    told = f"attachment; filename*=UTF-8''{quote(name, safe='')}"
-    return Response(content, media_type="application/octet-stream", headers={"content-disposition": told})
+    disposition = f"attachment; filename*=UTF-8''{quote(name, safe='')}"
+    return Response(content, media_type="application/octet-stream", headers={"content-disposition": disposition})
 
 
-async def _learned(desk: Desk, request: Request, asked: requests.Learn) -> AsyncIterator[str]:
-    """What learning tells, a line each, until it is done or nobody listens."""
+async def _learned(desk: Desk, request: Request, body: requests.Learn) -> AsyncIterator[str]:
+    """Progress of learning as JSON lines, until learning ends or the client disconnects."""
     loop, lines = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any] | None]()
     stopped = threading.Event()
 
-    def tell(told: Mapping[str, Any] | None) -> None:
-        loop.call_soon_threadsafe(lines.put_nowait, None if told is None else dict(told))
+    def tell(message: Mapping[str, Any] | None) -> None:
+        loop.call_soon_threadsafe(lines.put_nowait, None if message is None else dict(message))
 
     async def work() -> None:
         try:
-            await desk.work(lambda workspace: workspace.learn(asked, tell, lambda: stopped.is_set() or desk.ended.is_set()))
+            await desk.work(lambda workspace: workspace.learn(body, tell, lambda: stopped.is_set() or desk.ended.is_set()))
         except Stopped:
             pass
         except HTTPException as error:
@@ -276,14 +276,14 @@ async def _learned(desk: Desk, request: Request, asked: requests.Learn) -> Async
     try:
         while True:
             try:
-                told = await asyncio.wait_for(lines.get(), WAIT)
+                message = await asyncio.wait_for(lines.get(), WAIT)
             except TimeoutError:
                 if await request.is_disconnected():
                     return
                 continue
-            if told is None:
+            if message is None:
                 return
-            yield json.dumps(told) + "\n"
+            yield json.dumps(message) + "\n"
             if await request.is_disconnected():
                 return
     finally:
@@ -292,20 +292,20 @@ async def _learned(desk: Desk, request: Request, asked: requests.Learn) -> Async
 
 
 def _one_line(error: Exception) -> str:
-    """What a person is told of an error; what is the program's own fault is printed where it runs."""
+    """Message of an error for the user; failures of the program are printed as well."""
     if isinstance(error, UserError):
         return line(str(error))
-    if (told := mistake_of_machine(error)) is not None:
-        return line(told)
+    if (message := mistake_of_machine(error)) is not None:
+        return line(message)
     say(f"error: {type(error).__name__}: {error}", error=True)
     return f"the program failed ({type(error).__name__}); what it printed says more"
 
 
 async def _refused(request: Request, error: Exception) -> Response:
-    status, told = (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, "broken off")
-    return JSONResponse({"error": line(str(told))}, status)
+    status, detail = (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, "broken off")
+    return JSONResponse({"error": line(str(detail))}, status)
 
 
 async def _mistaken(request: Request, error: Exception) -> Response:
-    own = isinstance(error, UserError | ClientDisconnect) or mistake_of_machine(error) is not None
-    return JSONResponse({"error": _one_line(error)}, 400 if own else 500)
+    expected = isinstance(error, UserError | ClientDisconnect) or mistake_of_machine(error) is not None
+    return JSONResponse({"error": _one_line(error)}, 400 if expected else 500)

@@ -1,4 +1,4 @@
-"""The demonstrations of one concept that a person has shown so far, by hand, from the library or from files."""
+"""Demonstrations of one concept collected on the page: by hand, from the library or from files."""
 
 import tempfile
 from dataclasses import replace
@@ -16,27 +16,27 @@ from ftl_lightning.play import requests
 from ftl_lightning.play.films import Json, film, films
 
 WANTED = 5
-"""That a person is asked for."""
+"""Number of demonstrations that the page asks for."""
 MOST, MOST_SCENES, MOST_UNDONE = 50, 50, 50
-"""Demonstrations, scenes that are remembered, and steps that can be undone."""
+"""Maximum number of demonstrations, of remembered scenes, and of changes that can be undone."""
 FILES = (".npz", ".safetensors")
-"""Endings of files of demonstrations, beside those of a domain's other programs."""
+"""Suffixes of demonstration files, besides those of a domain's other programs."""
 
 
 class Demonstrating:
-    """Demonstrations, and the scenes that more of them can be shown in.
+    """Demonstrations of one concept, and the scenes in which more can be recorded.
 
     Args:
-        model: of whose domain they are.
-        source: of the library; files of recordings may be missing.
+        model: model of the same domain.
+        source: library; files of recordings may be missing.
 
     Attributes:
-        task: that a scene or a demonstration was last asked for; empty for none.
+        task: task of the last scene or demonstration drawn; empty for none.
     """
 
     def __init__(self, model: FewShot, source: Source) -> None:
         self._model, self._domain, self._source = model, model.domain, source
-        self._own: list[tuple[int, Demonstrations]] = []
+        self._entries: list[tuple[int, Demonstrations]] = []
         self._before: list[list[tuple[int, Demonstrations]]] = []
         self._scenes: dict[int, Scene] = {}
         self._count = 0
@@ -45,12 +45,12 @@ class Demonstrating:
 
     @property
     def name(self) -> str:
-        """What the first one is called, where it came with a name; else empty."""
-        return next((own.concepts[0] for _, own in self._own if own.concepts[0]), "")
+        """Name of the first demonstration that came with a name; else empty."""
+        return next((entry.concepts[0] for _, entry in self._entries if entry.concepts[0]), "")
 
     @property
     def library(self) -> Json:
-        """Tasks of which demonstrations can be drawn, or why there are none."""
+        """Tasks whose demonstrations can be drawn, or the reason why there are none."""
         if self._library is None:
             concepts = self._domain.concepts
             known = dict.fromkeys((*concepts.training, *(goal for suite in concepts.suites.values() for goal in suite.goals)))
@@ -63,47 +63,47 @@ class Demonstrating:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Endings of files that are read."""
+        """Suffixes of readable files."""
         return (*FILES, *self._domain.imports)
 
     def told(self) -> dict[str, Any]:
-        """Films of them, what a check found in each and in all, and whether anything can be undone."""
+        """Films, findings of the check for each demonstration and for all, and whether a change can be undone."""
         flags: dict[int, list[str]] = {}
         general: list[str] = []
-        if self._own:
-            own = self.together("demonstrations")
-            found = (*check(own), *fit_findings(self._model.model, own))  # what the model knows of them takes longer
-            for finding in (one for one in found if one.severity != "note"):
+        if self._entries:
+            joined = self.together("demonstrations")
+            findings = (*check(joined), *fit_findings(self._model.model, joined))  # the latter runs the model, which takes longer
+            for finding in (item for item in findings if item.severity != "note"):
                 for row in finding.rows:
                     flags.setdefault(row, []).append(finding.text)
                 general += [] if finding.rows else [finding.text]
         shown = [
-            {"id": number, "film": films(self._domain, own)[0], "flags": flags.get(row, [])}
-            for row, (number, own) in enumerate(self._own)
+            {"id": number, "film": films(self._domain, entry)[0], "flags": flags.get(row, [])}
+            for row, (number, entry) in enumerate(self._entries)
         ]
         return {"demonstrations": shown, "check": general, "undo": bool(self._before), "wanted": WANTED}
 
     def together(self, name: str) -> Demonstrations:
-        """All of them as demonstrations of one concept.
+        """All demonstrations as those of one concept.
 
         Raises:
             UserError: if there are none.
         """
-        if not self._own:
+        if not self._entries:
             raise UserError("demonstrations: expected one or more, found none; show the model something first")
-        joined = concatenate([own for _, own in self._own])
+        joined = concatenate([entry for _, entry in self._entries])
         return replace(joined, concepts=(name,) * len(joined))
 
     def _recorder(self) -> Recorder:
-        if (found := self._domain.recorder) is None:
+        if (recorder := self._domain.recorder) is None:
             raise UserError(f"scene: expected a model whose behaviour is shown by hand, found one of {self._domain.name}")
-        return found
+        return recorder
 
     def scene(self, asked: requests.Pose) -> Json:
-        """A new scene to show something in.
+        """Draw a new scene for a demonstration.
 
         Raises:
-            UserError: in a domain where nothing is shown by hand, or for a task that has no scenes.
+            UserError: in a domain without recording by hand, or for a task without scenes.
         """
         recorder = self._recorder()
         if asked.task and asked.task not in recorder.tasks:
@@ -113,15 +113,15 @@ class Demonstrating:
         self.task = asked.task or self.task
         self._scenes[self._count] = scene
         self._scenes = dict(list(self._scenes.items())[-MOST_SCENES:])
-        pieces = [{"name": one.name, "at": list(one.at), "shapes": list(one.shapes)} for one in scene.pieces]
-        told = {"film": film(scene.film), "pieces": pieces, "speed": scene.speed, "seconds": scene.seconds}
-        return {"scene": self._count, **told}
+        pieces = [{"name": piece.name, "at": list(piece.at), "shapes": list(piece.shapes)} for piece in scene.pieces]
+        content = {"film": film(scene.film), "pieces": pieces, "speed": scene.speed, "seconds": scene.seconds}
+        return {"scene": self._count, **content}
 
     def record(self, asked: requests.Recorded) -> None:
-        """What a hand did becomes a demonstration.
+        """Add a demonstration recorded by hand.
 
         Raises:
-            UserError: for a scene that nobody asked for, or a path that shows nothing.
+            UserError: for an unknown scene, or a path that shows nothing.
         """
         recorder = self._recorder()
         if (scene := self._scenes.get(asked.scene)) is None:
@@ -129,10 +129,10 @@ class Demonstrating:
         self.add(recorder.record(scene, *expect_path(scene, asked.path, asked.seconds)))
 
     def draw(self, asked: requests.Drawn) -> None:
-        """Others from the library: an expert's, or recordings.
+        """Add demonstrations of the library: an expert's, or recordings.
 
         Raises:
-            UserError: for a task of which there are none.
+            UserError: for a task without demonstrations.
         """
         self._domain.expect_goal(asked.task, "task")
         self._count += 1
@@ -140,14 +140,14 @@ class Demonstrating:
         self.task = asked.task
 
     def read(self, name: str, content: bytes) -> None:
-        """Those of a file.
+        """Add the demonstrations of a file.
 
         Args:
-            name: of it, which says of which program it is.
-            content: its bytes.
+            name: file name, whose suffix determines the program.
+            content: bytes of the file.
 
         Raises:
-            UserError: for a file of no such program or of another domain, or a damaged one.
+            UserError: for an unknown program, another domain, or a damaged file.
         """
         ending, stem = Path(name).suffix.lower(), Path(name).stem
         with tempfile.TemporaryDirectory() as folder:
@@ -156,48 +156,48 @@ class Demonstrating:
             try:
                 imports = self._domain.imports.get(ending)
                 self.add(self._model.demonstrations((imports or Demonstrations.load)(path), name=stem))
-            except UserError as error:  # which names a file that the person does not know
-                told = str(error).replace(str(path), short(Path(name).name))
-                told = told if told.startswith(short(Path(name).name)) else f"{short(Path(name).name)}: {told}"
-                raise UserError(told) from error
+            except UserError as error:  # names a file that the user does not know
+                message = str(error).replace(str(path), short(Path(name).name))
+                message = message if message.startswith(short(Path(name).name)) else f"{short(Path(name).name)}: {message}"
+                raise UserError(message) from error
 
     def add(self, more: Demonstrations) -> None:
-        """Take further ones, each on its own.
+        """Append demonstrations as separate entries.
 
         Raises:
-            UserError: where they become too many.
+            UserError: if there are too many.
         """
-        if len(self._own) + len(more) > MOST:
-            raise UserError(f"demonstrations: expected at most {MOST} of a concept, found {len(self._own) + len(more)}")
+        if len(self._entries) + len(more) > MOST:
+            raise UserError(f"demonstrations: expected at most {MOST} of a concept, found {len(self._entries) + len(more)}")
         self._keep()
         for row in range(len(more)):
             self._count += 1
-            self._own.append((self._count, more.rows([row])))
+            self._entries.append((self._count, more.rows([row])))
 
     def _keep(self) -> None:
-        self._before = [*self._before, list(self._own)][-MOST_UNDONE:]
+        self._before = [*self._before, list(self._entries)][-MOST_UNDONE:]
 
     def remove(self, asked: requests.One) -> None:
-        """Go on without one.
+        """Remove a demonstration.
 
         Raises:
-            UserError: if it is not there.
+            UserError: if it does not exist.
         """
-        if all(number != asked.id for number, _ in self._own):
+        if all(number != asked.id for number, _ in self._entries):
             raise UserError(f"id: expected a demonstration that is there, found {asked.id}")
         self._keep()
-        self._own = [(number, own) for number, own in self._own if number != asked.id]
+        self._entries = [(number, entry) for number, entry in self._entries if number != asked.id]
 
     def undo(self) -> None:
-        """Go back to what was there before the last change."""
+        """Undo the last change."""
         if self._before:
-            self._own = self._before.pop()
+            self._entries = self._before.pop()
 
     def clear(self) -> None:
-        """Go on without any."""
-        if self._own:
+        """Remove all demonstrations."""
+        if self._entries:
             self._keep()
-        self._own = []
+        self._entries = []
 
 
 def as_npz(own: Demonstrations) -> bytes:

@@ -1,4 +1,4 @@
-"""Films as the page takes them: JSON of shapes, or of bodies in space."""
+"""Films as JSON for the page: shapes, or bodies in space."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,9 +21,9 @@ def film(drawn: VectorFilm, right: bool | None = None, told: str = "") -> Json:
     """A film of shapes.
 
     Args:
-        drawn: its shapes.
-        right: whether what it shows is; ``None`` where nobody judged.
-        told: how it ended, in words.
+        drawn: shapes of the film.
+        right: whether the behaviour is correct; ``None`` if not judged.
+        told: outcome in words.
     """
     window = [round(edge, 4) for edge in drawn.window]
     return {
@@ -42,8 +42,8 @@ def plan_film(show: Show, states: Tensor, starts: InitialStates | None, right: b
     Args:
         show: the domain's pictures.
         states: ``(time, state)``, finite.
-        starts: where it starts, one; ``None`` in domains without initial states.
-        right: whether it is; ``None`` where nobody judged.
+        starts: a single initial state; ``None`` in domains without initial states.
+        right: whether the plan is correct; ``None`` if not judged.
     """
     if show.wireframe is not None:
         body = show.wireframe(states)
@@ -52,7 +52,7 @@ def plan_film(show: Show, states: Tensor, starts: InitialStates | None, right: b
 
 
 def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = None) -> list[Json]:
-    """Those of all demonstrations or samples; what is not finite has none."""
+    """Films of all demonstrations or samples with finite states."""
     starts, observed = plans.initial_states, bool(domain.observed)
     return [
         plan_film(
@@ -67,12 +67,12 @@ def films(domain: Domain, plans: Demonstrations, right: Sequence[bool] | None = 
 
 
 def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tensor]) -> list[Json]:
-    """Those of executed episodes, in domains that draw them.
+    """Films of executed episodes; empty in domains that do not draw them.
 
     Args:
-        domain: with an environment.
-        rollout: what happened.
-        outcomes: of each episode by name, of bool or numbers ``(episode,)``; empty where nobody judged.
+        domain: domain with an environment.
+        rollout: executed episodes.
+        outcomes: of each episode by name, of bool or numbers ``(episode,)``; empty if not judged.
     """
     draw = None if domain.closed_loop is None else domain.closed_loop.vector_film
     if draw is None:
@@ -89,6 +89,6 @@ def episode_films(domain: Domain, rollout: Rollout, outcomes: Mapping[str, Tenso
 
 
 def _ended(outcomes: Mapping[str, Tensor], number: int) -> str:
-    """What came true in an episode, in words."""
+    """True outcomes of an episode, in words."""
     judged = {name: bool(values[number]) for name, values in outcomes.items() if values.dtype == torch.bool}
     return ", ".join(name for name, true in judged.items() if true) or (f"no {SUCCESS}" if SUCCESS in judged else "")

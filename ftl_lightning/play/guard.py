@@ -1,4 +1,4 @@
-"""Who may ask the server: this machine's own page, with its token, in questions of a bounded size."""
+"""Access control of the server: only this machine's page, with its token, in requests of bounded size."""
 
 import asyncio
 import hmac
@@ -13,9 +13,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ftl_lightning.errors import short
 
 TOKEN = "x-token"
-"""The header that every question but the first carries."""
+"""Header required in every request but the first."""
 SECONDS = 30.0
-"""That a question's bytes may take."""
+"""Maximum seconds to receive a request."""
 HEADERS: Mapping[str, str] = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
@@ -24,17 +24,17 @@ HEADERS: Mapping[str, str] = {
     "cross-origin-resource-policy": "same-origin",
     "x-frame-options": "DENY",
 }
-"""Of every answer."""
+"""Headers of every answer."""
 
 
 class Guard:
-    """Turns away what does not come from the page: other hosts' names (which a name server may point here), pages of other
-    origins, and whoever does not know the token.
+    """Refuse requests that are not from the page: with other host names (which a name server may point here), from pages of other
+    origins, or without the token.
 
     Args:
-        app: that answers the others.
-        token: of this run.
-        hosts: ``host:port`` by which the server may be asked.
+        app: answers the accepted requests.
+        token: token of this run.
+        hosts: ``host:port`` that requests may name.
     """
 
     def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
@@ -50,20 +50,20 @@ class Guard:
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *own]}
+                extra = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+                message = {**message, "headers": [*message["headers"], *extra]}
             await send(message)
 
-        if (told := self._refusal(scope)) is None:
+        if (refusal := self._refusal(scope)) is None:
             await self._app(scope, receive, with_headers)
             return
-        body = json.dumps({"error": told}).encode()
+        body = json.dumps({"error": refusal}).encode()
         headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()), (b"connection", b"close")]
         await with_headers({"type": "http.response.start", "status": 403, "headers": headers})
         await send({"type": "http.response.body", "body": body})
 
     def _refusal(self, scope: Scope) -> str | None:
-        """Why a question is turned away; ``None`` if it is not."""
+        """Reason for refusing a request; ``None`` if it is accepted."""
         headers: dict[str, list[str]] = {}
         for name, value in scope["headers"]:
             headers.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
@@ -82,22 +82,22 @@ class Guard:
 
 
 async def body_of(request: Request, most: int) -> bytes:
-    """The bytes of a question.
+    """Read the bytes of a request.
 
     Raises:
-        HTTPException: where there are more than ``most``, or they take too long.
+        HTTPException: for more than ``most`` bytes, or if they take too long.
     """
-    told = f"expected at most {most // 2**20} MB, found more"
+    message = f"expected at most {most // 2**20} MB, found more"
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > most:
-        raise HTTPException(413, told)
+        raise HTTPException(413, message)
     content = bytearray()
     try:
         async with asyncio.timeout(SECONDS):
             async for part in request.stream():
                 content += part
                 if len(content) > most:
-                    raise HTTPException(413, told)
+                    raise HTTPException(413, message)
     except TimeoutError as error:
         raise HTTPException(408, f"expected a whole question within {SECONDS:.0f} seconds, found a part") from error
     return bytes(content)

@@ -1,4 +1,4 @@
-"""Samples of mixed concepts as films, judged where somebody can judge them."""
+"""Films of samples of mixed concepts, judged where the domain can judge."""
 
 import functools
 import operator
@@ -20,19 +20,19 @@ from ftl_lightning.play.requests import Sample
 from ftl_lightning.play.same import Sampled
 
 STEPS = 10
-"""Of the sampler, at most: a slider that moves wants an answer at once."""
+"""Maximum number of sampling steps, so that a moving slider is answered at once."""
 JOINED = " and "
-"""Between the names of mixed concepts, for domains that read such a text as a goal."""
+"""Separator of the names of mixed concepts, for domains that read the result as a goal."""
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Concepts that are mixed.
+    """Concepts of a mixture.
 
     Attributes:
-        concepts: as they are mixed, their weights included.
-        names: of each.
-        examples: demonstrations of those that were learned here.
+        concepts: compositions multiplied by their weights.
+        names: name of each concept.
+        examples: demonstrations of concepts learned here.
     """
 
     concepts: Sequence[Composition]
@@ -41,22 +41,22 @@ class Mixture:
 
     @property
     def mixed(self) -> Composition:
-        """Their sum."""
+        """Sum of the concepts."""
         return functools.reduce(operator.add, self.concepts)
 
 
 def sampling_of(model: FewShot, temperature: float | None = None) -> dict[str, Any]:
-    """How samples are made while a person waits: the tuned sampler with few steps, or a quick one in its place."""
+    """Settings of interactive sampling: the tuned sampler with few steps, or a fast sampler in its place."""
     tuned = model.tuned.sampling
     steps = min(tuned.steps, STEPS) if tuned.sampler == "dpm_solver" else STEPS
     return {"sampler": "dpm_solver", "steps": steps, "temperature": tuned.temperature if temperature is None else temperature}
 
 
 def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tuple[str, InitialStates | None]:
-    """Where samples start, and of which task that is: the first that the domain reads; nothing in domains without initial states.
+    """Initial states of samples, and their task: the first that the domain reads; empty in domains without initial states.
 
     Raises:
-        UserError: if it reads none of them.
+        UserError: if the domain reads none of the tasks.
     """
     if not model.domain.observed:
         return "", None
@@ -67,27 +67,27 @@ def starts_of(model: FewShot, tasks: Sequence[str], count: int, seed: int) -> tu
 
 
 def goal_of(domain: Domain, names: Sequence[str], task: str) -> str:
-    """What a mix is judged by: its names joined where the domain reads that, or the task whose scenes were asked for.
+    """Goal by which a mixture is judged: the joined names if the domain reads them, else the requested task.
 
-    Empty where nobody can say.
+    Empty if samples cannot be judged.
     """
     reads = domain.concepts.reads
     return next((text for text in (JOINED.join(names), task) if text and reads(text)), "")
 
 
 def judge_of(model: FewShot, examples: Sequence[Demonstrations]) -> Domain:
-    """The domain that judges samples: of a user's own data with these demonstrations of new concepts beside those of training."""
+    """Domain that judges samples: of a user's data, with demonstrations of new concepts beside those of training."""
     base = model.model.examples
     return judging_domain(model.model, [*([] if base is None else [base]), *examples])
 
 
 def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json], str]:
-    """Films of samples, and what share of them is right, in words; empty where nobody judges.
+    """Films of samples, and the fraction of correct samples in words; empty if not judged.
 
     Args:
-        domain: that judges.
+        domain: domain that judges.
         plans: samples.
-        goal: what they are judged by; empty for nothing.
+        goal: goal of the samples; empty for none.
     """
     if goal and domain.metrics:
         measured = domain.measure(goal, plans.states, plans.initial_states)
@@ -99,19 +99,19 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> tuple[list[Json]
 
 
 def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str]) -> tuple[list[Json], str, Sampled]:
-    """Samples of a mix, or episodes in which it is executed.
+    """Generate samples of a mixture, or episodes that execute it.
 
     Args:
-        model: that generates them.
-        mixture: of what.
-        asked: how many, and how.
-        tasks: whose initial states they may start from, the first that the domain reads.
+        model: generates the samples.
+        mixture: concepts of the mixture.
+        asked: number of samples, and settings.
+        tasks: tasks for initial states; the first that the domain reads is used.
 
     Returns:
-        Films, what is right in words, and how they were made.
+        Films, the judgement in words, and the settings of sampling.
 
     Raises:
-        UserError: for a task that the domain does not read, or what cannot be executed.
+        UserError: for a task that the domain does not read, or if behaviour cannot be executed.
     """
     judge = judge_of(model, mixture.examples)
     if asked.task:
@@ -121,13 +121,13 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
     goal = goal_of(judge, mixture.names, asked.task)
     if not asked.execute:
         plans = model.sample(mixture.mixed, asked.count, starts, seed=asked.seed, **how)
-        shown, told = judged(judge, plans, goal)
+        shown, verdict = judged(judge, plans, goal)
     elif starts is None:
         raise UserError(f"execute: expected a model whose behaviour is executed, found one of {model.domain.name}")
     else:
         done = model.execute(mixture.mixed, starts, goal, seed=asked.seed, **how)
         outcomes: Mapping[str, torch.Tensor] = model.domain.judge(goal, done.rollout) if goal else {}
         shown = episode_films(model.domain, done.rollout, outcomes)
-        told = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())
-        told = f"mean of {asked.count}: {told} ({goal})" if told else ""
-    return shown, told, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)
+        verdict = ", ".join(f"{name} {value:.2f}" for name, value in done.outcomes.items())
+        verdict = f"mean of {asked.count}: {verdict} ({goal})" if verdict else ""
+    return shown, verdict, Sampled(count=asked.count, seed=asked.seed, task=task, execute=asked.execute, **how)

@@ -1,4 +1,4 @@
-"""The page without a program: recorded demonstrations, and samples that were made before for a grid of weights."""
+"""The page without a server: recorded demonstrations, and precomputed samples for a grid of weights."""
 
 import gzip
 import itertools
@@ -14,31 +14,31 @@ from ftl_lightning.play.workspace import Workspace
 from ftl_lightning.tensor_file import bytes_hash, write_text
 
 WEIGHTS = (0.0, 0.5, 1.0, 1.5)
-"""Of each concept of a pair."""
+"""Weights of each concept of a pair."""
 PAIRS, OTHERS = 4, 3
-"""Pairs of concepts of a page, and training concepts that a learned one is mixed with."""
+"""Maximum number of pairs of concepts, and of training concepts mixed with a learned concept."""
 COUNT = 8
-"""Samples of each mix."""
+"""Number of samples of each mixture."""
 
 
 def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Which concepts are mixed, by their names on the page: learned ones with some training concepts and with one another; without
-    any, those of training.
+    """Pairs of concepts to mix, by their identifiers on the page: learned concepts with training concepts and with each other, or
+    training concepts if none are learned.
 
     Args:
-        concepts: as a workspace lists them.
-        named: pairs of their texts in place of these.
+        concepts: list of concepts of a workspace.
+        named: pairs of concept names that replace the default pairs.
 
     Raises:
-        UserError: for a text that is none of theirs.
+        UserError: for an unknown name.
     """
     if named:
-        by_name = {one["name"]: one["id"] for one in concepts}
+        by_name = {concept["name"]: concept["id"] for concept in concepts}
         if unknown := [name for name in itertools.chain(*named) if name not in by_name]:
             raise UserError(f"pairs: expected concepts of the model, found {short(unknown[0])!r}; the verb concepts lists them")
-        return [(by_name[one], by_name[other]) for one, other in named]
-    learned = [one["id"] for one in concepts if one["kind"] != "training"]
-    training = [one["id"] for one in concepts if one["kind"] == "training"]
+        return [(by_name[first], by_name[second]) for first, second in named]
+    learned = [concept["id"] for concept in concepts if concept["kind"] != "training"]
+    training = [concept["id"] for concept in concepts if concept["kind"] == "training"]
     if not learned:
         return list(itertools.combinations(training[: OTHERS + 1], 2))[:PAIRS]
     mixed = itertools.chain(zip(itertools.repeat(learned[0]), training[:OTHERS]), itertools.combinations(learned, 2))
@@ -48,29 +48,29 @@ def pairs_of(concepts: Sequence[dict[str, Any]], named: Sequence[tuple[str, str]
 def answers_of(
     workspace: Workspace, pairs: Sequence[tuple[str, str]] = (), tell: Callable[[], None] = lambda: None
 ) -> dict[str, Any]:
-    """What the page would ask the program, by the name of the question.
+    """Answers to all requests of the page, by request key.
 
     Args:
-        workspace: with the demonstrations and concepts that are shown.
-        pairs: of concepts by their texts; by default see :func:`pairs_of`.
-        tell: called after each mix.
+        workspace: workspace with the demonstrations and concepts to show.
+        pairs: pairs of concept names; by default see :func:`pairs_of`.
+        tell: called after each mixture.
     """
     state = workspace.state()
     mixes = pairs_of(state["concepts"], pairs)
     shown = set(itertools.chain(*mixes))
-    concepts = [one for one in state["concepts"] if one["id"] in shown]
+    concepts = [concept for concept in state["concepts"] if concept["id"] in shown]
     offline = {"weights": list(WEIGHTS), "pairs": [list(pair) for pair in mixes]}
-    found: dict[str, Any] = {"/api/state": state | {"concepts": concepts, "models": [], "offline": offline}}
-    for one in concepts:
-        found[request_key(f"/api/thumbnail?id={one['id']}")] = workspace.thumbnail(one["id"])
+    answers: dict[str, Any] = {"/api/state": state | {"concepts": concepts, "models": [], "offline": offline}}
+    for concept in concepts:
+        answers[request_key(f"/api/thumbnail?id={concept['id']}")] = workspace.thumbnail(concept["id"])
     for pair in mixes:
         for weights in itertools.product(WEIGHTS, repeat=2):
             mixed = tuple(requests.Mixed(key, weight) for key, weight in zip(pair, weights, strict=True))
             parts = [{"id": part.id, "weight": part.weight, "groups": []} for part in mixed]
-            asked = {"parts": parts, "count": COUNT, "seed": 0, "temperature": state["temperature"], "execute": False, "task": ""}
-            found[request_key("/api/sample", asked)] = workspace.sample(requests.Sample(mixed, COUNT)) | {"seconds": 0}
+            body = {"parts": parts, "count": COUNT, "seed": 0, "temperature": state["temperature"], "execute": False, "task": ""}
+            answers[request_key("/api/sample", body)] = workspace.sample(requests.Sample(mixed, COUNT)) | {"seconds": 0}
             tell()
-    return found
+    return answers
 
 
 def write_offline(
@@ -79,13 +79,13 @@ def write_offline(
     """Write the page; the same samples give the same bytes.
 
     Args:
-        workspace: with the demonstrations and concepts that are shown.
-        path: of the HTML file.
-        pairs: as of :func:`answers_of`.
-        tell: called after each mix.
+        workspace: workspace with the demonstrations and concepts to show.
+        path: path of the HTML file.
+        pairs: as in :func:`answers_of`.
+        tell: called after each mixture.
 
     Returns:
-        Its size in bytes.
+        Size of the page in bytes.
     """
     content = json.dumps(answers_of(workspace, pairs, tell), separators=(",", ":")).encode()
     text = page(bytes_hash(content), gzip.compress(content, mtime=0))

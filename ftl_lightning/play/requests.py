@@ -1,4 +1,4 @@
-"""What the page may ask for, as it stands in a request's JSON."""
+"""Requests of the page, as read from JSON."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,15 +7,15 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.ranges import expect_count, expect_factor, expect_range
 
 MOST_SAMPLES, MOST_DRAWN, MOST_PARTS, MOST_NAME = 64, 20, 12, 100
-"""Samples at a time, demonstrations drawn at a time, concepts in a mix, and letters of a name."""
+"""Maximum number of samples and of drawn demonstrations per request, of concepts in a mixture, and of letters in a name."""
 MOST_TEMPERATURE = 4.0
 
 
 def expect_name(name: str) -> None:
-    """Refuse a name that is none.
+    """Refuse an invalid name.
 
     Raises:
-        UserError: for an empty or long one, or letters that cannot be printed.
+        UserError: for an empty or too long name, or letters that cannot be printed.
     """
     if not 1 <= len(name.strip()) <= MOST_NAME or not name.isprintable():
         raise UserError(f"name: expected 1 to {MOST_NAME} letters, found {len(name)}")
@@ -23,26 +23,26 @@ def expect_name(name: str) -> None:
 
 @dataclass(frozen=True)
 class Open:
-    """Another model, by name."""
+    """Open a model, by name."""
 
     model: str
 
 
 @dataclass(frozen=True)
 class Pose:
-    """A new scene to show something in, of a task where scenes differ."""
+    """Draw a new scene, of a task where scenes differ."""
 
     task: str = ""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a hand did.
+    """Demonstration recorded by hand.
 
     Attributes:
-        scene: number of the scene that it was done in.
-        path: places ``(step, piece, 2)`` in the film's unit.
-        seconds: of each step, from any zero.
+        scene: number of the scene.
+        path: positions ``(step, piece, 2)`` in the film's unit.
+        seconds: time of each step, from any zero.
     """
 
     scene: int
@@ -52,7 +52,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Demonstrations from the library."""
+    """Draw demonstrations from the library."""
 
     task: str
     count: int = 5
@@ -70,14 +70,14 @@ class One:
 
 @dataclass(frozen=True)
 class Named:
-    """A concept by its name on the page."""
+    """A concept, by its identifier on the page."""
 
     id: str
 
 
 @dataclass(frozen=True)
 class Renamed:
-    """Another name for a concept that was learned or opened here."""
+    """New name of a concept that was learned or opened here."""
 
     id: str
     name: str
@@ -88,16 +88,16 @@ class Renamed:
 
 @dataclass(frozen=True)
 class Nothing:
-    """No more than the address says."""
+    """Request without content."""
 
 
 @dataclass(frozen=True)
 class Learn:
-    """Learn from the demonstrations that are there.
+    """Learn from the current demonstrations.
 
     Attributes:
-        name: of the concept.
-        quick: in the paper's form and until little changes; else in the form that the demonstrations ask for.
+        name: name of the concept.
+        quick: learn in the paper's form until little changes; else in the form selected by the demonstrations.
     """
 
     name: str
@@ -109,7 +109,7 @@ class Learn:
 
 @dataclass(frozen=True)
 class Mixed:
-    """A concept in a mix, by its name on the page, with a weight that multiplies its own, on some groups of columns or all."""
+    """A concept of a mixture, by its identifier on the page, with a factor of its weight, on some groups of columns or all."""
 
     id: str
     weight: float = 1.0
@@ -121,15 +121,15 @@ class Mixed:
 
 @dataclass(frozen=True)
 class Sample:
-    """Samples of a mix.
+    """Generate samples of a mixture.
 
     Attributes:
-        parts: what is mixed.
-        count: of samples.
-        seed: of the noise and of what samples start from.
-        temperature: of the sampler; ``None`` for the tuned one.
-        execute: whether they are executed in closed loop.
-        task: whose initial states they start from; empty for a usual one.
+        parts: concepts of the mixture.
+        count: number of samples.
+        seed: seed of the noise and of the initial states.
+        temperature: temperature of the sampler; ``None`` for the tuned value.
+        execute: whether samples are executed in closed loop.
+        task: task of the initial states; empty for the default.
     """
 
     parts: Sequence[Mixed]

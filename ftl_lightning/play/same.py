@@ -1,4 +1,4 @@
-"""What was done on the page, as Python and as commands that give the same numbers."""
+"""Python code and commands that reproduce the results of the page, with equal numbers."""
 
 import keyword
 import re
@@ -11,9 +11,9 @@ from ftl_lightning.concepts.concept import file_name
 from ftl_lightning.learning.inversion_settings import INVERSION
 
 FOLDER = "concepts"
-"""Where commands write learned concepts."""
+"""Folder to which commands write learned concepts."""
 VARIABLES = frozenset({"model", "mixed", "starts", "samples", "episodes", *keyword.kwlist})
-"""Names that a concept's variable may not have."""
+"""Names that are not allowed as a concept's variable."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class Learned:
     """A concept that was learned on the page.
 
     Attributes:
-        name: under which it was learned, which decides where learning starts.
-        label: its name on the page, which may have been changed.
-        changes: settings that differ from those that go with the model.
-        steps: of gradient descent; ``None`` for the tuned number.
+        name: name during learning, which determines where learning starts.
+        label: current name on the page.
+        changes: settings that differ from the model's.
+        steps: number of gradient steps; ``None`` for the tuned number.
     """
 
     name: str
@@ -34,31 +34,31 @@ class Learned:
 
     @property
     def variable(self) -> str:
-        """A name that Python takes."""
+        """Valid Python name."""
         word = re.sub(r"\W+", "_", self.label.lower()).strip("_") or "concept"
         return f"_{word}" if word[0].isdigit() else word
 
     @property
     def file(self) -> str:
-        """Of the concept, that the page downloads."""
+        """Name of the concept's file downloaded from the page."""
         return f"{self.variable}.safetensors"
 
     @property
     def demonstrations(self) -> str:
-        """File of them that the page downloads."""
+        """Name of the demonstrations' file downloaded from the page."""
         return f"{self.variable}.npz"
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of what is mixed.
+    """A term of a mixture.
 
     Attributes:
-        text: of a training concept, or the name of a learned one.
-        weight: that multiplies its own.
-        groups: of columns that it is on; all where empty.
-        learned: how it was learned; ``None`` for a training concept.
-        file: of a concept that was neither learned here nor in pretraining; empty for others.
+        text: text of a training concept, or name of a learned concept.
+        weight: factor of the concept's weight.
+        groups: groups of columns on which the concept acts; empty for all.
+        learned: how the concept was learned here; else ``None``.
+        file: file of a concept that was neither learned here nor in pretraining; else empty.
     """
 
     text: str
@@ -70,12 +70,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Sampled:
-    """How samples were made.
+    """Settings of sampling.
 
     Attributes:
-        count, seed, temperature, sampler, steps: as of ``FewShot.sample``.
-        task: whose initial states they start from; empty in domains without any.
-        execute: whether they were executed in closed loop.
+        count, seed, temperature, sampler, steps: as in ``FewShot.sample``.
+        task: task of the initial states; empty in domains without any.
+        execute: whether samples were executed in closed loop.
     """
 
     count: int
@@ -88,20 +88,20 @@ class Sampled:
 
 
 def python(model: str, parts: Sequence[Part], how: Sampled | None) -> str:
-    """A script.
+    """Python script.
 
     Args:
         model: name or folder.
-        parts: that were mixed, or what was learned.
-        how: samples were made; ``None`` for none.
+        parts: terms of the mixture, or the learned concept.
+        how: settings of sampling; ``None`` for no samples.
     """
     learned = list({part.learned.variable: part.learned for part in parts if part.learned}.values())
     lines = ["from ftl_lightning import FewShot"]
     lines += ["from ftl_lightning.demonstrations import Demonstrations"] if learned else []
     lines += ["", f"model = FewShot.from_pretrained({model!r})"]
-    for one in learned:
-        told = "".join(f", {key}={value!r}" for key, value in _settings(one).items())
-        lines.append(f"{one.variable} = model.learn(Demonstrations.load({one.demonstrations!r}), name={one.name!r}{told})")
+    for entry in learned:
+        args = "".join(f", {key}={value!r}" for key, value in _settings(entry).items())
+        lines.append(f"{entry.variable} = model.learn(Demonstrations.load({entry.demonstrations!r}), name={entry.name!r}{args})")
     if how is not None and parts:
         grouped = any(part.groups for part in parts)
         mixed = f"model.compose({composed(parts)!r})" if grouped and not learned else " + ".join(map(_term, parts))
@@ -134,30 +134,30 @@ def _term(part: Part) -> str:
 
 
 def composed(parts: Sequence[Part]) -> str:
-    """As ``--compose`` takes it."""
-    told = []
+    """Text for ``--compose``."""
+    terms = []
     for part in parts:
         name = f"{FOLDER}/{file_name(part.learned.name)}.safetensors" if part.learned else part.file or part.text
         at = f"@{','.join(part.groups)}" if part.groups else ""
-        told.append(f"{name}{at}:{part.weight:g}")
-    return " + ".join(told)
+        terms.append(f"{name}{at}:{part.weight:g}")
+    return " + ".join(terms)
 
 
 def command(model: str, configuration: str, parts: Sequence[Part], how: Sampled | None) -> str:
-    """Commands.
+    """Shell commands.
 
     Args:
         model: name or folder.
-        configuration: file of ``invert`` that goes with it.
-        parts, how: as of :func:`python`.
+        configuration: file of ``invert`` for the model.
+        parts, how: as in :func:`python`.
     """
     lines = []
-    for one in {part.learned.variable: part.learned for part in parts if part.learned}.values():
+    for entry in {part.learned.variable: part.learned for part in parts if part.learned}.values():
         words = ["python", "-m", "ftl_lightning", "invert", "--config", configuration, "--model.pretrained", model]
-        words += ["--data.demonstrations", one.demonstrations, "--model.output", FOLDER]
-        for key, value in one.changes.items():
+        words += ["--data.demonstrations", entry.demonstrations, "--model.output", FOLDER]
+        for key, value in entry.changes.items():
             words += [f"--model.{INVERSION.get(key, key)}", str(value)]
-        words += [] if one.steps is None else ["--data.steps", str(one.steps)]
+        words += [] if entry.steps is None else ["--data.steps", str(entry.steps)]
         lines.append(shlex.join(words))
     if how is not None and parts:
         words = ["python", "-m", "ftl_lightning", "sample", "--pretrained", model, "--compose", composed(parts)]

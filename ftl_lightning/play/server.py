@@ -1,4 +1,4 @@
-"""Serving the page on this machine, until the person ends it."""
+"""Serve the page on this machine until the user ends the program."""
 
 import contextlib
 import ipaddress
@@ -18,19 +18,19 @@ from ftl_lightning.printing import say
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765
-"""Unless another program has it."""
+"""Default port, unless another program uses it."""
 MOST_CONNECTIONS, IDLE, PATIENCE = 200, 5, 3
-"""Connections at a time, seconds that an idle one is kept, and that the last answers may take when the program ends."""
+"""Maximum number of connections, seconds before an idle connection is closed, and seconds for the last answers at the end."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a page is served.
+    """Address of a page.
 
     Attributes:
-        host: address to listen at; any but the loopback address lets other machines in, which is told.
-        port: 0 for :data:`PORT`, or any other if that is taken.
-        browser: whether a browser is opened.
+        host: address to listen on; any but the loopback address admits other machines, with a warning.
+        port: port number; 0 for :data:`PORT`, or any free port if that is in use.
+        browser: whether to open a browser.
     """
 
     host: str = LOOPBACK
@@ -44,16 +44,16 @@ def serve(
     begin: Begin | None = None,
     close: Callable[[], None] = lambda: None,
 ) -> None:
-    """Serve a page until Ctrl-C, or until it is told on the page to end.
+    """Serve a page until Ctrl-C, or until the page ends the program.
 
     Args:
-        routes: what is answered.
-        place: where.
-        begin: done at the beginning, while the page may be asked already.
+        routes: routes of the page.
+        place: address of the page.
+        begin: run at the start, while requests are already answered.
         close: called when the program ends.
 
     Raises:
-        UserError: for an address that cannot be had.
+        UserError: if the address is not available.
     """
     listening = _listening(place.host, place.port)
     port, names, token = listening.getsockname()[1], _names(place.host), secrets.token_urlsafe(24)
@@ -72,8 +72,8 @@ def serve(
     address = f"http://{hosts[0]}/?token={token}"
     say(f"open {address}\nCtrl-C ends the program")
     if not ipaddress.ip_address(place.host).is_loopback:
-        told = f"http://{hosts[-1]}/?token={token}"
-        say(f"warning: other machines of this network reach it at {told}; whoever has this address can use the program", error=True)
+        link = f"http://{hosts[-1]}/?token={token}"
+        say(f"warning: other machines of this network reach it at {link}; whoever has this address can use the program", error=True)
     if place.browser:
         webbrowser.open(address)
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
@@ -82,10 +82,10 @@ def serve(
 
 
 class _Server(uvicorn.Server):
-    """Stops what runs before it waits for the last answers.
+    """Server that stops running work before it waits for the last answers.
 
     Args:
-        config: of the server.
+        config: settings of the server.
         close: called first when the program ends.
     """
 
@@ -99,48 +99,48 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """At Ctrl-C, as uvicorn names it."""
+        """Handle Ctrl-C; the name is that of uvicorn."""
         self._close()
         super().handle_exit(sig, frame)
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    """A socket at an address."""
+    """Socket that listens on an address."""
     try:
         family = socket.AF_INET6 if ipaddress.ip_address(host).version == 6 else socket.AF_INET
     except ValueError as error:
         raise UserError(f"host: expected an address such as {LOOPBACK} or 0.0.0.0, found {short(host)!r}") from error
     last: OSError | None = None
     for wanted in (port,) if port else (PORT, 0):
-        found = socket.socket(family)
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener = socket.socket(family)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            found.bind((host, wanted))
-            found.listen()  # from when its address is told
+            listener.bind((host, wanted))
+            listener.listen()  # before the address is printed
         except (OSError, OverflowError) as error:
-            found.close()
+            listener.close()
             last = error if isinstance(error, OSError) else OSError(str(error))
             continue
-        return found
-    told = last.strerror or str(last) if last else ""
-    raise UserError(f"host, port: expected an address that is free, found {host}:{port} ({told}); choose another port")
+        return listener
+    reason = last.strerror or str(last) if last else ""
+    raise UserError(f"host, port: expected an address that is free, found {host}:{port} ({reason}); choose another port")
 
 
 def _names(host: str) -> list[str]:
-    """By which the server may be asked, this machine's own first."""
+    """Accepted host names; the first is used on this machine."""
     bracketed = f"[{host}]" if ":" in host else host
     if ipaddress.ip_address(host).is_unspecified:
-        return [LOOPBACK, "localhost", _own_address()]
+        return [LOOPBACK, "localhost", _network_address()]
     if ipaddress.ip_address(host).is_loopback:
         return [bracketed, "localhost"]
     return [bracketed]
 
 
-def _own_address() -> str:
-    """Address of this machine in its network; nothing is sent to find it."""
+def _network_address() -> str:
+    """Address of this machine in its network; determined without sending anything."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # an address that belongs to nobody (RFC 5737)
+            probe.connect(("192.0.2.1", 9))  # a reserved address (RFC 5737)
         except OSError:
             return socket.gethostname()
         return str(probe.getsockname()[0])

@@ -1,4 +1,4 @@
-"""What ``view`` shows of a file: films of its demonstrations by concept with what a check found, or of a concept's samples."""
+"""Content of ``view``: films of demonstrations by concept with the findings of a check, or of the samples of a concept."""
 
 import tempfile
 from pathlib import Path
@@ -18,15 +18,15 @@ from ftl_lightning.play.mixing import sampling_of, starts_of
 from ftl_lightning.tensor_file import kind_of, visible
 
 MOST_SHOWN, MOST_CONCEPTS = 60, 100
-"""Films of a concept, and concepts; of more the first."""
+"""Maximum number of films per concept, and of concepts; the first are shown."""
 SAMPLES = 16
-"""Of a learned concept."""
+"""Number of samples of a learned concept."""
 HEADER = 16 * 2**20
-"""Bytes of a file that are read to say of what kind it is."""
+"""Maximum bytes read to determine the kind of a file."""
 
 
 def holds_results(file: str) -> bool:
-    """Whether a file, or a folder, is one of results."""
+    """Whether a file or folder contains results."""
     path = Path(file)
     return path.suffix == ".csv" or (path.is_dir() and bool(visible(path, "**/*.csv")))
 
@@ -35,7 +35,7 @@ def results_page(file: str) -> str:
     """The page of ``report --html`` of some results.
 
     Raises:
-        UserError: if there are none.
+        UserError: if there are no results.
     """
     from ftl_lightning.reporting.html.page import write_page
 
@@ -46,11 +46,11 @@ def results_page(file: str) -> str:
 
 
 def viewed(file: str, model: str = "") -> dict[str, Any]:
-    """What the page shows of a file.
+    """State of the page for a file.
 
     Args:
-        file: of demonstrations, samples or a learned concept; the name or folder of a data set.
-        model: of a learned concept; empty to look for it.
+        file: demonstrations, samples or a learned concept; the name or folder of a data set.
+        model: model of a learned concept; empty to search for it.
 
     Raises:
         UserError: naming the file, if it is none of these.
@@ -64,50 +64,50 @@ def viewed(file: str, model: str = "") -> dict[str, Any]:
     return _state(path.name, *_of_demonstrations(file))
 
 
-def _state(title: str, told: list[str], groups: list[Json]) -> dict[str, Any]:
-    shown = {"title": title, "told": told, "groups": groups}
+def _state(title: str, notes: list[str], groups: list[Json]) -> dict[str, Any]:
+    shown = {"title": title, "told": notes, "groups": groups}
     return {"title": title, "model": {"name": "", "title": "", "hash": ""}, "models": [], "viewer": shown, "offline": None}
 
 
 def _of_demonstrations(file: str) -> tuple[list[str], list[Json]]:
-    found, broken = read_mended(file) if Path(file).is_file() else (read_own(file), ())
-    domain = _domain_of(found)
+    data, broken = read_mended(file) if Path(file).is_file() else (read_own(file), ())
+    domain = _domain_of(data)
     with about(file):
-        found = found.fitted(domain.observed) if domain is not None else found
-    show = line_drawings(Plans(found.states.shape[1], found.state_names, found.state_units)) if domain is None else domain.show
-    names = list(dict.fromkeys(found.concepts))
-    told = [str(found)]
+        data = data.fitted(domain.observed) if domain is not None else data
+    show = line_drawings(Plans(data.states.shape[1], data.state_names, data.state_units)) if domain is None else domain.show
+    names = list(dict.fromkeys(data.concepts))
+    notes = [str(data)]
     if len(names) > MOST_CONCEPTS:
-        told.append(f"the first {MOST_CONCEPTS} of {len(names)} concepts are shown")
+        notes.append(f"the first {MOST_CONCEPTS} of {len(names)} concepts are shown")
     groups = []
     for name in names[:MOST_CONCEPTS]:
-        rows = [row for row, text in enumerate(found.concepts) if text == name]
-        own = found.rows(rows)
-        findings = [*(one.within(rows) for one in broken if set(one.rows) <= set(rows)), *check(own)]
-        told += [f"{name}: {one.text}" for one in findings if not one.rows and one.severity != "note"]
-        told += [f"{name}: the first {MOST_SHOWN} of {len(rows)} are shown"] if len(rows) > MOST_SHOWN else []
-        flags = [[one.text for one in findings if row in one.rows and one.severity != "note"] for row in range(len(rows))]
-        groups.append({"concept": name, "films": _films(show, own, domain is not None and bool(domain.observed), flags)})
-    return told, groups
+        rows = [row for row, text in enumerate(data.concepts) if text == name]
+        subset = data.rows(rows)
+        findings = [*(item.within(rows) for item in broken if set(item.rows) <= set(rows)), *check(subset)]
+        notes += [f"{name}: {item.text}" for item in findings if not item.rows and item.severity != "note"]
+        notes += [f"{name}: the first {MOST_SHOWN} of {len(rows)} are shown"] if len(rows) > MOST_SHOWN else []
+        flags = [[item.text for item in findings if row in item.rows and item.severity != "note"] for row in range(len(rows))]
+        groups.append({"concept": name, "films": _films(show, subset, domain is not None and bool(domain.observed), flags)})
+    return notes, groups
 
 
-def _domain_of(found: Demonstrations) -> Domain | None:
-    """The domain that a file says it is of, if an installed package offers it and its states fit."""
-    if found.domain in ("", OWN) or found.domain not in domain_names():
+def _domain_of(demonstrations: Demonstrations) -> Domain | None:
+    """Domain named by a file, if an installed package offers it and the states fit."""
+    if demonstrations.domain in ("", OWN) or demonstrations.domain not in domain_names():
         return None
-    domain = load_domain(found.domain)
-    return domain if len(domain.plans.columns) == found.states.shape[2] else None
+    domain = load_domain(demonstrations.domain)
+    return domain if len(domain.plans.columns) == demonstrations.states.shape[2] else None
 
 
-def _films(show: Show, own: Demonstrations, observed: bool, flags: list[list[str]]) -> list[Json]:
-    lengths, starts = own.lengths.tolist(), own.initial_states
+def _films(show: Show, demonstrations: Demonstrations, observed: bool, flags: list[list[str]]) -> list[Json]:
+    lengths, starts = demonstrations.lengths.tolist(), demonstrations.initial_states
     return [
         {
-            "film": plan_film(show, own.states[row, : lengths[row]], starts.take([row]) if observed else None),
+            "film": plan_film(show, demonstrations.states[row, : lengths[row]], starts.take([row]) if observed else None),
             "label": str(row + 1),
             "flags": flags[row],
         }
-        for row in range(min(len(own), MOST_SHOWN))
+        for row in range(min(len(demonstrations), MOST_SHOWN))
     ]
 
 
@@ -123,7 +123,7 @@ def _of_concept(file: str, model: str) -> tuple[list[str], list[Json]]:
     name = concept.origin.name
     task, starts = starts_of(few, (name,), SAMPLES, 0)
     plans = few.sample(learned, SAMPLES, starts, seed=0, **sampling_of(few))
-    told = [str(concept), *str(learned.explain()).splitlines(), *([f"samples start from scenes of {task!r}"] if task else [])]
+    notes = [str(concept), *str(learned.explain()).splitlines(), *([f"samples start from scenes of {task!r}"] if task else [])]
     if not plans.states.isfinite().all():
         raise UserError(f"{file}: expected a concept whose samples are finite, found another")
-    return told, [{"concept": name, "films": _films(few.domain.show, plans, bool(few.domain.observed), [[]] * SAMPLES)}]
+    return notes, [{"concept": name, "films": _films(few.domain.show, plans, bool(few.domain.observed), [[]] * SAMPLES)}]

@@ -1,4 +1,4 @@
-"""What a person did on the page with one model: demonstrations shown, concepts learned, mixes sampled."""
+"""A session with one model on the page: demonstrations, learned concepts and samples of mixtures."""
 
 import tempfile
 import warnings
@@ -25,22 +25,20 @@ from ftl_lightning.tensor_file import kind_of
 from ftl_lightning.tuned import OWN
 
 SHOWN, SHOWN_FIRST = 8, 4
-"""Samples that are shown of a learned concept, and while it is learned."""
+"""Number of samples shown of a learned concept, and during learning."""
 FIRST, EVERY, SHARE = 0.2, 0.5, 3.0
-"""Seconds of learning before its first samples are shown, and the least between two showings; and how many times as long as a
-showing takes is learned before the next one.
-"""
+"""Seconds of learning before the first samples, minimum seconds between samples, minimum ratio of learning to sampling time."""
 TOLD = 0.05
-"""Seconds between two losses that are told: each takes time from learning."""
+"""Minimum seconds between reported losses: each report takes time from learning."""
 QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
 QUICK_STEPS = 250
-"""Of learning quickly from a user's own data; chosen on strokes, see docs/experiments-own-data.md."""
+"""Steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md."""
 
 Tell = Callable[[Json], None]
 
 
 class Stopped(Exception):
-    """Nobody waits for what is learned any more."""
+    """Learning was aborted because no client waits for the result."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +46,14 @@ class Known:
     """A concept that can be mixed.
 
     Attributes:
-        name: its text.
-        kind: ``'training'``; ``'shipped'`` or ``'saved'``, of the model's library; ``'opened'`` from a file; ``'learned'`` here.
-        composition: what samples are generated from.
-        concept: what a file of it holds; ``None`` of a training concept.
-        file: of one that was not learned here; else empty.
-        learned: how it was learned here; else ``None``.
-        demonstrations: that it was learned from here; else ``None``.
-        accuracy: share of its samples that were right, where somebody judged them.
+        name: text of the concept.
+        kind: ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file; ``'learned'`` here.
+        composition: composition to sample from.
+        concept: content of the concept's file; ``None`` for a training concept.
+        file: path or name of the concept's file; empty for training concepts and those learned here.
+        learned: how the concept was learned here; else ``None``.
+        demonstrations: training data of a concept learned here; else ``None``.
+        accuracy: fraction of correct samples; ``None`` if not judged.
     """
 
     name: str
@@ -69,21 +67,21 @@ class Known:
 
     @property
     def form(self) -> str:
-        """Of the concept, in a word or two; empty for training concepts."""
+        """Form of the concept in a word or two; empty for training concepts."""
         if self.concept is None:
             return ""
         return self.concept.choice.form if self.concept.choice else "modes" if self.concept.modes else "one set"
 
 
 class Workspace:
-    """One model, and what was done with it. Nothing is written: files are what the browser saves.
+    """One model and the state of its session. No files are written: the browser saves them.
 
     Args:
-        model: name of one that ships, or a folder.
+        model: name of a shipped model, or a folder.
         root: folder of the user's copy of recordings, for domains whose demonstrations do not ship.
 
     Raises:
-        UserError: if there is no such model, or no concepts are learned through it.
+        UserError: if the model does not exist, or cannot learn concepts.
     """
 
     def __init__(self, model: str, root: Path | None = None) -> None:
@@ -98,13 +96,13 @@ class Workspace:
         }
         learned = self._model.library().learned
         for number, entry in enumerate(learned):
-            found = self._model.load(str(entry.path))
-            name = entry.stem if sum(other.name == entry.name for other in learned) > 1 else entry.name
-            known = Known(name, entry.kind, found, found.concept, str(entry.path), accuracy=entry.accuracy)
+            concept = self._model.load(str(entry.path))
+            name = entry.stem if sum(item.name == entry.name for item in learned) > 1 else entry.name
+            known = Known(name, entry.kind, concept, concept.concept, str(entry.path), accuracy=entry.accuracy)
             self._concepts[f"s{number}"] = known
 
     def state(self) -> dict[str, Any]:
-        """All that the page shows at first."""
+        """Initial state of the page."""
         domain, recorder = self._domain, self._domain.recorder
         return {
             "title": self.name.rpartition("/")[2].replace("_", " "),
@@ -122,51 +120,51 @@ class Workspace:
         }
 
     def work(self) -> dict[str, Any]:
-        """The demonstrations that are there, and what a check says of them."""
+        """Current demonstrations and findings of their check."""
         parts = (Part(self._newest.label, learned=self._newest),) if self._newest else ()
         return self._shown.told() | {"same": self._same(parts, None)}
 
     @property
     def suggestion(self) -> str:
-        """A name for what is to be learned: that of the demonstrations, where a file or the library said one."""
+        """Suggested name of the concept: the name of the demonstrations, if a file or the library gave it."""
         return self._shown.name or "new concept"
 
     # Demonstrations.
 
     def scene(self, asked: requests.Pose) -> Json:
-        """A new scene to show something in."""
+        """Draw a new scene for a demonstration."""
         return self._shown.scene(asked)
 
     def record(self, asked: requests.Recorded) -> Json:
-        """With what a hand showed."""
+        """Add a demonstration recorded by hand; return the new work."""
         self._shown.record(asked)
         return self.work()
 
     def draw(self, asked: requests.Drawn) -> Json:
-        """With demonstrations from the library."""
+        """Add demonstrations of the library; return the new work."""
         self._shown.draw(asked)
         return self.work()
 
     def remove(self, asked: requests.One) -> Json:
-        """Without one."""
+        """Remove a demonstration; return the new work."""
         self._shown.remove(asked)
         return self.work()
 
     def undo(self, asked: requests.Nothing) -> Json:
-        """As before the last change."""
+        """Undo the last change; return the new work."""
         self._shown.undo()
         return self.work()
 
     def clear(self, asked: requests.Nothing) -> Json:
-        """Without any."""
+        """Remove all demonstrations; return the new work."""
         self._shown.clear()
         return self.work()
 
     def upload(self, name: str, content: bytes) -> None:
-        """Take a file of demonstrations, of a concept, or of another program.
+        """Read a file of demonstrations, of a concept, or of another program.
 
         Raises:
-            UserError: for one that is none of these, or of another model or domain.
+            UserError: for another kind of file, or a file of another model or domain.
         """
         if (ending := Path(name).suffix.lower()) not in self._shown.files:
             raise UserError(f"file: expected one that ends in {' or '.join(self._shown.files)}, found {short(name)!r}")
@@ -176,7 +174,7 @@ class Workspace:
             self._shown.read(name, content)
 
     def demonstrations_file(self, key: str) -> tuple[str, bytes]:
-        """Name and bytes of an ``.npz`` with the demonstrations that are there, or those of a concept that was learned here.
+        """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here.
 
         Raises:
             UserError: if there are none.
@@ -191,35 +189,35 @@ class Workspace:
     # Concepts.
 
     def _known(self, key: str) -> Known:
-        if (found := self._concepts.get(key)) is None:
+        if (known := self._concepts.get(key)) is None:
             raise UserError(f"id: expected a concept that is there, found {short(key)!r}")
-        return found
+        return known
 
     def _listed(self) -> list[Json]:
-        return [self._told(key, known) for key, known in self._concepts.items()]
+        return [self._entry(key, known) for key, known in self._concepts.items()]
 
-    def _told(self, key: str, known: Known) -> Json:
+    def _entry(self, key: str, known: Known) -> Json:
         count = None if known.concept is None else known.concept.origin.count
-        told = {"id": key, "name": known.name, "kind": known.kind, "count": count, "form": known.form}
-        return told | {"accuracy": known.accuracy, "hash": self._model.model.hash}
+        entry = {"id": key, "name": known.name, "kind": known.kind, "count": count, "form": known.form}
+        return entry | {"accuracy": known.accuracy, "hash": self._model.model.hash}
 
     def _open(self, name: str, content: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "concept.safetensors"
             path.write_bytes(content)
             try:
-                found = self._model.load(path)
+                concept = self._model.load(path)
             except UserError as error:
-                told = str(error).replace(str(path), short(name))
-                raise UserError(f"{told}; open the model that it was learned with first") from error
+                message = str(error).replace(str(path), short(name))
+                raise UserError(f"{message}; open the model that it was learned with first") from error
         self._count += 1
-        self._concepts[f"o{self._count}"] = Known(found.concept.origin.name, "opened", found, found.concept, name)
+        self._concepts[f"o{self._count}"] = Known(concept.concept.origin.name, "opened", concept, concept.concept, name)
 
     def concept_file(self, key: str) -> tuple[str, bytes]:
         """Name and bytes of a concept's file.
 
         Raises:
-            UserError: for a training concept, which the model itself holds.
+            UserError: for a training concept, which is part of the model.
         """
         known = self._known(key)
         if known.concept is None:
@@ -230,20 +228,20 @@ class Workspace:
             return known.learned.file if known.learned else Path(known.file).name, path.read_bytes()
 
     def forget(self, asked: requests.Named) -> None:
-        """Go on without a concept that was learned or opened here.
+        """Remove a concept that was learned or opened here.
 
         Raises:
-            UserError: for one of the model's own.
+            UserError: for a concept of the model.
         """
         if self._known(asked.id).kind not in ("learned", "opened"):
             raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
         del self._concepts[asked.id]
 
     def rename(self, asked: requests.Renamed) -> None:
-        """Call a concept otherwise that was learned or opened here; its file then says so.
+        """Rename a concept that was learned or opened here, also in its file.
 
         Raises:
-            UserError: for one of the model's own.
+            UserError: for a concept of the model.
         """
         known, name = self._known(asked.id), " ".join(asked.name.split())
         if known.kind not in ("learned", "opened") or known.concept is None:
@@ -256,63 +254,63 @@ class Workspace:
         self._concepts[asked.id] = replace(known, name=name, concept=concept, learned=learned)
 
     def learn(self, asked: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
-        """Learn a concept from the demonstrations, telling loss and samples as it goes.
+        """Learn a concept from the demonstrations, and report loss and samples meanwhile.
 
         Args:
-            asked: name and how.
-            tell: called with each line that the page is told.
-            stopped: whether nobody waits any more.
+            asked: name and settings.
+            tell: called with each line for the page.
+            stopped: whether no client waits any more.
 
         Raises:
-            UserError: without demonstrations, or where they cannot be learned from.
-            Stopped: if nobody waits.
+            UserError: without demonstrations, or if they cannot be learned from.
+            Stopped: if no client waits.
         """
         name = " ".join(asked.name.split())
-        own, begin = self._shown.together(name), monotonic()
+        demonstrations, begin = self._shown.together(name), monotonic()
         changes, steps = self._settings(asked.quick)
-        due, told_at = begin + FIRST, begin
+        due, reported = begin + FIRST, begin
 
         def watch(now: Learning) -> None:
-            nonlocal due, told_at
+            nonlocal due, reported
             if stopped():
                 raise Stopped
-            if (shown := monotonic()) >= told_at + TOLD or now.step in (1, steps):
+            if (clock := monotonic()) >= reported + TOLD or now.step in (1, steps):
                 tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
-                told_at = shown
-            if shown >= due:
-                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, own)[0]})
-                due = monotonic() + max(EVERY, SHARE * (monotonic() - shown))
+                reported = clock
+            if clock >= due:
+                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, demonstrations)[0]})
+                due = monotonic() + max(EVERY, SHARE * (monotonic() - clock))
 
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what they tell stands beside the demonstrations
-            concept = self._model.learn(own, name=name, steps=steps, watch=watch, **changes)
+            warnings.simplefilter("ignore")  # the page shows these warnings beside the demonstrations
+            concept = self._model.learn(demonstrations, name=name, steps=steps, watch=watch, **changes)
         seconds = monotonic() - begin
         self._count += 1
-        told_steps = None if steps == self._model.tuned.learning_steps else steps
-        key, how = f"l{self._count}", Learned(name, self._unused(name), changes, told_steps)
-        known = Known(name, "learned", concept, concept.concept, learned=how, demonstrations=own)
-        shown, right = self._samples(concept, GENERATED, own)
+        changed_steps = None if steps == self._model.tuned.learning_steps else steps
+        key, learned = f"l{self._count}", Learned(name, self._unused(name), changes, changed_steps)
+        known = Known(name, "learned", concept, concept.concept, learned=learned, demonstrations=demonstrations)
+        shown, right = self._samples(concept, GENERATED, demonstrations)
         quality: Json = {"line": right, "numbers": {}}
-        if len(own) > 1:
-            found = concept.quality.quality
-            quality = {"line": ", ".join(filter(None, (right, found.words))), "numbers": found.numbers}
+        if len(demonstrations) > 1:
+            measured = concept.quality.quality
+            quality = {"line": ", ".join(filter(None, (right, measured.words))), "numbers": measured.numbers}
         decided = [film["right"] for film in shown if film["right"] is not None]
         self._concepts[key] = known = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
-        self._newest = how
-        told = {"done": True, "concept": self._told(key, known), "concepts": self._listed(), "quality": quality}
-        same = self._same((Part(how.label, learned=how),), None)
-        tell({**told, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
+        self._newest = learned
+        result = {"done": True, "concept": self._entry(key, known), "concepts": self._listed(), "quality": quality}
+        same = self._same((Part(learned.label, learned=learned),), None)
+        tell({**result, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
 
     def _unused(self, name: str) -> str:
-        """A label whose files and variable no other concept that was learned here has."""
+        """Label whose files and variable differ from those of every concept learned here."""
         taken = VARIABLES | {known.learned.variable for known in self._concepts.values() if known.learned}
-        found, number = name, 2
-        while Learned(name, found).variable in taken:
-            found, number = f"{name} {number}", number + 1
-        return found
+        label, number = name, 2
+        while Learned(name, label).variable in taken:
+            label, number = f"{name} {number}", number + 1
+        return label
 
     def _settings(self, quick: bool) -> tuple[dict[str, Any], int]:
-        """What differs from the tuned settings, and steps: where a person waits, a single set of embeddings, learned quickly."""
+        """Changes to the tuned settings, and steps. Only a single set of embeddings is learned quickly."""
         tuned, steps = self._model.tuned.inversion, self._model.tuned.learning_steps
         if not quick or tuned.modes.sets != 1 or tuned.adapter.rank:
             return {}, steps
@@ -323,39 +321,41 @@ class Workspace:
     # Samples.
 
     def sample(self, asked: requests.Sample) -> Json:
-        """Samples of a mix.
+        """Generate samples of a mixture.
 
         Raises:
-            UserError: for a concept or group that is none, or what cannot be executed.
+            UserError: for an unknown concept or group, or if behaviour cannot be executed.
         """
         begin = monotonic()
         known = [self._known(part.id) for part in asked.parts]
         width, plans = self._model.model.config.state_dim, self._domain.plans
         concepts = [
-            (part.weight * one.composition).on(plans.grouped(part.groups), width) if part.groups else part.weight * one.composition
-            for part, one in zip(asked.parts, known, strict=True)
+            (part.weight * item.composition).on(plans.grouped(part.groups), width)
+            if part.groups
+            else part.weight * item.composition
+            for part, item in zip(asked.parts, known, strict=True)
         ]
-        names = [one.name for one in known]
+        names = [item.name for item in known]
         examples = [
-            replace(one.demonstrations, concepts=(one.name,) * len(one.demonstrations)) for one in known if one.demonstrations
+            replace(item.demonstrations, concepts=(item.name,) * len(item.demonstrations)) for item in known if item.demonstrations
         ]
         mixture = Mixture(concepts, names, examples)
-        shown, told, how = samples(self._model, mixture, asked, (self._shown.task, *names))
+        shown, verdict, how = samples(self._model, mixture, asked, (self._shown.task, *names))
         parts = [
-            Part(one.name, part.weight, tuple(part.groups), one.learned, one.file)
-            for part, one in zip(asked.parts, known, strict=True)
+            Part(item.name, part.weight, tuple(part.groups), item.learned, item.file)
+            for part, item in zip(asked.parts, known, strict=True)
         ]
-        return {"samples": shown, "told": told, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
+        return {"samples": shown, "told": verdict, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
 
-    def _samples(self, concept: LearnedConcept, count: int, own: Demonstrations) -> tuple[list[Json], str]:
-        """Of a concept that was just learned from some demonstrations, and what share is right."""
+    def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations) -> tuple[list[Json], str]:
+        """Films of samples of a newly learned concept, and the fraction of correct samples in words."""
         task, starts = starts_of(self._model, (self._shown.task,), count, 0)
         plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
-        judge = judge_of(self._model, [own])
+        judge = judge_of(self._model, [demonstrations])
         return judged(judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
 
     def thumbnail(self, key: str) -> Json:
-        """A sample of a concept."""
+        """Film of one sample of a concept."""
         known = self._known(key)
         _, starts = starts_of(self._model, (known.name, self._shown.task), 1, 0)
         plans = self._model.sample(known.composition, 1, starts, seed=0, **sampling_of(self._model))

@@ -1,4 +1,4 @@
-"""What each change to the paper's form is worth: ours, and ours with one change taken away at a time."""
+"""Ablation of the changes to the paper's form: ours, and ours without one change at a time."""
 
 import pandas as pd
 
@@ -10,8 +10,8 @@ from ftl_lightning.reporting.table import MISSING, Table, select, summarise
 
 
 def changes_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """One line for each variant in the order of the rows, one column for each setting with the domain's headline, or if it was
-    not measured, its main metric.
+    """One line for each variant in the order of the rows, one column for each setting, with the domain's headline or else its
+    main metric.
 
     Args:
         domain: the domain.

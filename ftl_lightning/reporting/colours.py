@@ -1,6 +1,6 @@
-"""Each method's colour, the same in all figures.
+"""Colours of methods, the same in all figures.
 
-The colours are Okabe and Ito's (2008) and Tol's (2021), which colour-blind people tell apart.
+The colours are Okabe and Ito's (2008) and Tol's (2021), which are safe for colour-blind readers.
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,28 +24,28 @@ OF_METHODS: Mapping[Compared, str] = {
     Compared(FINE_TUNED): "#882255",
 }
 SPARE = ("#117733", "#ddcc77", "#88ccee", "#555555")
-"""Of methods of one's own, before those of methods that a figure does not show."""
+"""Colours of user methods, used before colours of methods that a figure lacks."""
 COLOURS = (*dict.fromkeys(OF_METHODS.values()), *SPARE)
-"""In this order where lines are no methods."""
+"""Colours in order, for lines that are not methods."""
 PAPER = "#9a9a9a"
 
 
 def colours(named: Iterable[tuple[str, Compared]]) -> dict[str, str]:
-    """A colour for each name: its method's own; of several names of one method the others have one of its other forms'.
+    """Assign a colour to each name: its method's colour, else the colour of another form, else a spare colour.
 
     Args:
-        named: what a figure shows, with the method that it is of; a method of one's own has a spare colour.
+        named: names in a figure with their methods; user methods have spare colours.
     """
-    found: dict[str, str] = {}
+    chosen: dict[str, str] = {}
     waiting: dict[str, Compared] = {}
     for name, method in named:
-        own = OF_METHODS.get(method)
-        if own is None or own in found.values():
+        colour = OF_METHODS.get(method)
+        if colour is None or colour in chosen.values():
             waiting[name] = method
         else:
-            found[name] = own
+            chosen[name] = colour
     for name, method in waiting.items():
         forms = [colour for known, colour in OF_METHODS.items() if known.name == method.name]
-        left = [colour for colour in (*forms, *SPARE, *reversed(COLOURS)) if colour not in found.values()]
-        found[name] = left[0] if left else COLOURS[len(found) % len(COLOURS)]
-    return found
+        left = [colour for colour in (*forms, *SPARE, *reversed(COLOURS)) if colour not in chosen.values()]
+        chosen[name] = left[0] if left else COLOURS[len(chosen) % len(COLOURS)]
+    return chosen

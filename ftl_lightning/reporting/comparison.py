@@ -1,4 +1,4 @@
-"""Our method against the baselines, each number beside the paper's and their difference."""
+"""Our method against the baselines, each number beside the paper's and the difference."""
 
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
@@ -36,7 +36,7 @@ from ftl_lightning.reporting.table import (
 from ftl_lightning.reporting.tables import against, as_learned_most
 
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
-"""The paper's, by their names in tables."""
+"""Names of the paper's baselines."""
 LANGUAGE = BASELINES[-1]
 METHODS = (
     PAPERS_METHOD,
@@ -45,18 +45,18 @@ METHODS = (
     *map(Compared, BASELINES),
     Compared(FINE_TUNED),
 )
-"""The order of methods in tables; other forms of ours come after ours, other methods come last."""
+"""Order of methods in tables; our other forms follow ours, other methods come last."""
 ALIKE = 0.9
-"""In this share of episodes, at least, a reference policy ends as ours does to be told."""
+"""Minimum share of episodes with our outcome for which a reference policy is annotated."""
 LINES = 10
-"""At most, of the short overview."""
+"""Maximum number of lines of the short overview."""
 
 
 def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFrame:
-    """Rows of all domains in which a baseline was measured: those of the comparison, and of domains without such, of ablations.
+    """Rows of all domains with a measured baseline: from the comparison, or from ablations for domains that it lacks.
 
     Args:
-        comparison, ablations: rows of the results; of the latter each method is taken as it was learned mostly.
+        comparison, ablations: rows of the results; ablations contribute the most measured configuration of each method.
     """
     compared_domains = set(comparison["domain"])
     others = [
@@ -68,7 +68,7 @@ def all_methods(comparison: pd.DataFrame, ablations: pd.DataFrame) -> pd.DataFra
 
 
 def reference_lines(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
-    """The latest rows of what stands beside all methods: chance, trivial policies and oracles."""
+    """The latest rows of reference lines: chance, trivial policies and oracles."""
     return latest(select(results, domain=domain.name, role=REFERENCE))
 
 
@@ -78,25 +78,25 @@ def compared(domain: Domain, results: pd.DataFrame) -> pd.DataFrame:
 
 
 def methods(rows: pd.DataFrame) -> list[Compared]:
-    """The methods among the rows, each in its forms: ours, the paper's baselines, and others as they appear."""
+    """Methods and forms in the rows: ours, the paper's baselines, then others in order of appearance."""
     learned = rows[rows["role"] == METHOD]
     measured = dict.fromkeys(map(Compared, learned["method"], learned["form"]))
-    found = [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
-    return sorted(found, key=lambda method: method.name != OURS)
+    ordered = [method for method in dict.fromkeys((*METHODS, *measured)) if method in measured]
+    return sorted(ordered, key=lambda method: method.name != OURS)
 
 
 def comparison_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """All methods, and all reference lines."""
+    """Tables of all methods and of all reference lines."""
     return [table for table in (comparison_table(domain, results), references_table(domain, results)) if not table.cells.empty]
 
 
 def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str] = ()) -> Table:
-    """One line for each setting, metric and method: the paired test, measured, its errors, the paper's number, the difference.
+    """One line for each setting, metric and method: paired test, mean with errors, the paper's number and the difference.
 
     Args:
-        domain: whose.
-        results: with rows of it.
-        shown: metrics; those that methods are compared by where none are named.
+        domain: the domain.
+        results: rows of the results.
+        shown: metrics; if empty, those by which methods are compared.
     """
     rows = compared(domain, results)
     lines = []
@@ -107,7 +107,7 @@ def comparison_table(domain: Domain, results: pd.DataFrame, shown: Sequence[str]
             for method in methods(rows):
                 if number := summarise(of_method(method_rows, method)):
                     cells = beside(number, lookup(domain, setting, metric, method=method))
-                    lines.append([setting, metric, label(*method), _told(tested.get(method)), *cells])
+                    lines.append([setting, metric, label(*method), _verdict(tested.get(method)), *cells])
     caption = (
         f"{domain.name}: all methods{_learned_from(rows)}, mean ± standard error over tasks; ours is: by how much "
         f"{label(*domain.ours)} is better"
@@ -142,13 +142,13 @@ BESIDE = ("measured", "spread over seeds", "paper", "difference")
 
 
 def beside(number: Number, papers: Published | None) -> list[str]:
-    """The columns :data:`BESIDE`."""
+    """Cells of the columns :data:`BESIDE`."""
     spread = MISSING if number.spread is None else f"{number.spread:.2f}"
     return [number.with_error(), spread, paper(papers), difference_to(papers, number)]
 
 
 def rivals(domain: Domain, rows: pd.DataFrame, setting: str) -> list[Compared]:
-    """The baselines of a setting; of training concepts language is ours, the same model and the same words."""
+    """The baselines of a setting; for training concepts without language, which equals ours there."""
     same = setting in training_settings(domain)
     return [method for method in methods(rows) if method.name != OURS and not (method.name == LANGUAGE and same)]
 
@@ -158,12 +158,12 @@ def _leads(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> lis
     return leads(method_rows, domain.ours, rivals(domain, rows, setting), domain.less_is_better(metric))
 
 
-def _told(lead: Lead | None) -> str:
+def _verdict(lead: Lead | None) -> str:
     return MISSING if lead is None else f"{signed(lead.difference)}, {lead.shown}"
 
 
 def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
-    """Domain, setting and metric of all in which ours and a baseline were measured, in the order of the overview."""
+    """Domain, setting and metric of each line of the overview: ours and a baseline were measured."""
     return [
         (domain, setting, metric)
         for domain in _domains(results)
@@ -175,7 +175,7 @@ def shown_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
 
 
 def short_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
-    """Of :func:`shown_lines` at most :data:`LINES`: of each domain in turn what says most."""
+    """At most :data:`LINES` lines of :func:`shown_lines`: the headlines of each domain in turn."""
     lines = {
         domain.name: [
             (domain, setting, metric) for setting, metric in headlines(domain, rows) if _comparable(domain, rows, setting, metric)
@@ -188,17 +188,17 @@ def short_lines(results: pd.DataFrame) -> list[tuple[Domain, str, str]]:
 
 
 def _comparable(domain: Domain, rows: pd.DataFrame, setting: str, metric: str) -> bool:
-    """Whether there is something to compare: several methods, or the only ones that there are."""
+    """Whether several methods were measured, or the only method that there is."""
     measured = methods(select(rows, setting=setting, metric=metric))
     return len({method.name for method in measured}) > 1 or (bool(measured) and len(set(rows["method"])) == 1)
 
 
 OTHER_FORMS = "other forms"
-"""The column of ours in other forms than the paper's."""
+"""Column of our forms other than the paper's."""
 
 
 def overview(results: pd.DataFrame) -> Table:
-    """All domains: who is ahead, ours and the baselines, the paper's numbers in brackets.
+    """All domains: the lead, ours and the baselines, with the paper's numbers in brackets.
 
     Args:
         results: rows of a comparison; see :func:`all_methods`.
@@ -207,27 +207,29 @@ def overview(results: pd.DataFrame) -> Table:
 
 
 def short_overview(results: pd.DataFrame) -> Table:
-    """The overview in at most :data:`LINES` lines; of other forms the one that is chosen, and the domain's own."""
+    """The overview in at most :data:`LINES` lines; our other forms are the chosen one and the default form of the domain."""
     domains = _domains(results)
-    own = {domain.ours for domain in domains}
+    defaults = {domain.ours for domain in domains}
     columns = [
-        method for method in methods(results) if method.name != OURS or not method.form or method in own or CHOSEN in method.form
+        method
+        for method in methods(results)
+        if method.name != OURS or not method.form or method in defaults or CHOSEN in method.form
     ]
     return _overview(results, short_lines(results), columns)
 
 
 def overview_tables(results: pd.DataFrame) -> list[Table]:
-    """The overview for pages, in tables of few columns: who is ahead and our forms, the other methods, the reference lines."""
+    """The overview in tables of few columns: the lead and our forms, the other methods, the reference lines."""
     whole = overview(results)
     subject, lead, *columns = whole.cells.columns
     ours = [name for name in columns if name in (label(*PAPERS_METHOD), OTHER_FORMS)]
     others = [name for name in columns if name not in ours]
-    found = [Table("overview", whole.caption, whole.cells[[subject, lead, *ours]])]
+    tables = [Table("overview", whole.caption, whole.cells[[subject, lead, *ours]])]
     step = MOST_COLUMNS - 1
     for start in range(0, len(others), step):
         caption = f"The other methods, mean ± standard error over tasks{_brackets(results)}"
         shown = whole.cells[[subject, *others[start : start + step]]]
-        found.append(Table("overview_methods" + (f"_{start // step + 1}" if start else ""), caption, shown))
+        tables.append(Table("overview_methods" + (f"_{start // step + 1}" if start else ""), caption, shown))
     lines = [
         [_subject(*line), _references(domain, rows, references, *line[1:])]
         for domain in _domains(results)
@@ -236,25 +238,25 @@ def overview_tables(results: pd.DataFrame) -> list[Table]:
     ]
     caption = "Reference lines: chance, trivial policies and oracles, the least first"
     references = Table("overview_references", caption, pd.DataFrame(lines, columns=[subject, "reference lines"], dtype=str))
-    return [*found, references]
+    return [*tables, references]
 
 
 def headline_tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """What says most of a domain: a line for each method, and for each reference line, a column for each setting and metric."""
+    """Headlines of a domain: a line for each method or reference line, a column for each setting and metric."""
     rows, references = compared(domain, results), reference_lines(domain, results)
     shown = headlines(domain, rows)[: MOST_COLUMNS - 1]
     heads = [f"{setting}, {metric}" for setting, metric in shown]
     lines = [[label(*method), *(_cell(domain, rows, method, *line) for line in shown)] for method in methods(rows)]
     marks = " [the paper's]" if published(domain) else ""
-    found = [("headline", f"{domain.name}: mean ± standard error over tasks{marks}", "method", lines)]
+    sources = [("headline", f"{domain.name}: mean ± standard error over tasks{marks}", "method", lines)]
     named = [(str(name), select(references, method=name)) for name in sorted(set(references["method"]))]
-    lines = [[name, *(_mean(select(own, setting=setting, metric=metric)) for setting, metric in shown)] for name, own in named]
-    found += [("headline_references", f"{domain.name}: reference lines", "reference line", lines)]
+    lines = [[name, *(_mean(select(group, setting=setting, metric=metric)) for setting, metric in shown)] for name, group in named]
+    sources += [("headline_references", f"{domain.name}: reference lines", "reference line", lines)]
     tables = [
         Table(
             name, caption, pd.DataFrame([line for line in lines if set(line[1:]) != {MISSING}], columns=[head, *heads], dtype=str)
         )
-        for name, caption, head, lines in found
+        for name, caption, head, lines in sources
     ]
     return [table for table in tables if not table.cells.empty]
 
@@ -268,13 +270,13 @@ def _overview(results: pd.DataFrame, lines: Sequence[tuple[Domain, str, str]], c
     for domain, setting, metric in lines:
         rows = rows_of[domain.name]
         lead = least_certain(_leads(domain, rows, setting, metric))
-        rows = select(rows, setting=setting, metric=metric)  # which every cell of the line is made from
+        rows = select(rows, setting=setting, metric=metric)  # rows of this line
         form = f"{domain.ours.form}: " if domain.ours.form and lead else ""
         line = [_subject(domain, setting, metric), MISSING if lead is None else f"{form}{lead}"]
         line += [_cell(domain, rows, method, setting, metric) for method in first]
         if forms:
-            told = [(method.form, _cell(domain, rows, method, setting, metric)) for method in forms]
-            line.append(", ".join(f"{form} {cell}" for form, cell in told if cell != MISSING) or MISSING)
+            form_cells = [(method.form, _cell(domain, rows, method, setting, metric)) for method in forms]
+            line.append(", ".join(f"{form} {cell}" for form, cell in form_cells if cell != MISSING) or MISSING)
         cells.append([*line, *(_cell(domain, rows, method, setting, metric) for method in rest)])
     head = ["domain: setting, metric", "lead", *(label(*method) for method in first)]
     head += [OTHER_FORMS] * bool(forms) + [label(*method) for method in rest]
@@ -321,7 +323,7 @@ def _cell(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, me
 
 
 def _agreeing(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
-    """Of reference policies whose episodes nearly all end as ours do: in how many."""
+    """Number of episodes with our outcome, for reference policies that nearly always agree with ours."""
     counted = {policy: against(ours, policy) for policy in policies(domain)}
     return {
         policy: same_outcome(*counts)
@@ -331,7 +333,7 @@ def _agreeing(domain: Domain, ours: pd.DataFrame) -> dict[str, str]:
 
 
 def _means(references: pd.DataFrame, agreeing: Mapping[str, str]) -> str:
-    """The mean of each reference line, the least first."""
+    """Means of the reference lines, in ascending order."""
     means = references.groupby("method")["value"].mean().sort_values()
     named = [(str(name), f"{name} {mean:.2f}") for name, mean in means.items()]
     return ", ".join(text + (f" ({agreeing[name]})" if name in agreeing else "") for name, text in named) or MISSING

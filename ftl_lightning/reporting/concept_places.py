@@ -1,4 +1,4 @@
-"""Where concepts lie: embeddings of training concepts and of learned components in a plane."""
+"""Embeddings of training concepts and learned components in a plane."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ class Place:
     """An embedding in the plane.
 
     Attributes:
-        concept: its name; component: ``'k1'`` for the first, empty for a training concept.
-        x, y: where.
+        concept: name of the concept; component: ``'k1'`` for the first, empty for a training concept.
+        x, y: coordinates.
     """
 
     concept: str
@@ -26,7 +26,7 @@ class Place:
 
     @property
     def name(self) -> str:
-        """The concept, and in brackets the component."""
+        """Concept, with component in brackets."""
         return f"{self.concept} [{self.component}]" if self.component else self.concept
 
 
@@ -34,12 +34,12 @@ def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int =
     """t-SNE of training concepts and learned components (paper, figure 'tsne'; van der Maaten & Hinton, 2008), in this order.
 
     Args:
-        model: whose concept space it is.
-        concepts: learned with it.
-        seed: of the map.
+        model: the pretrained model.
+        concepts: concepts learned with it.
+        seed: seed of t-SNE.
 
     Raises:
-        UserError: without scikit-learn.
+        UserError: if scikit-learn is missing.
     """
     expect_extra("notebooks", "concept_map")
     from sklearn.manifold import TSNE
@@ -48,10 +48,10 @@ def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int =
         (concept.origin.name, name.replace("component ", ""), part.embedding)
         for concept in concepts
         for name, part in concept.parts().items()
-        if part.mode is None  # modes would be five times as many, near one another
+        if part.mode is None  # modes would be five times as many near-copies
     ]
     embeddings = torch.cat((model.training_embeddings.cpu(), *(embedding[None] for *_, embedding in learned)))
     perplexity = min(10.0, (len(embeddings) - 1) / 3)
-    found = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
+    points = TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.numpy())
     names = [*((name, "") for name in model.config.training_concepts), *((name, part) for name, part, _ in learned)]
-    return [Place(*name, float(x), float(y)) for name, (x, y) in zip(names, found, strict=True)]
+    return [Place(*name, float(x), float(y)) for name, (x, y) in zip(names, points, strict=True)]

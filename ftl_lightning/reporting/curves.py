@@ -1,4 +1,4 @@
-"""How accuracy grows with the number of demonstrations, and with the number of components."""
+"""Accuracy against the number of demonstrations and the number of components."""
 
 import pandas as pd
 
@@ -10,15 +10,15 @@ from ftl_lightning.reporting.table import MISSING, Table, select, summarise
 from ftl_lightning.reporting.tables import LEARNED
 
 AXES = {"demonstrations": "K", "K": "demonstrations"}
-"""What grows, and what stays meanwhile."""
+"""Varied column, and the column that stays fixed."""
 
 
 def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """The rows of a domain's headline, or if it was not measured, its main metric, in which what else could grow is as usual.
+    """The rows of a domain's headline, or else its main metric, along an axis.
 
-    What else could grow, and the guidance weight, are those with which it was measured at most values of the axis; of several, the
-    main tables' weight where demonstrations grow, and learned weights where components do: with a fixed one for each, guidance
-    would grow with them. Settings that start where the demonstrations did are left out: they have no more samples than these.
+    The other column of :data:`AXES` and the guidance weight have the values with most points on the axis. Ties go to the weight of
+    the main tables for demonstrations, and to learned weights for K, as fixed weights per component would increase guidance with
+    K. Settings with the initial states of the demonstrations are left out: they have no more samples than demonstrations.
 
     Args:
         domain: the domain.
@@ -32,12 +32,12 @@ def points(domain: Domain, results: pd.DataFrame, axis: str) -> pd.DataFrame:
         return rows
     preferred = main_omega(domain) if axis == "demonstrations" else LEARNED
     measured = rows.groupby([AXES[axis], "omega"])[axis].nunique()
-    stays, omega = max(measured.index, key=lambda held: (measured[held], held[1] == preferred))
+    stays, omega = max(measured.index, key=lambda pair: (measured[pair], pair[1] == preferred))
     return select(rows, omega=omega, **{AXES[axis]: stays})
 
 
 def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
-    """One line for each setting and each of the two; the spread over seeds stands behind where there are several."""
+    """One line for each setting and axis; several seeds have their spread in brackets."""
     lines, grown = [], {axis: points(domain, results, axis) for axis in AXES}
     counts = sorted({count for axis, rows in grown.items() for count in rows[axis]})
     for axis, rows in grown.items():
@@ -46,6 +46,6 @@ def curves_table(domain: Domain, results: pd.DataFrame) -> Table:
             lines.append([setting, axis, *(MISSING if number is None else str(number) for number in numbers)])
     metric = next((name for rows in grown.values() for name in rows["metric"]), domain.main_metric)
     kept = {axis: rows.iloc[0] for axis, rows in grown.items() if len(rows)}
-    held = ", ".join(f"{axis} ({AXES[axis]} = {one[AXES[axis]]}, omega {one['omega']})" for axis, one in kept.items())
-    caption = f"{domain.name}: {metric} by {held}. Mean ± standard error over tasks (spread over seeds)"
+    axes = ", ".join(f"{axis} ({AXES[axis]} = {row[AXES[axis]]}, omega {row['omega']})" for axis, row in kept.items())
+    caption = f"{domain.name}: {metric} by {axes}. Mean ± standard error over tasks (spread over seeds)"
     return Table("curves", caption, pd.DataFrame(lines, columns=["setting", "of", *map(str, counts)], dtype=str))

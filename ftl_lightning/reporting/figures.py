@@ -29,11 +29,11 @@ from ftl_lightning.reporting.table import of_method, select, summarise
 from ftl_lightning.reporting.tables import labelled, main_rows
 
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
-"""Of reference policies."""
+"""Line styles of reference policies."""
 REFERENCE_MARKS = {REPLAYED: "X", FRESH: "*"}
-"""Of the reference lines of novelty and coverage."""
+"""Markers of the reference lines of novelty and coverage."""
 WIDEST = 60.0
-"""Inches of a figure, however many settings there are; a picture of thousands would take all memory."""
+"""Maximum width of a figure in inches; a figure of thousands of settings would fill the memory."""
 
 
 def _width(inches: float) -> float:
@@ -41,19 +41,19 @@ def _width(inches: float) -> float:
 
 
 def _wrapped(setting: str) -> str:
-    """In lines that stand beside each other without touching."""
+    """Wrap a label so that neighbours do not touch."""
     return textwrap.fill(figure_text(setting), 18, break_long_words=False)
 
 
 def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting beside the paper's and reference lines, K = 2 or else what there is; bars show standard errors.
+    """Plot a metric of every setting beside the paper's numbers and reference lines, for K = 2 or else the most measured K.
 
-    Errors are over tasks.
+    Error bars are standard errors over tasks.
 
     Args:
         domain: the domain.
         results: rows of the results file.
-        metric: as in a row of the results.
+        metric: its name in the results.
     """
     rows = labelled(latest(select(results, domain=domain.name, metric=metric)))
     ours, how = main_rows(rows, main_omega(domain))
@@ -66,7 +66,7 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
     policies = sorted(set(references["label"]))
 
     def once(label: str) -> str | None:
-        """For the legend, which names everything once, wherever it is seen first."""
+        """Return the legend entry of a label at its first use, else ``None``."""
         return None if figure_text(label) in axes.get_legend_handles_labels()[1] else figure_text(label)
 
     for place, setting in enumerate(shown):
@@ -91,14 +91,14 @@ def accuracy_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy
 
 
 def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accuracy") -> Figure:
-    """A metric of every setting, ours and the baselines', with the paper's numbers as diamonds and reference lines.
+    """Plot a metric of every setting for ours and the baselines, with reference lines and the paper's numbers as diamonds.
 
-    Bars show standard errors over tasks.
+    Error bars are standard errors over tasks.
 
     Args:
         domain: the domain.
         results: rows of a comparison.
-        metric: as in a row of the results.
+        metric: its name in the results.
     """
     rows = compared(domain, results)
     rows = rows[rows["metric"] == metric]
@@ -135,16 +135,16 @@ def comparison_bars(domain: Domain, results: pd.DataFrame, metric: str = "accura
 
 
 MARKS = "os^Pv*X<h>p8d"
-"""Of methods in the overview, beside their colours."""
+"""Markers of methods in the overview."""
 ROW = 0.5
-"""Inches that a line of the overview is high."""
+"""Height of a line of the overview in inches."""
 
 
 def overview_dots(results: pd.DataFrame) -> Figure:
-    """All domains, settings and metrics of a comparison: a mark for each method, bars show standard errors over tasks.
+    """Plot all domains, settings and metrics of a comparison: a marker for each method, with standard errors over tasks.
 
-    Diamonds without filling are the paper's numbers, each beside the method that it is of; ticks are reference lines. Of ours in
-    other forms than the paper's those are shown that are chosen by themselves, and the domains' own.
+    Open diamonds are the paper's numbers of the same method; ticks are reference lines. Our forms are limited to the paper's,
+    automatically chosen forms and the default forms of the domains.
 
     Args:
         results: see :func:`~ftl_lightning.reporting.comparison.all_methods`.
@@ -174,12 +174,12 @@ def overview_dots(results: pd.DataFrame) -> Figure:
     return figure
 
 
-def _series(measured: Sequence[Compared], own: Set[Compared]) -> dict[str, list[Compared]]:
-    """What the overview's figure shows, by its label; forms that are chosen by themselves are one."""
+def _series(measured: Sequence[Compared], defaults: Set[Compared]) -> dict[str, list[Compared]]:
+    """Methods of the overview by label; automatically chosen forms share a label."""
     series: dict[str, list[Compared]] = {}
     for method in measured:
         chosen = method.name == OURS and CHOSEN in method.form
-        if chosen or method.name != OURS or not method.form or method in own:
+        if chosen or method.name != OURS or not method.form or method in defaults:
             series.setdefault(method_label(OURS, CHOSEN) if chosen else method_label(*method), []).append(method)
     return series
 
@@ -191,12 +191,12 @@ def _dots(
     series: Mapping[str, Sequence[Compared]],
     colour_of: Mapping[str, str],
 ) -> None:
-    """One domain's panel, the first line on top; in each line its name, reference lines, and the methods below each other."""
+    """Draw the panel of a domain, the first line on top; each line has its name, reference lines, and methods below each other."""
     domain = lines[0][0]
     rows, references = compared(domain, results), reference_lines(domain, results)
     for place, (_, setting, metric) in enumerate(lines):
-        told = f"{setting}, {metric}" + (" (less is better)" if domain.less_is_better(metric) else "")
-        axes.text(0, place - 0.34, figure_text(told), fontsize=7, va="center")
+        title = f"{setting}, {metric}" + (" (less is better)" if domain.less_is_better(metric) else "")
+        axes.text(0, place - 0.34, figure_text(title), fontsize=7, va="center")
         means = select(references, setting=setting, metric=metric).groupby("method")["value"].mean()
         axes.plot(means, [place - 0.12] * len(means), "|", color="black", markersize=5, markeredgewidth=1)
         for index, (label, forms) in enumerate(series.items()):
@@ -219,13 +219,13 @@ def _dots(
 
 
 def _labelled_methods(rows: pd.DataFrame) -> list[tuple[str, Compared]]:
-    """Labels in their order, each with its method."""
+    """Sorted labels, each with its method."""
     known = rows.drop_duplicates("label").sort_values("label")
     return [(str(row.label), Compared(str(row.method), str(row.form))) for row in known.itertuples()]
 
 
 def growth(domain: Domain, results: pd.DataFrame) -> Figure:
-    """Accuracy against the number of demonstrations and against K; bars show standard errors over tasks.
+    """Plot accuracy against the number of demonstrations and against K, with standard errors over tasks.
 
     Args:
         domain: the domain.
@@ -251,10 +251,10 @@ def growth(domain: Domain, results: pd.DataFrame) -> Figure:
 
 
 def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
-    """Accuracy over coverage, one panel for each suite and setting: a line for each method, its temperature from dark to light.
+    """Plot accuracy over coverage for each suite and setting: a line for each method, temperature from dark to light.
 
-    Means over tasks and seeds. The better a method, the further up and to the left: the axis of coverage, of which less is better,
-    is not turned round. Crosses and stars are the reference lines *demonstrations replayed* and *fresh samples*.
+    Points are means over tasks and seeds. Less coverage is better, so better methods lie further up and to the left. Crosses and
+    stars are the reference lines *demonstrations replayed* and *fresh samples*.
 
     Args:
         domain: the domain.
@@ -294,7 +294,7 @@ def frontier(domain: Domain, rows: pd.DataFrame) -> Figure:
 
 
 def learning_time(curves: Mapping[str, Sequence[Measured]]) -> Figure:
-    """Accuracy over the seconds of learning, a line for each curve; the dotted line is the accuracy that all of them reach.
+    """Plot accuracy over seconds of learning, a line for each curve; the dotted line is the accuracy that all curves reach.
 
     Args:
         curves: see :func:`ftl_lightning.reporting.speed.read_speed`.
@@ -316,15 +316,15 @@ def _range(lines: pd.DataFrame) -> str:
 
 
 def concept_map(model: ConceptModel, concepts: Sequence[Concept], seed: int = 0) -> Figure:
-    """t-SNE of training concepts and learned components (paper, figure 'tsne').
+    """Plot a t-SNE of training concepts and learned components (paper, figure 'tsne').
 
     Args:
-        model: whose concept space it is.
-        concepts: learned with it.
-        seed: of the map.
+        model: the pretrained model.
+        concepts: concepts learned with it.
+        seed: seed of t-SNE.
 
     Raises:
-        UserError: without scikit-learn.
+        UserError: if scikit-learn is missing.
     """
     places = concept_places(model, concepts, seed)
     figure = Figure(figsize=(9, 6), layout="constrained")

@@ -1,6 +1,6 @@
-"""Accuracy over coverage as the temperature varies: the file that ``benchmarks/frontier.py`` writes.
+"""Accuracy over coverage as the temperature varies: the file that ``benchmarks/experiments/frontier.py`` writes.
 
-It is JSON, since it holds other columns than results files, which are all ``.csv`` files of a folder.
+The file is JSON, since its columns differ from results files, which are all ``.csv`` files of a folder.
 """
 
 import json
@@ -23,11 +23,11 @@ from ftl_lightning.tensor_file import write_text
 FRONTIER = "frontier.json"
 """Name of the file in a folder of results."""
 NOISY = "demonstrations with noise"
-"""A line for which nothing is learned; its temperature is the noise, as a share of the demonstrations' standard deviation."""
+"""A line without learning; its temperature is the noise, as a share of the demonstrations' standard deviation."""
 SUBJECT = ["domain", "suite", "setting", "task", "method", "form", "variant", "temperature", "seed", "n"]
-"""Columns that tell one measurement from another; ``temperature`` is missing for reference lines and for methods without one."""
+"""Columns that identify a measurement; ``temperature`` is missing for reference lines and methods without temperature."""
 COLUMNS = [*SUBJECT, "accuracy", "novelty", "coverage"]
-"""``accuracy`` is the domain's main metric; what was not measured is missing."""
+"""All columns; ``accuracy`` is the domain's main metric; missing if not measured."""
 
 
 _NUMBERS = ["temperature", "accuracy", "novelty", "coverage"]
@@ -35,7 +35,7 @@ _NUMBERS = ["temperature", "accuracy", "novelty", "coverage"]
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the file, for its check."""
+    """A row of the file, for validation."""
 
     domain: str
     suite: str
@@ -53,10 +53,10 @@ class _Row:
 
 
 def read_frontier(path: str | Path) -> pd.DataFrame:
-    """The measurements of a file, or of the folder that holds it; none where there is no file.
+    """Read the measurements of a file, or of its folder; empty if there is no file.
 
     Raises:
-        UserError: naming the file and the row, for one of something else.
+        UserError: for an invalid file, naming file and row.
     """
     path = Path(path)
     path = path / FRONTIER if path.is_dir() else path
@@ -67,14 +67,14 @@ def read_frontier(path: str | Path) -> pd.DataFrame:
 
 
 def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
-    """The accuracy of a method at the temperature where its coverage is a given one, between the temperatures that were measured.
+    """Interpolate the accuracy of a method at a coverage, between measured temperatures.
 
     Args:
-        rows: of one method and suite; means over tasks and seeds are taken.
-        coverage: the distance.
+        rows: rows of a method and suite; averaged over tasks and seeds.
+        coverage: the coverage.
 
     Returns:
-        ``None`` where no temperature covers so much.
+        Accuracy; ``None`` outside the measured coverage.
     """
     means = rows.groupby("temperature")[["coverage", "accuracy"]].mean().sort_values("coverage")
     if means.empty or not means["coverage"].iloc[0] <= coverage <= means["coverage"].iloc[-1]:
@@ -83,8 +83,8 @@ def accuracy_at(rows: pd.DataFrame, coverage: float) -> float | None:
 
 
 def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Of each method accuracy, novelty and coverage at every temperature, and its accuracy where it covers as much as ours does at
-    temperature 1 with one set of embeddings.
+    """Accuracy, novelty and coverage of each method at every temperature, and its accuracy at the coverage of ours at temperature 1
+    with one set of embeddings.
 
     Args:
         domain: the domain.
@@ -106,11 +106,11 @@ def frontier_table(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def write_frontier(path: str | Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Add measurements to a file, made if missing; the same ones are replaced. Whole or not at all.
+    """Add measurements to a file atomically; equal subjects are replaced.
 
     Args:
-        path: the file.
-        rows: by :data:`COLUMNS`.
+        path: the file; created if missing.
+        rows: values by :data:`COLUMNS`.
     """
     known = read_frontier(path)
     table = pd.DataFrame(rows, columns=COLUMNS)

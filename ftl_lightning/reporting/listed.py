@@ -1,4 +1,4 @@
-"""Files of measurements that are no results files: JSON with a list of rows."""
+"""Files of measurements other than results files: JSON with a list of rows."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,27 +11,27 @@ T = TypeVar("T")
 
 
 def read_listed(path: Path, key: str, kind: Callable[..., T], expected: str) -> list[T]:
-    """The rows of a file.
+    """Read the rows of a file.
 
     Args:
-        path: of it.
-        key: that has them.
-        kind: a dataclass that says what a row has; ``null`` is the same as nothing.
-        expected: what the file is expected to hold, for messages.
+        path: the file.
+        key: key of the rows.
+        kind: dataclass of a row; ``null`` counts as missing.
+        expected: expected content, for messages.
 
     Raises:
-        UserError: naming the file and the row, for one of something else.
+        UserError: for an invalid file, naming file and row.
     """
     try:
         content = read_json(path)
         rows = content.get(key) if isinstance(content, dict) else None
         if not isinstance(rows, list):
             raise UserError(f"key {key!r}: expected a list, found {shown(rows)}")
-        return [from_mapping(kind, _told(row), f"{key}[{number}]") for number, row in enumerate(rows)]
+        return [from_mapping(kind, _given(row), f"{key}[{number}]") for number, row in enumerate(rows)]
     except UserError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise UserError(f"{path}: expected {expected}, found something else ({reason})") from error
 
 
-def _told(row: object) -> object:
+def _given(row: object) -> object:
     return {name: value for name, value in row.items() if value is not None} if isinstance(row, dict) else row

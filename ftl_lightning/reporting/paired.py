@@ -1,4 +1,4 @@
-"""Which of two methods is better, from tasks and seeds that both were measured on, or from episodes with the same starts."""
+"""Paired tests of two methods, over tasks and seeds or over episodes with the same initial states."""
 
 import math
 from collections.abc import Sequence
@@ -12,25 +12,25 @@ from ftl_lightning.domains.paper import Compared
 from ftl_lightning.evaluation.row import label
 
 LEVEL = 0.05
-"""A difference is shown where p is below this."""
+"""Significance level of p."""
 EXACT = 20
-"""Up to so many differences every pattern of signs is tried."""
+"""Maximum number of differences for the exact test."""
 DRAWS = 10_000
-"""Patterns that are drawn where there are more."""
+"""Number of drawn sign patterns otherwise."""
 ROUNDING = 2e-6
-"""Results are written with six digits; means nearer than this are equal."""
+"""Tolerance for equal means; results have six digits."""
 AHEAD, BEHIND, UNSHOWN, UNDECIDED = "ahead", "behind", "no difference shown", "undecided"
 SAME = "the same in every task and seed"
 
 
 def sign_flip(parts: Sequence[float]) -> float:
-    """Two-sided p of a sum of paired differences: how often it is at least as far from zero when their signs are drawn.
+    """Two-sided p of a sum of paired differences under random signs.
 
-    If neither method is better, each difference is as likely with the other sign. Exact up to :data:`EXACT` differences that are
-    not zero (a zero has no sign to flip); else of :data:`DRAWS` drawn patterns, as (b + 1) / (draws + 1) where b are as far.
+    If neither method is better, both signs of a difference are equally likely. The test is exact up to :data:`EXACT` nonzero
+    differences; else p is (b + 1) / (draws + 1), where b of :data:`DRAWS` drawn sums are at least as far from zero.
 
     Args:
-        parts: what each pair adds to the mean difference.
+        parts: contribution of each pair to the mean difference.
     """
     moving = np.array([part for part in parts if abs(part) > ROUNDING])
     far = abs(moving.sum()) - ROUNDING
@@ -44,9 +44,9 @@ def sign_flip(parts: Sequence[float]) -> float:
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Corrected p values of tests that are read together, each in its place (Holm, 1979).
+    """Corrected p values of several tests, in the given order (Holm, 1979).
 
-    The smallest is multiplied by their number, the next by one less, and so on; none is below the one before it.
+    The smallest is multiplied by the number of tests, the next by one less, and so on; corrected values never decrease.
     """
     adjusted, largest = [1.0] * len(values), 0.0
     for rank, index in enumerate(sorted(range(len(values)), key=values.__getitem__)):
@@ -56,19 +56,19 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def reachable(signs: int, tests: int) -> bool:
-    """Whether so many signs could show a difference: where all agree, two of 2^signs patterns are as far, times the tests."""
+    """Whether this number of signs can reach significance: if all agree, p is 2 / 2^signs, times the number of tests."""
     return tests * 2.0 ** (1 - signs) < LEVEL
 
 
 @dataclass(frozen=True)
 class Lead:
-    """Ours beside a baseline, in one setting and metric.
+    """Ours against a baseline, in one setting and metric.
 
     Attributes:
-        baseline: which.
-        difference: by how much ours is better, negative where the baseline is: the mean over tasks of means over seeds.
-        pairs: of task and seed that both were measured on.
-        p: after Holm's correction; ``None`` where the pairs are too few to show anything.
+        baseline: the baseline.
+        difference: mean over tasks of means over seeds; positive if ours is better.
+        pairs: number of pairs (task, seed) with both methods.
+        p: p after Holm's correction; ``None`` for too few pairs.
         same: whether every pair is equal.
     """
 
@@ -80,7 +80,7 @@ class Lead:
 
     @property
     def verdict(self) -> str:
-        """One of the five words of this module."""
+        """One of the five verdicts of this module."""
         if self.same:
             return SAME
         if self.p is None:
@@ -89,7 +89,7 @@ class Lead:
 
     @property
     def shown(self) -> str:
-        """The verdict with what it stands on."""
+        """The verdict with p or the number of pairs."""
         if self.same:
             return self.verdict
         because = chance(self.p) if self.p is not None else f"{self.pairs} pair" + "s" * (self.pairs > 1)
@@ -100,18 +100,18 @@ class Lead:
 
 
 def signed(difference: float) -> str:
-    """With its sign and two digits, or three where two would show a zero that is none."""
+    """Format with sign and two digits, or three if two would show zero."""
     digits = 3 if ROUNDING < abs(difference) < 0.005 else 2
-    return f"{round(difference, digits) + 0.0:+.{digits}f}"  # adding zero turns a negative zero into a positive one
+    return f"{round(difference, digits) + 0.0:+.{digits}f}"  # adding zero removes a negative zero
 
 
 def up(p: float) -> float:
-    """Rounded up to three digits, as it is shown and judged: one that is shown as .050 is not below it."""
+    """Round p up to three digits, for display and verdict: a displayed .050 is not significant."""
     return math.ceil(round(1000 * p, 6)) / 1000
 
 
 def chance(p: float) -> str:
-    """A p value in words, ``'p = .023'``; ``'p < .001'`` for a smaller one."""
+    """Format a p value: ``'p = .023'``, or ``'p < .001'``."""
     below, p = p < 0.001, up(p)
     if below:
         return "p < .001"
@@ -119,22 +119,22 @@ def chance(p: float) -> str:
 
 
 def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], less: bool = False) -> list[Lead]:
-    """Ours beside each baseline, by a sign-flip permutation test of differences paired by task and seed.
+    """Compare ours with each baseline by a sign-flip permutation test of differences paired by task and seed.
 
-    Seeds of a task are not independent tasks. Where tasks are enough, the signs of whole tasks are flipped, and p speaks of tasks
-    like these. Else those of (task, seed) pairs are, and p speaks of new seeds of just these tasks: demonstrations, learning and
-    samples, not the pretrained model. Where even these are too few (a single task and three seeds have p = .25 at the least),
-    nothing is decided. Enough is what could reach :data:`LEVEL` after Holm's correction for the number of baselines, which makes it
-    no matter that the best of them is known only afterwards.
+    Seeds of a task are not independent tasks. With enough tasks, the signs of whole tasks are flipped, and p generalises to similar
+    tasks. Else the signs of (task, seed) pairs are flipped, and p generalises to new seeds (demonstrations, learning and samples,
+    not the pretrained model) of the same tasks. With too few pairs (a single task and three seeds have p >= .25) there is no
+    verdict. A number is enough if it can reach :data:`LEVEL` after Holm's correction for the number of baselines, which also
+    covers the choice of the best baseline afterwards.
 
     Args:
-        rows: of one setting and metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
-        ours: the method that is compared.
-        baselines: methods that it is compared with; those without rows are left out.
-        less: whether of the metric less is better.
+        rows: rows of one setting and metric, with ``task``, ``seed``, ``method``, ``form`` and ``value``.
+        ours: our method.
+        baselines: methods to compare with; methods without rows are left out.
+        less: whether less is better.
 
     Returns:
-        In the order of ``baselines``; none where ours or all of them were not measured.
+        Leads in the order of ``baselines``; empty without measurements of ours or of any baseline.
     """
     values = {
         Compared(*map(str, named)): measured.groupby(["task", "seed"])["value"].mean() * (-1 if less else 1)
@@ -160,29 +160,29 @@ def leads(rows: pd.DataFrame, ours: Compared, baselines: Sequence[Compared], les
 
 
 def _parts(differences: pd.Series, tests: int) -> list[float]:
-    """What each whole task, or else each pair, adds to the mean over tasks; the signs of these are flipped together."""
+    """Contribution of each task, or else of each pair, to the mean over tasks."""
     by_task = differences.groupby("task")
     parts = differences / by_task.transform("size") / by_task.ngroups
     return list(parts.groupby("task").sum() if reachable(by_task.ngroups, tests) else parts)
 
 
 def least_certain(compared: Sequence[Lead]) -> Lead | None:
-    """The lead that a single verdict is about: *ahead* is ahead of every baseline, *behind* is behind at least one.
+    """The lead for a single verdict: *ahead* is ahead of every baseline, *behind* is behind at least one.
 
-    Of those with the same verdict it is the best baseline's. ``None`` for none.
+    Among equal verdicts it is the lead over the best baseline. ``None`` without leads.
     """
     return min(compared, key=lambda lead: ({BEHIND: 0, AHEAD: 2}.get(lead.verdict, 1), lead.difference), default=None)
 
 
 def episodes(won: int, lost: int, count: int) -> str:
-    """A paired difference of two success rates with its 95 % interval, McNemar's exact p, and how many outcomes are the same.
+    """Format a paired difference of success rates with 95 % interval, McNemar's exact p and the number of equal outcomes.
 
-    The interval is Wald's with half an episode added to each of the four outcomes (Agresti & Min, 2005): without that it has no
-    width where no episode differs.
+    The interval is Wald's with half an episode added to each of the four outcomes (Agresti & Min, 2005); otherwise it has no width
+    when no episode differs.
 
     Args:
-        won, lost: pairs in which only the one succeeds, and only the other.
-        count: all pairs.
+        won, lost: number of pairs in which only the first, or only the second, succeeds.
+        count: number of all pairs.
     """
     apart, all_four = won + lost, count + 2
     middle = (won - lost) / all_four
@@ -192,10 +192,10 @@ def episodes(won: int, lost: int, count: int) -> str:
 
 
 def mcnemar(won: int, lost: int) -> float:
-    """The exact two-sided p of so many pairs in which only the one succeeds, and only the other."""
+    """McNemar's exact two-sided p; arguments as in :func:`episodes`."""
     return min(1.0, 2 * float(binom.cdf(min(won, lost), won + lost, 0.5)))
 
 
 def same_outcome(won: int, lost: int, count: int) -> str:
-    """In how many episodes both succeed or both do not."""
+    """Format the number of episodes in which both succeed or both fail."""
     return f"same outcome in {count - won - lost} of {count}"

@@ -1,4 +1,4 @@
-"""The report: every table and figure of every domain that has results."""
+"""The report: tables and figures of every domain with results."""
 
 import re
 from collections.abc import Sequence
@@ -34,9 +34,9 @@ from ftl_lightning.reporting.tables import as_learned_most, tables
 from ftl_lightning.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
-"""What ``report --readme`` writes stands between these lines."""
+"""Lines around the text that ``report --readme`` writes."""
 MOST_DOMAINS, MOST_CELLS = 100, 10_000
-"""Of one report, and of the tables of one domain."""
+"""Maximum number of domains of a report, and of cells of a domain's tables."""
 
 
 def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
@@ -44,8 +44,8 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
 
     Args:
         results: a results file, or a folder of them.
-        out: folder; each domain gets one of its own.
-        readme: a Markdown file whose part between two marks is replaced by the comparison's overview in a few lines, or without a
+        out: output folder, with a subfolder for each domain.
+        readme: a Markdown file whose part between two marks is replaced by the short overview of the comparison, or without a
             comparison by each domain's main table. The complete overview is ``overview.md`` in ``out``.
 
     Returns:
@@ -94,14 +94,14 @@ def write_report(results: Path, out: Path, readme: Path | None = None) -> str:
 
 
 def _expect_few(results: Path, studies: Sequence[pd.DataFrame]) -> None:
-    """Refuse results whose tables nobody could read, and which would take hours to make.
+    """Refuse results whose tables would be unreadable and take hours.
 
     Raises:
-        UserError: naming what there is too much of.
+        UserError: naming the exceeded limit.
     """
     if (count := len({name for rows in studies for name in rows["domain"]})) > MOST_DOMAINS:
         raise UserError(f"{results}: expected at most {MOST_DOMAINS} domains, found {count}; report fewer files at a time")
-    for domain, domain_rows in (named for rows in studies for named in rows.groupby("domain")):
+    for domain, domain_rows in (group for rows in studies for group in rows.groupby("domain")):
         ours = of_method(domain_rows, PAPERS_METHOD)
         cells = domain_rows["setting"].nunique() * len(domain_rows.groupby(["method", "form", "variant"]))
         cells += ours["setting"].nunique() * ours["variant"].nunique() * ours["K"].nunique() * ours["omega"].nunique()
@@ -140,7 +140,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def _file(metric: str) -> str:
-    """A name in the domain's folder, whatever the metric is called; no hidden one."""
+    """A valid file name, not hidden, for any metric."""
     return re.sub(r"[^\w+-]+", "_", metric).strip("_")[:100] or "_"
 
 

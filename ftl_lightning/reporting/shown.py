@@ -1,4 +1,4 @@
-"""What reports show of a domain: the only place of the reports that knows what a domain is made of."""
+"""Settings, metrics and published numbers of a domain for reports, which access domains only here."""
 
 import re
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from ftl_lightning.evaluation.judged import LOST, WON
 from ftl_lightning.printing import say
 
 TRAINING, PAPER = "training", "paper"
-"""Suites that come first in reports, in domains that have them."""
+"""Suites that come first in reports, if a domain has them."""
 
 
 def domain_of(name: str, rows: pd.DataFrame) -> Domain:
-    """The domain that results are about; of one that is not installed, or a user's own data, what the rows tell of it.
+    """The domain of results; for user data or a domain that is not installed, reconstructed from the rows.
 
     Raises:
-        UserError: for a name that no folder of a report can have.
+        UserError: for a name that cannot be a folder of a report.
     """
     if not re.fullmatch(r"\w[\w .+-]{0,99}", name):
         raise UserError(
@@ -54,12 +54,12 @@ def training_settings(domain: Domain) -> tuple[str, ...]:
 
 
 def component_tasks(domain: Domain) -> tuple[EvaluationTask, ...]:
-    """Tasks that are generated from a single component; they have a table of their own."""
+    """Tasks generated from a single component; they have a separate table."""
     return tuple(task for suite in domain.concepts.suites.values() for task in suite.tasks if task.component is not None)
 
 
 def settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
-    """The settings that have results: those of training, then the paper's, then others as they appear."""
+    """Settings with results: training settings, the paper's, then others in order of appearance."""
     apart = {task.setting for task in component_tasks(domain)}
     measured = [setting for setting in dict.fromkeys(rows["setting"]) if setting not in apart]
     order = dict.fromkeys((*training_settings(domain), *_suite(domain, PAPER), *measured))
@@ -67,46 +67,44 @@ def settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
 
 
 def learned_settings(domain: Domain, rows: pd.DataFrame) -> list[str]:
-    """The settings that the ablations of K and omega are about: all but those of training concepts."""
+    """Settings for the ablations of K and omega: all but training settings."""
     return [setting for setting in settings(domain, rows) if setting not in training_settings(domain)]
 
 
 def metrics(domain: Domain) -> tuple[str, ...]:
-    """What the methods are compared by: the main metric, success in closed loop and what goes wrong there, the headline, and the
-    paper's.
-    """
+    """Metrics of the comparison: the main metric, success and failures in closed loop, the headline, and the paper's metrics."""
     executed = [EXECUTED, *(f"{CLOSED} {outcome}" for outcome in domain.closed_loop.less_is_better)] if domain.closed_loop else []
     names = dict.fromkeys((domain.main_metric, *executed, domain.headline, *(number.metric for number in published(domain))))
     return tuple(name for name in names if name)
 
 
 def decisive(domain: Domain, rows: pd.DataFrame) -> str:
-    """The one metric of a small table: the domain's headline, or its main metric in rows without the headline."""
+    """The metric of a small table: the domain's headline, or its main metric if the rows lack the headline."""
     return domain.headline if domain.headline in set(rows["metric"]) else domain.main_metric
 
 
 def policies(domain: Domain) -> Sequence[str]:
-    """Reference policies that act from the same initial states as the method."""
+    """Reference policies that start from the method's initial states."""
     return tuple(domain.closed_loop.policies) if domain.closed_loop else ()
 
 
 def environments(domain: Domain) -> Sequence[str]:
-    """Behind the names of outcomes: nothing in the domain's own environment, the names of its others in these."""
+    """Suffixes of outcomes by environment: empty for the default environment, names in brackets for others."""
     return ("", *(f" ({name})" for name in domain.closed_loop.others)) if domain.closed_loop else ()
 
 
 def published(domain: Domain) -> tuple[Published, ...]:
-    """The paper's numbers that were measured as ours are; where there are none, tables have no columns for them."""
+    """The paper's numbers, if comparable with ours; otherwise tables have no columns for the paper."""
     return domain.paper.numbers if domain.paper and domain.paper.comparable else ()
 
 
 def main_omega(domain: Domain) -> str:
-    """The guidance weight of our main tables; empty for whatever was measured."""
+    """Guidance weight of our main tables; empty for any measured weight."""
     return domain.paper.ours if domain.paper else ""
 
 
 def papers_omega(domain: Domain) -> str:
-    """The guidance weight of the paper's main figures; empty where there is no paper."""
+    """Guidance weight of the paper's main figures; empty without a paper."""
     return domain.paper.omega if domain.paper else ""
 
 
@@ -119,14 +117,14 @@ def lookup(
     omega: str = "",
     method: Compared = PAPERS_METHOD,
 ) -> Published | None:
-    """The paper's number, if it has one.
+    """The paper's number, or ``None``.
 
     Args:
         domain: the domain.
         setting, metric, task: as in a row of the results; without a task the mean of the setting.
-        components: K; of a baseline it does not matter.
-        omega: the guidance weight as text; empty for that of the paper's main figures. Of a baseline it does not matter.
-        method: ours, or a baseline; the paper has numbers of its own form alone.
+        components: K; ignored for baselines.
+        omega: guidance weight as text; empty for the weight of the paper's main figures; ignored for baselines.
+        method: ours, or a baseline; of our forms, only the paper's has numbers.
     """
     learned = (components, omega or papers_omega(domain))
     for number in published(domain):
@@ -137,15 +135,15 @@ def lookup(
 
 
 def paper_tasks(domain: Domain, setting: str) -> list[str]:
-    """Tasks of a setting of which the paper's main figures show a number of their own."""
+    """Tasks of a setting with numbers in the paper's main figures."""
     numbers = [number for number in published(domain) if number.setting == setting and number.omega == papers_omega(domain)]
     return [number.task for number in numbers if number.task]
 
 
 def headlines(domain: Domain, rows: pd.DataFrame) -> list[tuple[str, str]]:
-    """Settings and metrics that say most in few lines: those that the paper has numbers of, then the same settings in closed loop.
+    """Settings and metrics of short tables: those with numbers of the paper, then the same settings in closed loop.
 
-    Without a paper the first setting of the suite ``paper``, or all where it has none, each with its decisive metric.
+    Without a paper: the first setting of the suite ``paper``, else all settings, each with its decisive metric.
     """
     measured = set(zip(rows["setting"], rows["metric"], strict=True))
     measured_settings = settings(domain, rows)

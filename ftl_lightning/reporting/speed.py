@@ -1,4 +1,4 @@
-"""Accuracy over seconds of learning: the file that ``benchmarks/speed.py`` writes."""
+"""Accuracy over seconds of learning: the file that ``benchmarks/speed/speed.py`` writes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,19 +9,19 @@ from ftl_lightning.reporting.listed import read_listed
 SPEED = "speed.json"
 """Name of the file in a folder of results."""
 PUBLISHED, ONE, TEN = "published procedure, one concept", "ours, one concept", "ours, ten concepts together"
-"""The curves."""
+"""Names of the curves."""
 WITHIN = 0.02
-"""An accuracy so much below the final one counts as reached."""
+"""Tolerance below the final accuracy that counts as reached."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was learned in some time.
+    """A point of a curve.
 
     Attributes:
-        curve: what it belongs to, such as :data:`PUBLISHED`.
-        steps: of gradient descent; a mean over concepts where each stops by itself.
-        seconds: they took.
+        curve: name of the curve, such as :data:`PUBLISHED`.
+        steps: gradient steps; mean over concepts if each stops by itself.
+        seconds: learning time.
         accuracy: mean over concepts of the share of plans that show the concept.
     """
 
@@ -32,15 +32,15 @@ class Measured:
 
 
 def reached(curves: Mapping[str, Sequence[Measured]]) -> float:
-    """The accuracy that every curve reaches: the least final one, less :data:`WITHIN`."""
+    """The accuracy that every curve reaches: minimum of final accuracies, minus :data:`WITHIN`."""
     return min(curve[-1].accuracy for curve in curves.values()) - WITHIN
 
 
 def read_speed(path: str | Path) -> dict[str, list[Measured]]:
-    """The curves of a file, or of the folder that holds it; none where there is no file.
+    """Read the curves of a file, or of its folder; empty if there is no file.
 
     Raises:
-        UserError: naming the file and the row, for one of something else.
+        UserError: for an invalid file, naming file and row.
     """
     path = Path(path)
     path = path / SPEED if path.is_dir() else path

@@ -1,4 +1,4 @@
-"""One table: the number behind rows of the results, beside the paper's, and a table as Markdown to read and LaTeX to paste."""
+"""Summary numbers of results, and tables in Markdown and LaTeX."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ftl_lightning.reporting.shown import published
 
 MISSING = "-"
 MOST_COLUMNS = 8
-"""Of a table that a page of the documentation can show."""
+"""Maximum columns of a table in the documentation."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class Number:
     """A measured accuracy.
 
     Attributes:
-        mean: over tasks and seeds.
+        mean: mean over tasks and seeds.
         error: standard error over tasks, of the means over seeds; ``None`` for a single task.
         spread: standard deviation over seeds, of the means over tasks; ``None`` for a single seed.
-        seeds: how many.
+        seeds: number of seeds.
     """
 
     mean: float
@@ -38,12 +38,12 @@ class Number:
         return f"{self.with_error()}{spread}"
 
     def with_error(self) -> str:
-        """Without the spread over seeds."""
+        """Format without the spread over seeds."""
         return f"{self.mean:.2f}" + ("" if self.error is None else f" ± {self.error:.2f}")
 
 
 def summarise(rows: pd.DataFrame) -> Number | None:
-    """The number behind some rows of the results, or ``None`` for no rows."""
+    """Summarise rows of the results; ``None`` for no rows."""
     if rows.empty:
         return None
     by_task = rows.groupby("task")["value"].mean()
@@ -61,8 +61,8 @@ class Table:
     """A table.
 
     Attributes:
-        name: of its files.
-        caption: one sentence.
+        name: name of its files.
+        caption: a sentence.
         cells: rows and columns of text.
     """
 
@@ -91,7 +91,7 @@ class Table:
 
 
 def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
-    """The rows with these values in their columns."""
+    """Select rows by values of columns."""
     chosen = np.ones(len(rows), dtype=bool)
     for column, value in values.items():
         chosen &= (rows[column] == value).to_numpy(dtype=bool)
@@ -99,28 +99,28 @@ def select(rows: pd.DataFrame, **values: object) -> pd.DataFrame:
 
 
 def of_method(rows: pd.DataFrame, method: Compared) -> pd.DataFrame:
-    """The rows of a method in one of its forms."""
+    """Select the rows of a method in one form."""
     return select(rows, method=method.name, form=method.form)
 
 
 def paper(papers: Published | None) -> str:
-    """The paper's number with its standard error."""
+    """Format the paper's number with its standard error."""
     if papers is None:
         return MISSING
     return f"{papers.value:.2f}" + ("" if papers.error is None else f" ± {papers.error:.2f}")
 
 
 def difference_to(papers: Published | None, number: Number | None) -> str:
-    """Ours less the paper's."""
+    """Format ours minus the paper's."""
     return MISSING if papers is None or number is None else f"{number.mean - papers.value:+.2f}"
 
 
 PAPERS = ("paper", "difference")
-"""Columns that tables of domains without a paper do not have."""
+"""Columns of tables of domains with a paper."""
 
 
 def make_table(domain: Domain, name: str, caption: str, lines: Sequence[Sequence[str]], columns: Sequence[str]) -> Table:
-    """A table, without the paper's columns where the domain has no numbers of a paper, or none for any of the lines."""
+    """A table; without numbers of a paper for the lines, it lacks the paper's columns."""
     cells = pd.DataFrame(lines, columns=list(columns), dtype=str)
-    told = bool(published(domain)) and any(set(cells[name]) - {MISSING} for name in PAPERS if name in cells)
-    return Table(name, caption, cells if told else cells.loc[:, ~cells.columns.isin(PAPERS)])
+    with_paper = bool(published(domain)) and any(set(cells[name]) - {MISSING} for name in PAPERS if name in cells)
+    return Table(name, caption, cells if with_paper else cells.loc[:, ~cells.columns.isin(PAPERS)])

@@ -41,38 +41,38 @@ from ftl_lightning.reporting.table import (
 )
 
 USUAL_K = 2
-"""Number of components of the main tables, the paper's."""
+"""Number of components in the main tables, as in the paper."""
 LEARNED = "learned"
-"""The guidance weight of components whose weights are learned."""
+"""Value of ``omega`` for learned guidance weights."""
 
 
 def _cell(rows: pd.DataFrame) -> str:
-    """A number as a table shows it, with a mark if it was not measured as the caption says."""
+    """Cell text of a number, marked if its weighting differs from the caption's."""
     number = summarise(rows)
     marks = dict.fromkeys(rows["mark"]) if "mark" in rows else ()
     return MISSING if number is None else str(number) + "".join(marks)
 
 
 BESIDE = ("method", "measured", *PAPERS)
-"""The last columns of tables of our method in all its forms."""
+"""Last columns of the tables of our method in all its forms."""
 
 
 def _beside(
     rows: pd.DataFrame, names: Sequence[str], papers: Callable[[Compared], Published | None] = lambda method: None
 ) -> list[list[str]]:
-    """The columns :data:`BESIDE` of each method that the rows have a number of.
+    """Cells of the columns :data:`BESIDE` for each method with rows.
 
     Args:
-        rows: with labels, see :func:`labelled`.
-        names: labels of methods, in their order.
-        papers: the paper's number of a method, if it has one.
+        rows: rows with labels, see :func:`labelled`.
+        names: labels of methods, in order.
+        papers: the paper's number of a method, or ``None``.
     """
     lines = []
     for name in names:
-        own = select(rows, label=name)
-        if (number := summarise(own)) is not None:
-            published_number = papers(Compared(*own.iloc[0][["method", "form"]]))
-            lines.append([name, _cell(own), paper(published_number), difference_to(published_number, number)])
+        method_rows = select(rows, label=name)
+        if (number := summarise(method_rows)) is not None:
+            published_number = papers(Compared(*method_rows.iloc[0][["method", "form"]]))
+            lines.append([name, _cell(method_rows), paper(published_number), difference_to(published_number, number)])
     return lines
 
 
@@ -84,37 +84,37 @@ def _references(
     subjects: Sequence[tuple[list[str], pd.DataFrame]],
     heads: Sequence[str],
 ) -> Table:
-    """The reference lines beside a table.
+    """The table of reference lines beside another table.
 
     Args:
-        domain: whose.
-        name, caption: of the table that they stand beside.
-        rows: all, for the order of lines.
-        subjects: the first cells of a line, and the rows behind it.
-        heads: of these cells.
+        domain: the domain.
+        name, caption: of the other table.
+        rows: all rows, for the order of lines.
+        subjects: first cells of each line, and its rows.
+        heads: column names of the first cells.
     """
     _, names = _columns(rows)
     lines = [
-        [*first, label, _cell(own)]
+        [*first, label, _cell(reference)]
         for first, subject_rows in subjects
         for label in names
-        if not (own := select(subject_rows, role=REFERENCE, label=label)).empty
+        if not (reference := select(subject_rows, role=REFERENCE, label=label)).empty
     ]
     return make_table(domain, f"{name}_references", f"{caption}: reference lines", lines, [*heads, "reference line", "measured"])
 
 
 def _columns(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
-    """Methods and reference lines among the results, each sorted."""
+    """Sorted labels of methods and of reference lines."""
     return tuple(sorted(set(rows.loc[rows["role"] == role, "label"])) for role in (METHOD, REFERENCE))  # type: ignore[return-value]
 
 
 def labelled(rows: pd.DataFrame) -> pd.DataFrame:
-    """With a column ``label``: the method with its form and variant."""
+    """Add the column ``label``: the method with its form and variant."""
     return rows.assign(label=labels(rows))
 
 
 def weighting(components: int, omega: str) -> str:
-    """The number of components and how they are weighted, in words."""
+    """The number of components and their weights, in words."""
     weights = "learned weights" if omega == LEARNED else f"fixed omega {omega}"
     return f"K = {components}, {weights}" if components else weights
 
@@ -125,15 +125,15 @@ def _weightings(rows: pd.DataFrame) -> list[tuple[int, str]]:
 
 
 def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
-    """What a main table shows of each method and setting: two components with the main weight, or else what was measured most.
+    """Rows of a main table: for each method and setting two components with the main weight, or else the most measured weighting.
 
     Args:
-        rows: with labels, see :func:`labelled`.
-        omega: the main tables' guidance weight.
+        rows: rows with labels, see :func:`labelled`.
+        omega: guidance weight of the main tables.
 
     Returns:
-        The rows, with a column ``mark`` that says in brackets where ours was learned otherwise than the caption says; and the
-        caption's words for how it was learned.
+        The rows, with the weighting of ours in the column ``mark`` where it differs from the caption's; and the caption's words
+        for the weighting.
     """
     rows = rows[rows["role"] == METHOD]
     usual = (USUAL_K, omega)
@@ -154,22 +154,22 @@ def main_rows(rows: pd.DataFrame, omega: str) -> tuple[pd.DataFrame, str]:
 
 
 def as_learned_most(domain: Domain, rows: pd.DataFrame) -> pd.DataFrame:
-    """Of each method, form and setting the rows of one way of learning, and all reference lines.
+    """Rows of a single configuration for each method, form and setting, and all reference lines.
 
-    The guidance weight is that of the main tables (:func:`main_rows`); of variants and numbers of demonstrations it is what was
-    measured most, the largest number where several were measured alike.
+    The guidance weight is that of the main tables (:func:`main_rows`). Variant and number of demonstrations are the most measured;
+    ties go to more demonstrations.
     """
     chosen, _ = main_rows(labelled(latest(rows)), main_omega(domain))
     kept = []
-    for _, own in chosen.groupby(["method", "form", "setting"], sort=False):
-        counts = own.groupby(["variant", "demonstrations"], sort=False).size()
+    for _, group in chosen.groupby(["method", "form", "setting"], sort=False):
+        counts = group.groupby(["variant", "demonstrations"], sort=False).size()
         variant, demonstrations = max(counts.index, key=lambda way: (counts[way], way[1]))
-        kept.append(select(own, variant=variant, demonstrations=demonstrations))
+        kept.append(select(group, variant=variant, demonstrations=demonstrations))
     return pd.concat([*kept, select(latest(rows), role=REFERENCE)])[list(rows.columns)]
 
 
 def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
-    """Every table of a domain for which there are results, reference lines in tables of their own."""
+    """All tables of a domain that have results, with separate tables of reference lines."""
     domain_rows = labelled(latest(select(results, domain=domain.name)))
     metric = domain.main_metric
     rows = select(domain_rows, metric=metric)
@@ -186,7 +186,7 @@ def tables(domain: Domain, results: pd.DataFrame) -> list[Table]:
 
 
 def _accuracy(domain: Domain, rows: pd.DataFrame, metric: str, name: str) -> list[Table]:
-    """The bars of the paper's main figure, and trivial policies and the oracle."""
+    """The numbers of the paper's main figure, and trivial policies and the oracle."""
     learned_labels, _ = _columns(rows)
     selected, how = main_rows(rows, main_omega(domain))
     lines, subjects = [], []
@@ -211,7 +211,7 @@ def _of_paper(domain: Domain, setting: str, metric: str, method: Compared, task:
 
 
 def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
-    """All that happened in closed loop, by setting."""
+    """All outcomes in closed loop, by setting."""
     executed = rows[rows["metric"].str.startswith(CLOSED)]
     selected, how = main_rows(executed, main_omega(domain))
     learned_labels, _ = _columns(executed)
@@ -231,10 +231,10 @@ def _outcomes(domain: Domain, rows: pd.DataFrame) -> list[Table]:
 
 
 def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
-    """In how many episodes only ours succeeds, in how many only the policy from the same start, and of how many; maybe ``None``.
+    """Episodes that only ours wins, episodes that only the policy wins from the same start, and all; ``None`` without rows.
 
     Raises:
-        UserError: for rows that no episodes can have.
+        UserError: for counts that are impossible.
     """
     won, lost = (select(ours, metric=f"{begin}{policy}") for begin in (WON, LOST))
     if won.empty:
@@ -250,7 +250,7 @@ def against(ours: pd.DataFrame, policy: str) -> tuple[int, int, int] | None:
 
 
 def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
-    """Our successes less those of reference policies from the same starts, over all seeds, in each environment."""
+    """Difference between our success and that of reference policies from the same starts, over all seeds, by environment."""
     selected, _ = main_rows(rows, main_omega(domain))
     learned_labels, _ = _columns(selected[selected["metric"].str.startswith(WON)])
     lines, elsewhere = [], ""
@@ -276,21 +276,21 @@ def _grid(
     lines: Sequence[tuple[Sequence[str], Callable[[Compared], Published | None], pd.DataFrame]],
     heads: Sequence[str],
 ) -> Table:
-    """A table with a line for each method of each subject: its first cells, the paper's number of a method, the rows behind it."""
+    """A table with a line for each method of each subject (first cells, the paper's number of a method, rows)."""
     learned_labels, _ = _columns(rows)
     cells = [[*first, *line] for first, papers, line_rows in lines for line in _beside(line_rows, learned_labels, papers)]
     return make_table(domain, name, caption, cells, [*heads, *BESIDE])
 
 
 def _judged(domain: Domain, rows: pd.DataFrame) -> list[str]:
-    """The metrics of tables of K and omega: the main one, what goes wrong in closed loop, and the paper's."""
+    """Metrics of the tables of K and omega: the main metric, failures in closed loop, and the paper's metrics."""
     wrong = [metric for metric in metrics(domain) if domain.less_is_better(metric)]
     papers = [number.metric for number in published(domain)]
     return [metric for metric in dict.fromkeys((domain.main_metric, *wrong, *papers)) if metric in set(rows["metric"])]
 
 
 def _count(domain: Domain, rows: pd.DataFrame) -> Table:
-    """The ablation on the number of learned concepts, with learned weights."""
+    """Ablation of the number of learned concepts, with learned weights."""
     ours = select(of_method(rows, PAPERS_METHOD), omega=LEARNED)
     lines = [
         (
@@ -307,7 +307,7 @@ def _count(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
-    """The effect of the guidance weight, K = 2, or the K that was measured most."""
+    """Ablation of the guidance weight, for K = 2 or else the most measured K."""
     ours = of_method(rows, PAPERS_METHOD)
     counts = Counter(components for components, _ in _weightings(ours) if components)
     count = USUAL_K if USUAL_K in counts or not counts else counts.most_common(1)[0][0]
@@ -327,7 +327,7 @@ def _omega(domain: Domain, rows: pd.DataFrame) -> Table:
 
 
 def _components(domain: Domain, rows: pd.DataFrame, metric: str) -> Table:
-    """What each learned component generates alone, with learned weights, or as it was measured most."""
+    """Each learned component alone, with learned weights or else the most measured weighting."""
     tasks = component_tasks(domain)
     selected, how = main_rows(rows[rows["setting"].isin({task.setting for task in tasks})], LEARNED)
     lines = [

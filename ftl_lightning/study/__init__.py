@@ -1,1 +1,1 @@
-"""A study with people: films of generated behaviour in one web page, and tables of what its raters answered."""
+"""A study with people: films of generated behaviour on a web page, and tables of the raters' answers."""

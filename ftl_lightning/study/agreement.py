@@ -1,4 +1,4 @@
-"""Agreement between raters who put things into categories."""
+"""Agreement between raters who assign categories."""
 
 import math
 from collections import Counter
@@ -8,15 +8,15 @@ from collections.abc import Hashable, Iterable, Sequence
 def krippendorff_alpha(units: Iterable[Sequence[Hashable]]) -> float:
     """Krippendorff's alpha of categories without an order.
 
-    ``1 - D_observed / D_expected``: 1 where all agree, 0 where they agree as often as by chance, less where less. (K. Krippendorff,
+    ``1 - D_observed / D_expected``: 1 for full agreement, 0 for agreement by chance, negative for less. (K. Krippendorff,
     "Computing Krippendorff's Alpha-Reliability", 2011, part C and D.)
 
     Args:
-        units: for everything that was judged, the categories that raters gave it, in any order; who gave none is left out, and a
-            unit that fewer than two raters judged does not count.
+        units: for each rated item, the categories given by raters, in any order; missing ratings are omitted, and items with fewer
+            than two ratings do not count.
 
     Returns:
-        alpha, or NaN where nothing varies: then agreement cannot be told from a habit.
+        alpha, or NaN if nothing varies, because agreement is then indistinguishable from habit.
     """
     paired = [Counter(unit) for unit in units if len(unit) > 1]
     totals = sum(paired, Counter())

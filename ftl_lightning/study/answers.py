@@ -1,4 +1,4 @@
-"""What raters answered: files that their browsers saved, read and checked against a study's key."""
+"""Answers of raters: files saved by their browsers, read and checked against a study's key."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from ftl_lightning.study.questions import BEST, CHECK, DEPICTS, NO, REPEAT, YES
 
 ANSWERS_KIND = "study answers"
 REPEATS_THAT_MAY_DIFFER = 0.5
-"""Share of the questions asked twice that an attentive rater may answer both ways."""
+"""Maximum fraction of repeated questions that an attentive rater may answer inconsistently."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """What a study's questions and films are.
+    """Meaning of a study's questions and films.
 
     Attributes:
-        study, page: 16-digit names of the study and of its page.
+        study, page: 16-digit identifiers of the study and of its page.
         questions: by id: ``kind``, ``text``, ``films``, and ``expected`` of a check, ``scenario`` and ``setting`` of a comparison.
-        films: by id: ``setting``, ``scenario``, ``concept``, ``method``, where it is from.
+        films: by id: ``setting``, ``scenario``, ``concept``, ``method``, and the film's source.
     """
 
     study: str
@@ -37,12 +37,12 @@ class Key:
 
 @dataclass(frozen=True)
 class Rater:
-    """One person's answers.
+    """Answers of one person.
 
     Attributes:
-        file: they came from.
-        name: 16 digits that the browser drew.
-        answers: by question: ``'yes'``, ``'no'``, or a film's id.
+        file: source of the answers.
+        name: 16 digits drawn by the browser.
+        answers: by question id: ``'yes'``, ``'no'``, or a film's id.
     """
 
     file: Path
@@ -52,20 +52,20 @@ class Rater:
 
 def _json(path: Path, kind: str) -> dict[str, Any]:
     content = read_json(path, f"a {kind} file")
-    found = content.get("kind") if isinstance(content, dict) else None
-    if found != kind:
-        told = f"a {short(str(found))} file" if found else "a file of other software"
-        raise UserError(f"{path}: expected a {kind} file, found {told}")
+    actual = content.get("kind") if isinstance(content, dict) else None
+    if actual != kind:
+        description = f"a {short(str(actual))} file" if actual else "a file of other software"
+        raise UserError(f"{path}: expected a {kind} file, found {description}")
     if content.get("format") != FORMAT:
         raise UserError(f"{path}: key 'format': expected {FORMAT}, found {shown(content.get('format'))}; it is of another version")
     return content
 
 
 def read_key(path: Path) -> Key:
-    """The key that ``study`` wrote.
+    """Read the key written by ``study``.
 
     Raises:
-        UserError: naming the file, if it is missing, damaged or something else.
+        UserError: naming the file, if it is missing, damaged or of another kind.
     """
     content = _json(path, KEY_KIND)
     try:
@@ -77,8 +77,8 @@ def read_key(path: Path) -> Key:
             _expect_texts(question, ("text", "kind"))
             if not question["films"] or not {*question["films"]} <= key.films.keys():
                 raise KeyError("films")
-        asked = {_asked(question) for question in key.of_kind(DEPICTS).values()}
-        if not {_asked(question) for question in key.of_kind(REPEAT).values()} <= asked:
+        original = {_identity(question) for question in key.of_kind(DEPICTS).values()}
+        if not {_identity(question) for question in key.of_kind(REPEAT).values()} <= original:
             raise KeyError("a question that is repeated")
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
@@ -93,13 +93,13 @@ def _expect_texts(entry: Mapping[str, Any], names: Sequence[str]) -> None:
             raise ValueError(f"{name}: {shown(entry[name])}")
 
 
-def _asked(question: Mapping[str, Any]) -> tuple[str, ...]:
-    """What makes a question the same as another."""
+def _identity(question: Mapping[str, Any]) -> tuple[str, ...]:
+    """Content by which repeated questions are equal."""
     return (question["text"], *question["films"])
 
 
 def read_rater(path: Path, key: Key) -> Rater:
-    """One file of answers.
+    """Read one file of answers.
 
     Raises:
         UserError: naming the file, if it is missing, damaged, of another study, of another page, or not finished.
@@ -115,16 +115,16 @@ def read_rater(path: Path, key: Key) -> Rater:
         raise UserError(f"{path}: expected a rater and a list of answers, found a damaged file")
     answers: dict[str, str] = {}
     for entry in given:
-        if entry is None:  # the browser's word for a question that was not reached
+        if entry is None:  # a question that was not reached
             continue
-        asked = entry.get("id") if isinstance(entry, dict) else None
-        question = key.questions.get(asked) if isinstance(asked, str) else None
+        identifier = entry.get("id") if isinstance(entry, dict) else None
+        question = key.questions.get(identifier) if isinstance(identifier, str) else None
         if question is None or entry["id"] in answers:
             raise UserError(f"{path}: key 'answers': expected one answer to each question, found {shown(entry)}")
         allowed = (YES, NO) if question["kind"] != BEST else question["films"]
         if entry.get("answer") not in allowed:
-            told = " or ".join(allowed)
-            raise UserError(f"{path}: answer to {entry['id']}: expected {told}, found {entry.get('answer')!r}")
+            choices = " or ".join(allowed)
+            raise UserError(f"{path}: answer to {entry['id']}: expected {choices}, found {entry.get('answer')!r}")
         answers[entry["id"]] = entry["answer"]
     if not content.get("finished") or len(answers) < len(key.questions):
         raise UserError(
@@ -134,14 +134,14 @@ def read_rater(path: Path, key: Key) -> Rater:
 
 
 def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]]:
-    """Files of answers; of those that cannot be read it is told why, and the others go on.
+    """Read files of answers; invalid files are reported and skipped.
 
     Args:
-        paths: files, or folders whose ``answers*.json`` are meant.
-        key: of the study.
+        paths: files, or folders with files ``answers*.json``.
+        key: key of the study.
 
     Returns:
-        Raters, each once, and one line for every file that is refused.
+        Unique raters, and one line for each refused file.
     """
     files: list[Path] = []
     refused: list[str] = []
@@ -167,18 +167,18 @@ def read_raters(paths: Sequence[Path], key: Key) -> tuple[list[Rater], list[str]
 
 
 def inattention(rater: Rater, key: Key) -> str:
-    """Why a rater's answers do not count, or nothing if they do.
+    """Reason to exclude a rater's answers; empty if they count.
 
-    A rater has failed who answers any check wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions in
-    two ways.
+    A rater fails by answering any check wrongly, or more than :data:`REPEATS_THAT_MAY_DIFFER` of the repeated questions
+    inconsistently.
     """
     checks = key.of_kind(CHECK)
     wrong = sum(rater.answers[name] != question["expected"] for name, question in checks.items())
     if wrong:
         return f"{wrong} of {len(checks)} attention checks answered wrongly"
-    first = {_asked(question): name for name, question in key.of_kind(DEPICTS).items()}
-    pairs = [(name, first[_asked(question)]) for name, question in key.of_kind(REPEAT).items()]
-    differ = sum(rater.answers[one] != rater.answers[other] for one, other in pairs)
+    first = {_identity(question): name for name, question in key.of_kind(DEPICTS).items()}
+    pairs = [(name, first[_identity(question)]) for name, question in key.of_kind(REPEAT).items()]
+    differ = sum(rater.answers[repeat] != rater.answers[original] for repeat, original in pairs)
     if differ > REPEATS_THAT_MAY_DIFFER * len(pairs):
         return f"{differ} of {len(pairs)} questions that were asked twice answered in two ways"
     return ""

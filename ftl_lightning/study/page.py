@@ -1,4 +1,4 @@
-"""The page that raters open: one file with films, questions and its own program, which asks nothing of a network."""
+"""The page for raters: a single file with films, questions and scripts, which uses no network."""
 
 import base64
 import html
@@ -23,14 +23,14 @@ from ftl_lightning.tensor_file import bytes_hash, content_hash, write_text
 
 PAGE, KEY = "study.html", "key.json"
 KEY_KIND, FORMAT = "study key", 1
-"""Of the key's file."""
+"""Kind and format of the key's file."""
 HERE = Path(__file__).parent
 CONSENT = (
     "You will see short films of generated behaviour and say what they depict. It takes about {minutes} minutes. "
     "Nobody asks for your name. Your answers stay in this browser until you save them as a file yourself at the end. "
     "You may stop at any time, and what you do not save is not used. Some questions check attention."
 )
-"""What raters agree to, unless whoever runs the study says otherwise."""
+"""Default consent of raters."""
 AGREE = "I am 18 or older, I have read this, and I take part voluntarily."
 SECONDS_A_QUESTION = 9
 MILLIMETRES = 1000
@@ -38,12 +38,12 @@ MILLIMETRES = 1000
 
 @dataclass(frozen=True)
 class Made:
-    """What :func:`make_study` wrote.
+    """Result of :func:`make_study`.
 
     Attributes:
-        page, key: the files.
-        study: 16-digit name of the study.
-        size: of the page in bytes; films: in it; questions: a rater answers.
+        page, key: paths of the files.
+        study: 16-digit identifier of the study.
+        size: bytes of the page; films: number of films; questions: number of questions for a rater.
     """
 
     page: Path
@@ -58,14 +58,14 @@ def make_study(domain: Domain, questions: Questions, out: Path, title: str = "",
     """Write a study's page and key; the same questions and options give the same bytes.
 
     Args:
-        domain: whose behaviour the films show.
-        questions: about them.
+        domain: domain of the films.
+        questions: questions about the films.
         out: folder to write to.
-        title: of the page; empty for one that tells nothing.
-        consent: what raters agree to; empty for :data:`CONSENT`.
+        title: title of the page; empty for a neutral title.
+        consent: consent of raters; empty for :data:`CONSENT`.
 
     Raises:
-        UserError: where ``out`` has the key of another study.
+        UserError: if ``out`` has the key of another study.
     """
     minutes = max(1, round(len(questions.page) * SECONDS_A_QUESTION / 60))
     content: dict[str, Any] = {
@@ -95,22 +95,22 @@ def make_study(domain: Domain, questions: Questions, out: Path, title: str = "",
 
 
 def _keep_other_keys(path: Path, study: str) -> None:
-    """Without its key nobody can read a study's answers any more."""
+    """Refuse to overwrite the key of another study, without which its answers cannot be read."""
     if path.is_file():
         try:
-            found = read_json(path).get("study")
+            existing = read_json(path).get("study")
         except (UserError, OSError, AttributeError):
-            found = "something else"
-        if found != study:
-            told = short(str(found))
-            raise UserError(f"{path}: expected no key of another study, found that of {told}; name another folder with --out")
+            existing = "something else"
+        if existing != study:
+            name = short(str(existing))
+            raise UserError(f"{path}: expected no key of another study, found that of {name}; name another folder with --out")
 
 
 def _drawings(domain: Domain, questions: Questions) -> dict[str, Any]:
-    """Films for the page: what moves, if the domain can say it, or else animations."""
+    """Films for the page: wireframes if the domain offers them, else animations."""
     motions = [film.states[:1] if number in questions.still else film.states for number, film in enumerate(questions.films)]
     if domain.show.wireframe is not None:
-        # As long as the others, so that its length does not tell a standing picture.
+        # Standing pictures are as long as the other films, so that length does not reveal them.
         frames = max(len(film.states) for film in questions.films)
         standing = [states.expand(frames, -1) if len(states) == 1 else states for states in motions]
         return _lines([domain.show.wireframe(states) for states in standing])
@@ -122,8 +122,8 @@ def _lines(wireframes: Sequence[Wireframe]) -> dict[str, Any]:
     first = wireframes[0]
     left, lower, side = window(wireframes)
     films = {}
-    for number, one in enumerate(wireframes):
-        whole = np.clip(np.rint(seen(one.points) * MILLIMETRES), -32768, 32767).astype("<i2")  # a body is within 32 m
+    for number, wireframe in enumerate(wireframes):
+        whole = np.clip(np.rint(seen(wireframe.points) * MILLIMETRES), -32768, 32767).astype("<i2")  # a body is within 32 m
         films[film_id(number)] = {"frames": len(whole), "points": base64.b64encode(whole.tobytes()).decode()}
     drawing = {
         "points": first.points.shape[1],
@@ -142,7 +142,7 @@ def _animations(pictures: Sequence[Sequence[np.ndarray[Any, Any]]], questions: Q
     films: dict[str, Any] = {}
     for number, frames in enumerate(pictures):
         still = number in questions.still
-        shown = list(frames[:1]) * 2 if still else list(frames)  # an animation of one frame would be told by its form
+        shown = list(frames[:1]) * 2 if still else list(frames)  # a single frame would be recognisable
         films[film_id(number)] = {
             "gif": base64.b64encode(gif(shown)).decode(),
             "seconds": len(shown) * frame_milliseconds(len(shown)) / 1000,
@@ -158,5 +158,5 @@ def _html(content: Mapping[str, Any]) -> str:
         "DATA": script_json(content),
     }
     template = (HERE / "page.html").read_text(encoding="utf-8")
-    # In one go: what is put in is not looked at again, so that a title '%DATA%' stays one.
-    return re.sub(f"%({'|'.join(parts)})%", lambda found: parts[found[1]], template)
+    # A single pass does not replace within inserted text, so that a title '%DATA%' is kept.
+    return re.sub(f"%({'|'.join(parts)})%", lambda match: parts[match[1]], template)

@@ -1,7 +1,7 @@
-"""What raters are asked, and the key that says who made what and which answers are known.
+"""Questions for raters, and the key with the sources of films and the known answers.
 
-Raters' page and key are apart: the page knows films and questions by numbers that were dealt out at random, the key says what they
-are and stays with whoever runs the study.
+The raters' page identifies films and questions by random numbers. The key says what they are, and stays with whoever runs the
+study.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,9 @@ from ftl_lightning.study.films import CHECKS, Film
 
 YES, NO = "yes", "no"
 DEPICTS, BEST = "depicts", "best"
-"""The two questions of the paper: whether a film depicts a concept, and which of several depicts it best."""
+"""The two questions of the paper: whether a film depicts a concept, and which of several films depicts it best."""
 CHECK, REPEAT = "check", "repeat"
-"""Questions whose answer is known; the same question about the same film once more."""
+"""Questions with a known answer, and repeated questions about the same film."""
 INSTRUCTIONS = {YES: "This question checks attention: please answer Yes.", NO: "This question checks attention: please answer No."}
 
 
@@ -26,12 +26,12 @@ class Questions:
     """A study's films and questions.
 
     Attributes:
-        films: in the order of their numbers, without what they are.
-        still: numbers of films that are shown as their first state alone.
-        page: questions as the page has them: ``{"id", "text", "films"}``, a single film for yes or no, several to choose from.
-        key: what each question is, by its id.
-        shown: what each film is, by its id.
-        seed: that dealt them out.
+        films: in the order of their numbers.
+        still: numbers of films that are shown as their first state only.
+        page: questions on the page: ``{"id", "text", "films"}``, a single film for yes or no, several films to choose from.
+        key: meaning of each question, by id.
+        shown: source of each film, by id.
+        seed: random seed of the numbers.
     """
 
     films: tuple[Film, ...]
@@ -43,7 +43,7 @@ class Questions:
 
 
 def film_id(number: int) -> str:
-    """The name of a film in the page."""
+    """Identifier of a film on the page."""
     return f"f{number + 1:02d}"
 
 
@@ -51,13 +51,13 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
     """The questions about some films.
 
     Args:
-        films: every scenario's with one of each method, and checks.
-        repeats: questions that are asked twice.
-        still: films that are shown once more as a standing picture, which depicts no motion.
-        seed: deals out numbers and draws what is repeated and stilled.
+        films: one film of each method in every scenario, and checks.
+        repeats: number of questions that are asked twice.
+        still: number of films that are repeated as a standing picture, which depicts no motion.
+        seed: random seed of the numbers, and of the repeated and standing films.
 
     Returns:
-        Whether each film depicts its concept; two questions that say what to answer, and the other checks; which film depicts a
+        Whether each film depicts its concept; two questions that state their answer, and the other checks; which film depicts a
         scenario's concept best.
     """
     rng = np.random.default_rng(seed)
@@ -84,10 +84,10 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
     for (expected, text), index in zip(INSTRUCTIONS.items(), rng.permutation(len(real)), strict=False):
         add(text, [number_of[id(real[index])]], kind=CHECK, expected=expected)
     for scenario in sorted({film.scenario for film in real}):
-        own = [film for film in real if film.scenario == scenario]
-        if len(own) > 1:
-            shown = sorted(number_of[id(film)] for film in own)
-            add(f"Which film depicts “{line(own[0].concept)}” best?", shown, kind=BEST, scenario=scenario, setting=own[0].setting)
+        pool = [film for film in real if film.scenario == scenario]
+        if len(pool) > 1:
+            shown = sorted(number_of[id(film)] for film in pool)
+            add(f"Which film depicts “{line(pool[0].concept)}” best?", shown, kind=BEST, scenario=scenario, setting=pool[0].setting)
     page, key = [], {}
     for number, index in enumerate(rng.permutation(len(questions)).tolist()):
         shown, kind = questions[index]
@@ -99,16 +99,16 @@ def ask(films: Sequence[Film], repeats: int, still: int, seed: int) -> Questions
         still=standing,
         page=tuple(page),
         key=key,
-        shown={film_id(number): _told(film, number in standing) for number, film in enumerate(dealt)},
+        shown={film_id(number): _source(film, number in standing) for number, film in enumerate(dealt)},
         seed=seed,
     )
 
 
 def whether(concept: str) -> str:
-    """The first question."""
+    """Text of the first question."""
     return f"Does this film depict “{line(concept)}”?"
 
 
-def _told(film: Film, still: bool) -> dict[str, Any]:
-    told = {name: getattr(film, name) for name in ("setting", "scenario", "concept", "method", "file", "row", "hash")}
-    return told | ({"still": True} if still else {})
+def _source(film: Film, still: bool) -> dict[str, Any]:
+    source = {name: getattr(film, name) for name in ("setting", "scenario", "concept", "method", "file", "row", "hash")}
+    return source | ({"still": True} if still else {})

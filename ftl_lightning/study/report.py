@@ -1,4 +1,4 @@
-"""The paper's table of a study: how often each method depicts a concept, and how often it is the one that depicts it best."""
+"""The paper's table of a study: how often each method depicts a concept, and how often it depicts it best."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,18 +19,18 @@ from ftl_lightning.study.films import NEW, TRAINING
 from ftl_lightning.study.questions import BEST, DEPICTS, YES
 
 LABELS = {BEST: "judged best", DEPICTS: "depicts the concept"}
-"""In the order of the paper's table."""
+"""Labels of the questions, in the order of the paper's table."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """How often something was said of a method in a setting, in per cent.
+    """How often raters chose a method in a setting, in per cent.
 
     Attributes:
-        mean: over raters and scenarios.
-        spread: standard deviation over raters of each one's mean over scenarios (divided by their number, as the paper's is).
-        low, high: Wilson's 95 % interval, as if answers were independent of one another.
-        answers: how many there are.
+        mean: mean over raters and scenarios.
+        spread: standard deviation over raters of each rater's mean over scenarios (divisor: number of raters, as in the paper).
+        low, high: Wilson's 95 % interval, as if answers were independent.
+        answers: number of answers.
     """
 
     mean: float
@@ -42,15 +42,15 @@ class Share:
 
 @dataclass(frozen=True)
 class Report:
-    """What raters said.
+    """Results of a study.
 
     Attributes:
         shares: by setting, question and method.
         agreement: Krippendorff's alpha by setting and question.
-        scenarios: how many, by setting.
-        raters: whose answers count.
-        dropped: one line for every rater whose answers do not.
-        refused: one line for every file that is none of this study's finished answers.
+        scenarios: number of scenarios, by setting.
+        raters: number of raters whose answers count.
+        dropped: one line for every inattentive rater.
+        refused: one line for every file that does not have finished answers to this study.
     """
 
     shares: Mapping[tuple[str, str, str], Share]
@@ -62,11 +62,11 @@ class Report:
 
     @property
     def methods(self) -> list[str]:
-        """In alphabetical order."""
+        """Methods in alphabetical order."""
         return sorted({method for _, _, method in self.shares})
 
     def table(self) -> Table:
-        """One line for each setting and question, one column for each method."""
+        """One row for each setting and question, one column for each method."""
         scenarios = ", ".join(f"{count} {setting}" for setting, count in self.scenarios.items())
         raters = "1 rater" if self.raters == 1 else f"{self.raters} raters"
         table = Table(
@@ -76,9 +76,9 @@ class Report:
             table.add_column(literal(name), justify="left" if name in ("setting", "per cent") else "right")
         for setting in self.scenarios:
             for kind, label in LABELS.items():
-                found = [self.shares.get((setting, kind, method)) for method in self.methods]
-                if any(found):
-                    cells = ["" if share is None else _cell(share) for share in found]
+                shares = [self.shares.get((setting, kind, method)) for method in self.methods]
+                if any(shares):
+                    cells = ["" if share is None else _cell(share) for share in shares]
                     alpha = self.agreement.get((setting, kind), math.nan)
                     table.add_row(literal(setting), label, *cells, "-" if math.isnan(alpha) else f"{alpha:.2f}")
         return table
@@ -97,7 +97,7 @@ def study_table(answers: Sequence[Path], key: Path, keep_all: bool = False) -> R
         keep_all: whether raters who failed attention checks count.
 
     Raises:
-        UserError: for a key that cannot be read, and where no rater is left, with what was wrong with the first file.
+        UserError: for a key that cannot be read, and if no rater is left, with the first reason.
     """
     known = read_key(key)
     raters, refused = read_raters(answers, known)
@@ -115,7 +115,7 @@ def study_table(answers: Sequence[Path], key: Path, keep_all: bool = False) -> R
 
 def _counted(key: Key, raters: Sequence[Rater], dropped: tuple[str, ...], refused: tuple[str, ...]) -> Report:
     said: dict[tuple[str, str, str], dict[str, list[bool]]] = {}
-    """By setting, question and method, and then by rater: whether it was said of the method, in each scenario."""
+    """By setting, question and method, then by rater: whether the method was chosen, in each scenario."""
     units: dict[tuple[str, str], list[list[str]]] = {}
     scenarios: dict[str, set[str]] = {}
     for name, question in key.of_kind(DEPICTS).items():
@@ -136,7 +136,7 @@ def _counted(key: Key, raters: Sequence[Rater], dropped: tuple[str, ...], refuse
     order = sorted(scenarios, key=lambda name: ({TRAINING: 0, NEW: 1}.get(name, 2), name))
     return Report(
         shares={where: _share(list(by_rater.values())) for where, by_rater in said.items()},
-        agreement={where: krippendorff_alpha(found) for where, found in units.items()},
+        agreement={where: krippendorff_alpha(ratings) for where, ratings in units.items()},
         scenarios={setting: len(scenarios[setting]) for setting in order},
         raters=len(raters),
         dropped=tuple(map(line, dropped)),
@@ -145,8 +145,8 @@ def _counted(key: Key, raters: Sequence[Rater], dropped: tuple[str, ...], refuse
 
 
 def _share(by_rater: Sequence[Sequence[bool]]) -> Share:
-    """Of what each rater said in each scenario."""
-    means = np.array([np.mean(one) for one in by_rater])
+    """Percentage from the answers of each rater in each scenario."""
+    means = np.array([np.mean(answered) for answered in by_rater])
     answers = sum(map(len, by_rater))
     interval = binomtest(sum(map(sum, by_rater)), answers).proportion_ci(method="wilson")
     return Share(100 * float(means.mean()), 100 * float(means.std()), 100 * interval.low, 100 * interval.high, answers)
@@ -156,4 +156,4 @@ NOTES = (
     "mean ± standard deviation over raters of each rater's mean over scenarios, as in the paper; in brackets Wilson's 95 %",
     "interval, which takes answers as independent and is too narrow where they are not; alpha: Krippendorff's, nominal",
 )
-"""What a reader of the table has to know."""
+"""Notes below the table."""

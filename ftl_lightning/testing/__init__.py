@@ -1,1 +1,1 @@
-"""Small data sets to try the package with, which nothing in it was tuned on."""
+"""Small data sets for trying the package, on which nothing in it was tuned."""

@@ -1,7 +1,7 @@
-"""Many kinds of strokes as a hand draws them: what the model that ships, ``pretrained/strokes``, was pretrained and judged on.
+"""Many kinds of hand-drawn strokes: pretraining and evaluation data of the shipped model ``pretrained/strokes``.
 
-Kinds of :mod:`ftl_lightning.testing.strokes` are among them. The hand differs: corners are rounded, lines bend, closed strokes do
-not quite close. How much strokes of a kind differ in place, size and slant can be chosen, as one person draws more alike than many.
+They include the kinds of :mod:`ftl_lightning.testing.strokes`, drawn less precisely: corners are rounded, lines bend, and closed
+strokes do not quite close. Variation in place, size and slant is adjustable: one person's strokes vary less than many people's.
 """
 
 from collections.abc import Callable
@@ -14,11 +14,11 @@ from ftl_lightning.seeding import task_key
 from ftl_lightning.testing.strokes import NEW, SHAPES, STEPS, TRAINING, Points, corners, polar
 
 TEMPLATES = 100
-"""Strokes of each kind that :class:`Judge` compares with, by default."""
+"""Default number of templates per kind of :class:`Judge`."""
 TEMPLATE_SEED = 5_000_000
-"""Far from the seeds that anybody draws strokes from."""
+"""Seed of the templates, far from the seeds of other strokes."""
 RANDOM = "scribble"
-"""Name of strokes that have no common form: smooth curves and ways through random corners."""
+"""Name of strokes without a common form: smooth curves and polylines through random corners."""
 
 
 def _x_y(x: Points, y: Points) -> Points:
@@ -26,29 +26,29 @@ def _x_y(x: Points, y: Points) -> Points:
 
 
 def _turning(start: float, end: float, width: float = 1.0, height: float = 1.0) -> Callable[[Points], Points]:
-    """A part of an ellipse, between two angles in half turns."""
+    """Arc of an ellipse between two angles in half turns."""
     return lambda s: polar(np.ones_like(s), np.pi * (start + (end - start) * s)) * (width, height)
 
 
 def _joined(*parts: tuple[float, Callable[[Points], Points]]) -> Callable[[Points], Points]:
-    """One part after the other, each with the share of the stroke that it takes; each begins where the last ends."""
+    """Concatenate parts, each with its share of the stroke; each part begins at the end of the previous part."""
     shares = np.array([share for share, _ in parts])
     ends = np.cumsum(shares) / shares.sum()
 
     def shape(s: Points) -> Points:
-        found, begin, place = np.zeros((*s.shape, 2)), 0.0, np.zeros(2)
+        points, begin, place = np.zeros((*s.shape, 2)), 0.0, np.zeros(2)
         for number, (end, (_, part)) in enumerate(zip(ends, parts, strict=True)):
             first, last = part(np.zeros(1))[0], part(np.ones(1))[0]
             within = part(np.clip((s - begin) / (end - begin), 0, 1)) - first + place
-            found = np.where(((s >= begin) | (number == 0))[..., None], within, found)
+            points = np.where(((s >= begin) | (number == 0))[..., None], within, points)
             begin, place = end, place + last - first
-        return found
+        return points
 
     return shape
 
 
 def _loops(count: int, wide: float) -> Callable[[Points], Points]:
-    """Loops of a telephone cord, from the left to the right."""
+    """Loops of a telephone cord, from left to right."""
     return lambda s: _x_y(wide * (2 * s - 1) - 0.45 * np.sin(2 * np.pi * count * s), 0.6 * -np.cos(2 * np.pi * count * s))
 
 
@@ -110,21 +110,21 @@ _TEST: dict[str, Callable[[Points], Points]] = {
 }
 _GOES_ON = {"circle", "triangle", "figure eight", "square", "heart", *_CLOSED, "diamond", "drop", "hourglass", "star", "house"}
 _GOES_ON |= {"pentagon", "infinity"}
-"""Closed strokes, which may begin a little early or late and end before or beyond where they began."""
+"""Closed strokes, which may begin slightly early or late and end before or beyond their beginning."""
 KNOWN = (*TRAINING, *_OPEN, *_CLOSED)
-"""Kinds of pretraining."""
+"""Kinds for pretraining."""
 MIRRORED, BACKWARDS = "mirrored ", "backwards "
-"""Before the name of a kind, which is drawn from the right to the left then, or from the end to the start."""
+"""Prefixes of kinds that are mirrored left to right, or drawn from end to start."""
 VALIDATION = (*NEW, *_VALIDATION)
-"""New kinds that the model was chosen by: those of :data:`ftl_lightning.testing.strokes.NEW`, and six more."""
+"""New kinds for model selection: those of :data:`ftl_lightning.testing.strokes.NEW`, and six more."""
 TEST = tuple(_TEST)
-"""New kinds that were looked at once, when everything was fixed."""
+"""New kinds for the final evaluation, used once."""
 _EVERY = SHAPES | _OPEN | _CLOSED | _VALIDATION | _TEST
 
 
 def _random(even: Points, rng: np.random.Generator) -> Points:
-    """Strokes of no common form ``(count, time, 2)``, of about the size of the kinds."""
-    found = []
+    """Strokes ``(count, time, 2)`` without a common form, of about the size of the kinds."""
+    strokes = []
     for share in even:
         if rng.random() < 0.5:
             waves = np.arange(1, 6)
@@ -133,20 +133,20 @@ def _random(even: Points, rng: np.random.Generator) -> Points:
         else:
             path = corners(*[tuple(point) for point in rng.uniform(-1, 1, (rng.integers(3, 8), 2))])(share)
         path = path - path.mean(axis=0)
-        found.append(path / np.maximum(np.abs(path).max(), 1e-6))
-    return np.stack(found)
+        strokes.append(path / np.maximum(np.abs(path).max(), 1e-6))
+    return np.stack(strokes)
 
 
 def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.float32]:
-    """Strokes of one kind as a hand draws them.
+    """Hand-drawn strokes of one kind.
 
     Args:
-        kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, also :data:`MIRRORED` or :data:`BACKWARDS`; or
+        kind: one of :data:`KNOWN`, :data:`VALIDATION` or :data:`TEST`, also after :data:`MIRRORED` or :data:`BACKWARDS`; or
             :data:`RANDOM`.
-        count: how many.
-        seed: decides them; the same on every machine up to rounding.
-        alike: 0 for strokes of many people, all over the canvas; up to 1 for those of one who draws the same at the same place,
-            where what differs is the hand's bending and trembling.
+        count: number of strokes.
+        seed: random seed; strokes are equal on every machine up to rounding.
+        alike: 0 for strokes of many people, all over the canvas; up to 1 for one person's strokes at the same place, which differ
+            in bending and trembling.
 
     Returns:
         ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
@@ -154,7 +154,7 @@ def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.fl
     rng = np.random.default_rng([seed, task_key(kind)])
     plain = kind.removeprefix(MIRRORED).removeprefix(BACKWARDS)
     free = 1 - alike
-    person = rng.uniform(-1, 1, 6) * alike  # what all strokes of one who draws alike have in common
+    person = rng.uniform(-1, 1, 6) * alike  # common to all strokes of one person
 
     def differs(width: float, part: int) -> Points:
         return width * (person[part] + free * rng.uniform(-1, 1, count))
@@ -184,12 +184,12 @@ def drawn(kind: str, count: int, seed: int, alike: float = 0.0) -> NDArray[np.fl
     rotation = np.stack((np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)), axis=-1).reshape(count, 2, 2)
     place = np.stack((differs(1.4, 4), differs(1.4, 5)), axis=-1)[:, None]
     tremble = rng.normal(0, 0.01, points.shape)
-    found = points @ rotation.transpose(0, 2, 1) + place + tremble
-    return found.astype(np.float32)
+    strokes = points @ rotation.transpose(0, 2, 1) + place + tremble
+    return strokes.astype(np.float32)
 
 
 def _form(points: NDArray[np.float32]) -> Points:
-    """Strokes ``(stroke, 40, 2)`` without their place and size, flattened: mean 0, root mean square 1."""
+    """Normalise strokes ``(stroke, 40, 2)`` to mean 0 and root mean square 1, and flatten them."""
     centred = points.astype(np.float64) - points.mean(axis=1, keepdims=True)
     size = np.sqrt((centred**2).mean(axis=(1, 2), keepdims=True))
     flat: Points = (centred / np.maximum(size, 1e-9)).reshape(len(points), -1)
@@ -198,11 +198,11 @@ def _form(points: NDArray[np.float32]) -> Points:
 
 @dataclass(frozen=True)
 class Judge:
-    """Tells of which kind strokes are: that of the nearest template, whatever their place and size.
+    """Classifier of strokes by the nearest template, invariant to place and size.
 
     Attributes:
-        kinds: that it knows.
-        templates: ``(kind * template, 80)``, without place and size.
+        kinds: known kinds.
+        templates: normalised ``(kind * template, 80)``.
     """
 
     kinds: tuple[str, ...]
@@ -210,25 +210,25 @@ class Judge:
 
     @classmethod
     def of(cls, kinds: tuple[str, ...] = (*KNOWN, *VALIDATION, *TEST), count: int = TEMPLATES) -> "Judge":
-        """One that knows some kinds by so many templates each."""
+        """Create a classifier of some kinds with ``count`` templates each."""
         return cls(kinds, np.concatenate([_form(drawn(kind, count, TEMPLATE_SEED)) for kind in kinds]))
 
     def _apart(self, strokes: NDArray[np.float32]) -> Points:
-        """Squared distance of each stroke to its nearest template of each kind ``(stroke, kind)``."""
+        """Squared distance of each stroke to the nearest template of each kind ``(stroke, kind)``."""
         form = _form(strokes)
         apart = np.square(form).sum(axis=1)[:, None] + np.square(self.templates).sum(axis=1) - 2 * form @ self.templates.T
-        found: Points = apart.reshape(len(strokes), len(self.kinds), -1).min(axis=2)
-        return found
+        nearest: Points = apart.reshape(len(strokes), len(self.kinds), -1).min(axis=2)
+        return nearest
 
     def kind(self, strokes: NDArray[np.float32]) -> list[str]:
         """The kind of each stroke ``(stroke, 40, 2)``."""
         return [self.kinds[index] for index in self._apart(strokes).argmin(axis=1).tolist()]
 
     def distance(self, strokes: NDArray[np.float32], kind: str) -> float:
-        """Median distance of strokes ``(stroke, 40, 2)`` to the nearest template of a kind, where root mean square size is 1."""
-        own = self._apart(strokes)[:, self.kinds.index(kind)]
-        return float(np.sqrt(np.maximum(np.median(own), 0) / (2 * STEPS)))
+        """Median distance of strokes ``(stroke, 40, 2)`` to the nearest template of a kind, at a root mean square size of 1."""
+        squared = self._apart(strokes)[:, self.kinds.index(kind)]
+        return float(np.sqrt(np.maximum(np.median(squared), 0) / (2 * STEPS)))
 
     def rate(self, strokes: NDArray[np.float32], kind: str) -> float:
-        """Share of strokes ``(stroke, 40, 2)`` that are of a kind."""
-        return float(np.mean([found == kind for found in self.kind(strokes)]))
+        """Fraction of strokes ``(stroke, 40, 2)`` classified as a kind."""
+        return float(np.mean([predicted == kind for predicted in self.kind(strokes)]))

@@ -1,6 +1,6 @@
-"""Pen strokes in the plane: a small data set that nothing in this package was tuned on, with a rule that tells its kinds apart.
+"""Pen strokes in the plane: a small data set on which nothing in this package was tuned, with a classifier of its kinds.
 
-Eight kinds are for pretraining, three others are new and learned from five strokes each.
+Eight kinds are for pretraining; three new kinds are learned from five strokes each.
 """
 
 import functools
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 from ftl_lightning.seeding import task_key
 
 STEPS = 40
-"""Points of a stroke."""
+"""Number of points of a stroke."""
 TEMPLATES = 60
-"""Strokes of each kind that :func:`recognised` compares with."""
+"""Number of templates per kind of :func:`recognised`."""
 TEMPLATE_SEED = 4_000_000
-"""Far from the seeds that anybody draws strokes from."""
+"""Seed of the templates, far from the seeds of other strokes."""
 
 Points = NDArray[np.float64]
 """``(..., 2)``."""
 
 
 def corners(*points: tuple[float, float]) -> Callable[[Points], Points]:
-    """The way through some points, at an even pace: a function of how much of it is done ``(...,)``, from 0 to 1."""
+    """Polyline through points at an even pace: a function of the completed share ``(...,)``, from 0 to 1."""
     corner = np.array(points)
     reached = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(corner, axis=0), axis=1))))
     return lambda s: np.stack([np.interp(s * reached[-1], reached, corner[:, axis]) for axis in (0, 1)], axis=-1)
 
 
 def polar(radius: Points, angle: Points) -> Points:
-    """Points by their distance from the origin and their angle in radians, ``(...,)`` each."""
+    """Points from radius and angle in radians, ``(...,)`` each."""
     return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1)
 
 
@@ -61,20 +61,20 @@ SHAPES: dict[str, Callable[[Points], Points]] = {
     "heart": _heart,
     "S-curve": _s_curve,
 }
-"""By kind the way that a stroke takes, within about 1 of the origin, over the share of it that is done."""
+"""Path of each kind, within about 1 of the origin, as a function of the completed share."""
 NEW = ("square", "heart", "S-curve")
 """Kinds to learn from a few strokes."""
 TRAINING = tuple(kind for kind in SHAPES if kind not in NEW)
-"""Kinds of pretraining."""
+"""Kinds for pretraining."""
 
 
 def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
-    """Strokes of one kind: no two have the same size, proportions, place, slant and pace, and the hand trembles a little.
+    """Strokes of one kind with different size, proportions, place, slant and pace, and a slight tremble.
 
     Args:
         kind: one of :data:`TRAINING` or :data:`NEW`.
-        count: how many.
-        seed: decides them; the same on every machine up to rounding.
+        count: number of strokes.
+        seed: random seed; strokes are equal on every machine up to rounding.
 
     Returns:
         ``(count, 40, 2)``, x and y, in centimetres, mostly within 4 of the origin.
@@ -88,12 +88,12 @@ def strokes(kind: str, count: int, seed: int) -> NDArray[np.float32]:
     rotation = np.stack((np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)), axis=-1).reshape(count, 2, 2)
     place = rng.uniform(-1.5, 1.5, (count, 1, 2))
     tremble = rng.normal(0, 0.02, points.shape)
-    found = (points * size) @ rotation.transpose(0, 2, 1) + place + tremble
-    return found.astype(np.float32)
+    placed = (points * size) @ rotation.transpose(0, 2, 1) + place + tremble
+    return placed.astype(np.float32)
 
 
 def _shape(points: NDArray[np.float32]) -> Points:
-    """Strokes ``(stroke, 40, 2)`` without their place and size, flattened: mean 0, root mean square 1."""
+    """Normalise strokes ``(stroke, 40, 2)`` to mean 0 and root mean square 1, and flatten them."""
     centred = points.astype(np.float64) - points.mean(axis=1, keepdims=True)
     size = np.sqrt((centred**2).mean(axis=(1, 2), keepdims=True))
     flat: Points = (centred / np.maximum(size, 1e-9)).reshape(len(points), -1)
@@ -107,6 +107,6 @@ def _templates() -> Points:
 
 
 def recognised(stroke: NDArray[np.float32]) -> list[str]:
-    """The kind of each stroke ``(stroke, 40, 2)``: that of the nearest of all kinds' templates, whatever its place and size."""
+    """Classify strokes ``(stroke, 40, 2)`` by the nearest template of all kinds, invariant to place and size."""
     apart = np.linalg.norm(_shape(stroke)[:, None] - _templates(), axis=-1)
     return [list(SHAPES)[index // TEMPLATES] for index in apart.argmin(axis=1).tolist()]

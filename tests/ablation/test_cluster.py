@@ -257,7 +257,7 @@ def test_a_cluster_that_is_none_is_told_in_one_line(
 
 
 def test_rows_that_are_lost_doubled_or_different_are_counted() -> None:
-    compared = runpy.run_path(str(ROOT / "benchmarks" / "cluster_kills.py"))["compared"]
+    compared = runpy.run_path(str(ROOT / "benchmarks" / "stress" / "cluster_kills.py"))["compared"]
     expected = pd.DataFrame({"task": ["a", "b", "c"], "n": [1, 1, 1], "value": [0.1, 0.2, 0.3]})
     assert compared(expected, expected) == {"rows": 3, "lost": 0, "doubled": 0, "different": 0}
     lost = pd.concat([expected.head(1), expected.head(2).assign(value=[0.1, 0.5])], ignore_index=True)

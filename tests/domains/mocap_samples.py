@@ -111,7 +111,7 @@ def folder(path: Path, concepts: Sequence[str] = ()) -> Path:
 
 def script(name: str) -> ModuleType:
     """A script of the benchmarks as a module."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "benchmarks" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "benchmarks" / "experiments" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     sys.modules[name] = module = importlib.util.module_from_spec(spec)

@@ -23,7 +23,7 @@ TASK = "roundabout third exit"
 
 @pytest.fixture(scope="module")
 def benchmark() -> dict[str, Any]:
-    return runpy.run_path(str(ROOT / "benchmarks" / "driving" / "decisions.py"))
+    return runpy.run_path(str(ROOT / "benchmarks" / "experiments" / "driving" / "decisions.py"))
 
 
 @pytest.mark.slow

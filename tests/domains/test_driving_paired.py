@@ -8,7 +8,7 @@ from tests.conftest import ROOT
 
 
 def test_episodes_from_the_same_starts_are_paired() -> None:
-    compared = runpy.run_path(str(ROOT / "benchmarks" / "driving" / "paired.py"))["compared"]
+    compared = runpy.run_path(str(ROOT / "benchmarks" / "experiments" / "driving" / "paired.py"))["compared"]
     all_but_one = torch.arange(20) != 3
     every = {
         "ours": {"belief": all_but_one, "step": all_but_one},

@@ -20,7 +20,7 @@ CONDITIONS = {"ours", "ours with adapter", "text", "demonstrations", "people"}
 @pytest.fixture(autouse=True)
 def _few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Films of two steps of the sampler; nobody looks at them."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "experiments"))
     monkeypatch.setattr(FewShot, "sample", partialmethod(FewShot.sample, steps=2))
 
 

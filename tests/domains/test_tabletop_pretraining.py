@@ -178,7 +178,7 @@ def test_mistakes_are_told_in_one_line(data: PretrainingData) -> None:
 
 @pytest.mark.slow
 def test_a_model_is_corrected_by_the_expert(tiny_of: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    script = runpy.run_path(str(ROOT / "benchmarks" / "tabletop_dagger.py"))
+    script = runpy.run_path(str(ROOT / "benchmarks" / "experiments" / "tabletop_dagger.py"))
     pretrained = tiny_of("tabletop")
     monkeypatch.setattr("sys.argv", ["x", f"--pretrained={pretrained}", f"--task={PUSH}", "--count=2", "--out=made.safetensors"])
     script["main"]()

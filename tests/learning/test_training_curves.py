@@ -12,7 +12,7 @@ from tests.conftest import ROOT
 
 
 def test_a_resumed_run_is_one_curve(tmp_path: Path) -> None:
-    curve = runpy.run_path(str(ROOT / "benchmarks" / "training_curves.py"))["curve"]
+    curve = runpy.run_path(str(ROOT / "benchmarks" / "experiments" / "training_curves.py"))["curve"]
     for steps in ((99, 199), (199, 299)):
         with SummaryWriter(str(tmp_path)) as log:
             for step in steps:
@@ -26,7 +26,7 @@ def test_a_resumed_run_is_one_curve(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_model_that_uses_the_concept_loses_without_it() -> None:
-    losses = runpy.run_path(str(ROOT / "benchmarks" / "concept_in_loss.py"))["losses"]
+    losses = runpy.run_path(str(ROOT / "benchmarks" / "experiments" / "concept_in_loss.py"))["losses"]
     few = FewShot.from_pretrained("object_rearrangement")
     found = losses(few.model, few.domain.source(None).split("validation", 20, 0), 90)
     assert found["right"] > 0

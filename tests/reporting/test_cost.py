@@ -25,8 +25,8 @@ Script = Mapping[str, Any]
 
 
 def script(name: str, monkeypatch: pytest.MonkeyPatch) -> Script:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    return runpy.run_path(str(ROOT / "benchmarks" / f"{name}.py"))
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "speed"))
+    return runpy.run_path(str(ROOT / "benchmarks" / "speed" / f"{name}.py"))
 
 
 def test_operations_of_layers_and_convolutions_bytes_and_calls_are_those_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,14 +129,14 @@ def test_the_table_of_prices_is_what_its_file_says(monkeypatch: pytest.MonkeyPat
     price = script("price", monkeypatch)
     content = json.loads((ROOT / "results" / "price.json").read_text(encoding="utf-8"))
     kept = (ROOT / "results" / "price.md").read_text(encoding="utf-8")
-    assert price["table"](content, list(content["machines"])) == kept, "run benchmarks/price.py"
+    assert price["table"](content, list(content["machines"])) == kept, "run benchmarks/speed/price.py"
 
 
 @pytest.mark.parametrize("name", ["peers", "batching", "product_rate", "cost", "fit_options"])
 def test_the_tables_of_speed_are_what_their_files_say(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     table = script("speed_table", monkeypatch)["TABLES"][name]
     content = json.loads((ROOT / "results" / f"{name}.json").read_text(encoding="utf-8"))
-    assert table(content) == (ROOT / "results" / f"{name}.md").read_text(encoding="utf-8"), "run benchmarks/speed_table.py"
+    assert table(content) == (ROOT / "results" / f"{name}.md").read_text(encoding="utf-8"), "run benchmarks/speed/speed_table.py"
 
 
 def test_the_curve_of_batching_finds_limit_and_half(monkeypatch: pytest.MonkeyPatch) -> None:

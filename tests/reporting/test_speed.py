@@ -33,7 +33,7 @@ def write(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def benchmark() -> dict[str, Callable[..., Any]]:
-    return runpy.run_path(str(ROOT / "benchmarks" / "speed.py"))
+    return runpy.run_path(str(ROOT / "benchmarks" / "speed" / "speed.py"))
 
 
 def test_curves_are_read_from_a_file_or_its_folder_and_there_are_none_without(tmp_path: Path) -> None:

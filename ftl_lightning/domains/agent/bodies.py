@@ -1,4 +1,4 @@
-"""Meshes of revolution for the bodies that pybullet has no primitive for: cone and bowl."""
+"""Meshes of revolution for bodies without a pybullet primitive: cone and bowl."""
 
 import math
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ SEGMENTS = 24
 
 
 def revolve(profile: Sequence[tuple[float, float]], segments: int = SEGMENTS) -> Mesh:
-    """Turn a closed profile around the y axis.
+    """Rotate a closed profile around the y axis.
 
     Args:
         profile: ``(radius, y)`` from the lower pole to the upper one along the outside of the body; both ends on the axis.
-        segments: of a full turn.
+        segments: segments of a full turn.
     """
     vertices: list[list[float]] = []
     for radius, y in profile:
@@ -31,18 +31,18 @@ def revolve(profile: Sequence[tuple[float, float]], segments: int = SEGMENTS) ->
 
 
 def cone(radius: float, half_height: float) -> Mesh:
-    """A cone that stands on its base, centred halfway up."""
+    """Cone standing on its base, centred at half its height."""
     return revolve([(0.0, -half_height), (radius, -half_height), (0.0, half_height)])
 
 
 def bowl(radius: float, half_height: float, thickness: float, rings: int = 6) -> Mesh:
-    """An open shell: half an ellipsoid outside, a smaller one inside, so that it is concave.
+    """Concave open shell between two half ellipsoids.
 
     Args:
-        radius: of the rim, outside.
-        half_height: half the height; the centre lies halfway up.
-        thickness: of the wall.
-        rings: of each surface.
+        radius: outer radius of the rim.
+        half_height: half the height; the centre is at half the height.
+        thickness: thickness of the wall.
+        rings: rings of each surface.
     """
     height = 2 * half_height
     angles = [math.pi / 2 * ring / rings for ring in range(rings + 1)]

@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows about navigation."""
+"""Domain object of navigation."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -46,11 +46,11 @@ _SETTINGS = {
     )
     for name in names
 }
-"""What decides a demonstration besides task, count and seed."""
+"""Settings that determine demonstrations besides task, count and seed (cache key)."""
 
 
 def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrations:
-    """``count`` drives of each task by the expert, from the cache if they are there."""
+    """``count`` expert drives of each task, from the cache if present."""
     return cached(
         {"domain": NAME, "tasks": tasks, "count": count, "seed": seed, **_SETTINGS},
         len(tasks) * count,
@@ -59,17 +59,17 @@ def demonstrations(tasks: tuple[str, ...], count: int, seed: int) -> Demonstrati
 
 
 def _drive(tasks: tuple[str, ...], count: int, seed: int, progress: Callable[[], None]) -> Demonstrations:
-    found = [expert.demonstrations(task, count, seed, progress) for task in tasks]
+    parts = [expert.demonstrations(task, count, seed, progress) for task in tasks]
     return drives(
-        torch.cat([seen for seen, _ in found]),
-        torch.cat([lengths for _, lengths in found]),
+        torch.cat([seen for seen, _ in parts]),
+        torch.cat([lengths for _, lengths in parts]),
         tuple(task for task in tasks for _ in range(count)),
         {"generator": NAME, "seed": seed, "count_per_task": count},
     )
 
 
 def drives(observations: Tensor, lengths: Tensor, concepts: tuple[str, ...], provenance: Mapping[str, Any]) -> Demonstrations:
-    """Drives ``(demo, time, 52)`` as demonstrations."""
+    """Convert drives ``(demo, time, 52)`` to demonstrations."""
     return Demonstrations(
         states=observations[..., :STATE].contiguous(),
         lengths=lengths,
@@ -93,7 +93,7 @@ def reads(task: str) -> bool:
 
 
 class Expert:
-    """The expert's drives, from the cache if they are there."""
+    """Source of expert drives, cached."""
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         return demonstrations(TRAINING_CONCEPTS, count, seed if name == "train" else VALIDATION_SEED + seed)
@@ -106,12 +106,12 @@ class Expert:
 
 
 def initial_states(drawn: Tensor) -> InitialStates:
-    """Scenes ``(scene, 52)`` as they are observed: everything in them is."""
+    """Initial states of scenes ``(scene, 52)``, which are fully observed."""
     return InitialStates({OBSERVED: drawn}, drawn)
 
 
 def environment() -> "AgentEnvironment":
-    """The domain's environment.
+    """Environment of the domain.
 
     Raises:
         UserError: without the simulator, or if it does not start.
@@ -123,7 +123,7 @@ def environment() -> "AgentEnvironment":
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
-    """Forces ``(episode, 2)``: the way to where the plan is :data:`LOOKAHEAD` steps ahead (paper, closed loop).
+    """Forces ``(episode, 2)``: displacement to the plan's state :data:`LOOKAHEAD` steps ahead (paper, closed loop).
 
     Args:
         plans: ``(episode, horizon, 13)``.
@@ -171,15 +171,15 @@ def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> T
 
 
 def _from_start(states: Tensor) -> Tensor:
-    """Paths ``(plan, horizon, 2)`` in the plane, from where each starts."""
+    """Paths ``(plan, horizon, 2)`` in the plane, relative to their start."""
     paths = states[..., list(PLANE)]
     return paths - paths[:, :1]
 
 
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Root mean square distance ``(a, b)`` in metres of the agent's paths in the plane, each seen from its own start.
+    """Root mean square distance ``(a, b)`` in metres between the agent's paths in the plane, relative to their starts.
 
-    Where a plan starts is given, not generated. Where it leads depends on the scene: plans that are right in new scenes are novel.
+    The start is given, not generated. The end depends on the scene: correct plans in new scenes are novel.
     """
     return path_distance(_from_start(states), _from_start(others))
 

@@ -1,29 +1,29 @@
-"""Numbers of the physics, which need no simulator."""
+"""Constants of the physics."""
 
 from ftl_lightning.domains.agent.scenes import HEIGHT
 from ftl_lightning.extras import expect_extra
 
 STEP = 0.05
-"""Seconds between two states."""
+"""Seconds between states."""
 SUBSTEPS = 6
 MAX_STEPS = 128
 LOOKAHEAD = 5
 """An action is the displacement to the plan's state this many steps ahead (paper: a_t = tau_{t+5} - s_t)."""
 DRAG = 16.0
-"""The rate per second at which the agent's speed decays: so fast that pulling towards a point does not overshoot it."""
+"""Decay rate of the agent's speed per second, high enough to avoid overshooting."""
 MASS = LOOKAHEAD * STEP / DRAG
-"""kg. A plan that moves steadily at speed v is LOOKAHEAD * STEP * v ahead, and drag takes MASS * DRAG * v: with this mass, that
-way in metres, applied as a force in newtons, keeps the agent's speed at the plan's."""
+"""Mass in kg. A plan at constant speed v is LOOKAHEAD * STEP * v ahead, and drag is MASS * DRAG * v: with this mass, the
+displacement in metres, applied as a force in newtons, keeps the agent at the plan's speed."""
 MAX_FORCE = 0.2
-"""Newtons; a longer force is shortened."""
+"""Maximum force in newtons; larger forces are scaled down."""
 RADIUS = {"cone": 0.11, "sphere": HEIGHT, "bowl": 0.13, "cube": HEIGHT}
-"""Of the bodies' footprints, metres; half the edge of a cube."""
+"""Radius of the bodies' footprints in metres; half the edge of a cube."""
 MARGIN = 0.001
-"""Metres. The simulator keeps a cone this far above the ground, so the ground is this much lower; otherwise the agent would hop."""
+"""Gap in metres that the simulator keeps between cone and ground; the ground is lowered by it to avoid hopping."""
 
 
 def expect_simulator() -> None:
-    """Refuse to go on without pybullet.
+    """Check that pybullet is installed.
 
     Raises:
         UserError: with the command that installs it.

@@ -1,4 +1,4 @@
-"""The physics: a cone that is pushed over a plane with two standing objects, in pybullet, as a gymnasium environment."""
+"""Gymnasium environment in pybullet: a cone is pushed over a plane with two fixed objects."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ from ftl_lightning.errors import UserError
 
 BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]
-"""Half the size of the floor that is drawn."""
+"""Half extents of the drawn floor."""
 IMAGE = (200, 320)
 """Height and width of a rendered picture."""
 
@@ -38,12 +38,12 @@ Seen = dict[str, NDArray[np.float32]]
 
 
 class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
-    """One agent and two objects.
+    """Environment with an agent and two objects.
 
     An observation is an initial state (52 numbers, :mod:`ftl_lightning.domains.agent.scenes`). An action is a force in newtons
-    along x and z, held for :data:`STEP` seconds. The agent glides without friction, is slowed by drag, and neither tips nor
-    turns. Reaching an object (centres within :data:`REACH`) terminates an episode, :data:`MAX_STEPS` steps truncate it; the
-    simulation can be stepped on. Every instance has a simulator of its own, without a display.
+    along x and z, applied for :data:`STEP` seconds. The agent slides without friction, is slowed by drag, and neither tips nor
+    turns. Reaching an object (centres within :data:`REACH`) terminates an episode, :data:`MAX_STEPS` steps truncate it; further
+    steps are possible. Every instance has a separate simulator without a display.
 
     Raises:
         UserError: if the simulator does not start.
@@ -69,11 +69,11 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Build a scene.
 
         Args:
-            seed: of the scene that is drawn if none is given.
-            options: ``scene``, 52 numbers; or ``task``, whose scene is drawn (default 'go to red object').
+            seed: seed of the drawn scene if none is given.
+            options: ``scene``, 52 numbers; or ``task``, to draw a scene of it (default 'go to red object').
 
         Raises:
-            UserError: for a scene of another size, with overlapping bodies, or with numbers that are not finite.
+            UserError: for a scene of the wrong size, with overlapping bodies, or with numbers that are not finite.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -86,7 +86,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self._observation(), {}
 
     def _build(self) -> None:
-        # From nothing every time: what a simulator did before leaves no trace in what it does next.
+        # Rebuild everything, so that earlier episodes have no effect.
         client = self.client
         client.resetSimulation()
         client.setGravity(0, -9.81, 0)
@@ -101,7 +101,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self._agent,
             -1,
             lateralFriction=0,
-            linearDamping=0,  # drag is a force in `step`: the simulator's own cannot be as strong
+            linearDamping=0,  # drag is a force in `step`: linearDamping cannot be as strong
             localInertiaDiagonal=[0, 0, 0],  # a force through the centre of a body without inertia cannot turn it
             activationState=pybullet().ACTIVATION_STATE_DISABLE_SLEEPING,
         )
@@ -111,7 +111,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self._body(look, self._initial[columns][:3], 0)
 
     def _body(self, look: Look, position: NDArray[np.float32], mass: float) -> int:
-        """Create a body; without mass it stands where it is."""
+        """Create a body; it is fixed if the mass is 0."""
         client, (colour, shape) = self.client, look
         rgba = [*(value / 255 for value in COLOURS[colour]), 1.0]
         if shape == "sphere":
@@ -143,10 +143,10 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return {OBSERVED: observation}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Push for :data:`STEP` seconds. The reward is 0: what is right depends on the task, which physics does not know.
+        """Apply a force for :data:`STEP` seconds. The reward is 0, as the environment does not know the task.
 
         Raises:
-            UserError: for an action of another size, or with numbers that are not finite.
+            UserError: for an action of the wrong size or with numbers that are not finite.
         """
         force = np.asarray(action, dtype=np.float64)
         if force.shape != (len(PLANE),) or not np.isfinite(force).all():
@@ -167,7 +167,7 @@ class AgentEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return observation, 0.0, reached, self._steps >= MAX_STEPS, {}
 
     def render(self) -> NDArray[np.uint8]:
-        """A picture ``(height, width, 3)`` by pybullet's software renderer."""
+        """Picture ``(height, width, 3)`` of pybullet's software renderer."""
         height, width = IMAGE
         view = self.client.computeViewMatrix([0, 2.6, -6.2], [AGENT_START[0], 0, AGENT_START[2]], [0, 1, 0])
         lens = self.client.computeProjectionMatrixFOV(38, width / height, 0.1, 20)

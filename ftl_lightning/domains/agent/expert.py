@@ -1,4 +1,4 @@
-"""The expert: drives to the target through the same physics and keeps clear of the distractor."""
+"""Expert that drives to the target in the same physics and avoids the distractor."""
 
 import itertools
 from collections.abc import Callable
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
 LENGTH = 150
-"""States of a demonstration, padded with its last one (paper)."""
+"""States of a demonstration, padded with the last state (paper)."""
 SPEED = 0.4
-"""m/s of the expert's reference point along its route."""
+"""Speed of the reference point along the route in m/s."""
 KEEP_CLEAR = 0.5
-"""Least distance of the route from the distractor's centre, metres."""
+"""Minimum distance of the route from the distractor's centre in metres."""
 STOP = 0.26
-"""Distance from the end of the route to the target's centre, metres: just before the bodies touch."""
+"""Distance of the end of the route from the target's centre in metres, just before contact."""
 AT_REST = 0.02
-"""m/s below which the agent has stopped."""
+"""Speed in m/s below which the agent is at rest."""
 
 Plane = NDArray[np.float64]
 
 
 def route(start: Plane, target: Plane, distractor: Plane) -> Plane:
-    """Corners ``(2 or 3, 2)`` of the way from the start to just before the target, in x and z."""
+    """Corners ``(2 or 3, 2)`` of the route from the start to just before the target, in x and z."""
     way = target - start
     end = target - STOP * way / np.linalg.norm(way)
     share = np.clip((distractor - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
@@ -38,14 +38,14 @@ def route(start: Plane, target: Plane, distractor: Plane) -> Plane:
     gap = nearest - distractor
     if np.linalg.norm(gap) >= KEEP_CLEAR:
         return np.stack((start, end))
-    # Around it on the side on which the straight line passes it.
+    # Pass the distractor on the side of the straight line.
     detour = distractor + 1.1 * KEEP_CLEAR * gap / np.linalg.norm(gap)
     last = target - detour
     return np.stack((start, detour, target - STOP * last / np.linalg.norm(last)))
 
 
 def along(corners: Plane, distance: float) -> Plane:
-    """The point ``(2,)`` at a distance in metres along a polyline; its end if it is shorter."""
+    """Point ``(2,)`` at a distance in metres along a polyline, at most its end."""
     for here, there in itertools.pairwise(corners):
         length = float(np.linalg.norm(there - here))
         if distance <= length:
@@ -55,10 +55,10 @@ def along(corners: Plane, distance: float) -> Plane:
 
 
 def demonstrate(environment: "AgentEnvironment", initial: NDArray[np.float32], chosen: int) -> NDArray[np.float32]:
-    """Observations ``(time, 52)`` of one drive, ``time`` at most :data:`LENGTH`.
+    """Observations ``(time, 52)`` of a drive, ``time`` at most :data:`LENGTH`.
 
     Args:
-        environment: any; it is reset.
+        environment: environment; it is reset.
         initial: ``(52,)``.
         chosen: 0 or 1, the object to drive to.
     """
@@ -68,12 +68,12 @@ def demonstrate(environment: "AgentEnvironment", initial: NDArray[np.float32], c
 
 
 def follow(environment: "AgentEnvironment", initial: NDArray[np.float32], corners: Plane) -> NDArray[np.float32]:
-    """Observations ``(time, 52)`` of a drive along a way, at the expert's speed until it rests at the way's end.
+    """Observations ``(time, 52)`` of a drive along a route at the expert's speed, until rest at its end.
 
     Args:
-        environment: any; it is reset.
+        environment: environment; it is reset.
         initial: ``(52,)``.
-        corners: ``(2 or more, 2)`` of the way, in x and z. What :data:`LENGTH` states are too few for is left out.
+        corners: corners of the route ``(2 or more, 2)`` in x and z; the drive is cut at :data:`LENGTH` states.
     """
     observation = environment.reset(options={"scene": initial})[0][OBSERVED]
     seen = [observation]
@@ -88,15 +88,15 @@ def follow(environment: "AgentEnvironment", initial: NDArray[np.float32], corner
 
 
 def demonstrations(task: str, count: int, seed: int, progress: Callable[[], None]) -> tuple[Tensor, Tensor]:
-    """Drives of a task.
+    """Expert drives of a task.
 
     Args:
         task: see :func:`~ftl_lightning.domains.agent.scenes.parse`.
-        count, seed: of its scenes.
-        progress: called after each.
+        count, seed: number and seed of scenes.
+        progress: called after each drive.
 
     Returns:
-        Observations ``(count, 150, 52)``, padded with the last one, and lengths ``(count,)``.
+        Observations ``(count, 150, 52)``, padded with the last, and lengths ``(count,)``.
     """
     initial = scenes(task, count, seed)
     expect_simulator()

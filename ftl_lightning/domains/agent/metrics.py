@@ -1,4 +1,4 @@
-"""The paper's two metrics of navigation: progress to the target (open loop) and reaching it first (closed loop)."""
+"""The paper's metrics of navigation: progress to the target (open loop) and reaching it first (closed loop)."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from ftl_lightning.domains.rollout import Rollout
 
 
 def distances(positions: Tensor, world: Tensor) -> Tensor:
-    """Distances in metres ``(scene, time, 2 objects)`` of an agent's positions to both objects.
+    """Distances in metres ``(scene, time, 2 objects)`` of agent positions to both objects.
 
     Args:
         positions: ``(scene, time, 3)``.
@@ -26,12 +26,12 @@ def _to_each(goal: str, positions: Tensor, world: Tensor) -> tuple[Tensor, Tenso
 
 
 def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether a plan ends nearer to the target than the agent starts (paper, open loop).
+    """Whether a plan ends nearer to the target than it starts (paper, open loop).
 
     Args:
         goal: the task in words.
         states: plans ``(scene, horizon, 13)``.
-        starts: with ``world (scene, 52)``.
+        starts: initial states with ``world (scene, 52)``.
 
     Returns:
         ``(scene,)`` of bool; false where a plan is not finite.
@@ -42,15 +42,15 @@ def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
 
 
 def reached(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """What happened in episodes (paper, closed loop).
+    """Outcomes of episodes (paper, closed loop).
 
     Args:
         goal: the task in words.
-        rollout: with ``world (episode, time, 52)``, padded with the last one.
+        rollout: episodes with ``world (episode, time, 52)``, padded with the last.
 
     Returns:
-        ``(episode,)`` of bool each: ``success``, the agent ends within :data:`REACH` of the target and was never that near to
-        the distractor; ``distractor``, it was; ``progress``, it ends nearer to the target than it started.
+        ``(episode,)`` of bool each: ``success``, the agent ends within :data:`REACH` of the target and never was within
+        :data:`REACH` of the distractor; ``distractor``, it was; ``progress``, it ends nearer to the target.
     """
     world = rollout.observed[OBSERVED]
     to_target, to_distractor = _to_each(goal, world[..., :3], world[:, 0])

@@ -1,4 +1,4 @@
-"""The paper's numbers for navigation, to stand beside ours."""
+"""The paper's numbers for navigation."""
 
 from ftl_lightning.domains.paper import Published
 
@@ -16,13 +16,13 @@ def _concept_count() -> list[Published]:
 
 
 def _omega() -> list[Published]:
-    """Table 'Classifier-free guidance weight choice effect'; the learned weights stand in the table above already."""
+    """Table 'Classifier-free guidance weight choice effect'; learned weights are in the table above."""
     rows = (("1.2", 0.64, 0.08), ("1.4", 0.66, 0.05), ("1.6", 0.73, 0.07), ("1.8", 0.63, 0.06))
     return [Published(NEW, value, error, omega=omega) for omega, value, error in rows]
 
 
 def _learned_components() -> list[Published]:
-    """Table 'Analysis of learned concepts': what each learned component generates alone."""
+    """Table 'Analysis of learned concepts': generation with each component alone."""
     rows = (
         ("red", 0.42, 0.48, "bowl", 0.66, 0.56),
         ("yellow", 0.72, 0.44, "bowl", 0.58, 0.74),
@@ -39,7 +39,7 @@ def _learned_components() -> list[Published]:
 
 
 def _baselines() -> list[Published]:
-    """The baselines' columns of the table of guidance weights."""
+    """Baselines in the table of guidance weights."""
     rows = (("BC", 0.46, 0.05), ("CVAE", 0.60, 0.06), ("in-context", 0.57, 0.03), ("language", 0.63, 0.07))
     return [Published(NEW, value, error, method=method) for method, value, error in rows]
 

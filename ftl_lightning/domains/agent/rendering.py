@@ -1,4 +1,4 @@
-"""Pictures: plans drawn over their scenes from above, and frames of episodes from the simulator's own renderer."""
+"""Top-view pictures of plans, and films of episodes by the simulator."""
 
 from collections.abc import Sequence
 
@@ -16,24 +16,24 @@ from ftl_lightning.domains.vector_film import Shape, VectorFilm, regular, some, 
 from ftl_lightning.escape import figure_text
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}
-"""A bowl is an open triangle that points down."""
+"""Markers; a bowl is an open triangle pointing down."""
 CORNERS = {"cone": (3, np.pi / 2), "cube": (4, np.pi / 4)}
-"""Of shapes with corners: how many, and at which angle one is."""
+"""Number of corners and angle of the first corner."""
 SEEN = (-2.1, 2.1), (-4.8, -2.8)
-"""x and z that pictures show."""
+"""Ranges of x and z in pictures."""
 MAX_COLUMNS = 4
 FRAMES = 40
-"""At most, of an episode."""
+"""Maximum number of frames of an episode."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """A grid of scenes from above with the agent's way.
+    """Draw a grid of top-view scenes with the agent's path.
 
     Args:
         states: plans ``(scene, horizon, 13)``.
-        right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
-        title: above the grid.
-        starts: with ``world (scene, 52)``.
+        right: whether the task holds in each scene (green and red frames); ``None`` for grey frames.
+        title: title above the grid.
+        starts: initial states with ``world (scene, 52)``.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
@@ -64,15 +64,15 @@ def _scene(axes: Axes, plan: Tensor, initial: Tensor, frame: str) -> None:
 
 
 def _end(observations: Tensor) -> int:
-    """After how many of the steps ``(step, 3 or more)`` nothing moves any more."""
+    """Number of steps ``(step, 3 or more)`` until nothing moves any more."""
     moving = (observations[1:, :3] - observations[:-1, :3]).abs().amax(dim=1) > 0
     return int(moving.nonzero().max()) + 2 if moving.any() else 1
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """At most :data:`FRAMES` pictures ``(height, width, 3)`` of an episode, until nothing moves any more.
+    """Film an episode: at most :data:`FRAMES` frames ``(height, width, 3)``, until nothing moves any more.
 
-    Plans are not drawn: the pictures are the simulator's.
+    Plans are not drawn: the simulator renders the frames.
     """
     expect_simulator()
     from ftl_lightning.domains.agent.environment import AgentEnvironment
@@ -92,26 +92,26 @@ SIZE = 0.1
 """Half the width of a body in metres."""
 AGENT = "#c79a2b"
 STEPS_A_SECOND = 30.0
-"""Of the simulation in films of shapes: half as fast again as it was."""
+"""Simulation steps per second of a vector film: 1.5 times real time."""
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:
-    """An episode from above, until nothing moves any more."""
+    """Top-view film of an episode, until nothing moves any more."""
     observations = rollout.observed[OBSERVED][0]
     return from_above(observations[0], observations)
 
 
 def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """A plan or a demonstration ``(time, 13)`` from above, in its scene, until nothing moves any more."""
+    """Top-view film of a plan or demonstration ``(time, 13)``, until nothing moves any more."""
     return from_above(expect_starts(starts).observed[OBSERVED][0], states)
 
 
 def from_above(world: Tensor, states: Tensor) -> VectorFilm:
-    """A scene and the agent's way in it; the agent is the last shape.
+    """Top-view film of a scene and the agent's path; the agent is the last shape.
 
     Args:
         world: ``(52,)``.
-        states: ``(time, 3 or more)``, of which the first three are where the agent is.
+        states: ``(time, 3 or more)``; the first three columns are the agent's position.
     """
     end = _end(states)
     times = some(end, FRAMES)

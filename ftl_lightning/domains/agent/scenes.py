@@ -1,4 +1,4 @@
-"""Scenes: what an object is, how a goal reads, which pairs of objects a task shows, and the layout of an initial state.
+"""Scenes: objects, goals, pairs of objects per task, and the layout of initial states.
 
 Axes: x right, y up, z forward; metres. The agent starts at :data:`AGENT_START`; object 1 stands to its right, object 2 to its left.
 """
@@ -18,36 +18,36 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.seeding import task_key
 
 COLOURS = {"red": (255, 87, 34), "yellow": (217, 191, 119), "purple": (149, 56, 158), "green": (148, 252, 19)}
-"""The paper's colours, 0 to 255."""
+"""RGB colours of the paper, 0 to 255."""
 SHAPES = ("cone", "sphere", "bowl", "cube")
 TYPES = ("agent", "object 1", "object 2")
 
 HEIGHT = 0.102
-"""Of every centre above the ground, and half the height of every body."""
+"""Height of centres above the ground, half the height of bodies."""
 AGENT_START = (0.0, HEIGHT, -3.806)
 OBJECT_X, OBJECT_Z = (0.0, 1.66), (-4.355, -3.257)
-"""Where object 1 stands; object 2 stands in the mirror image."""
+"""Range of object 1; the range of object 2 is its mirror image in x."""
 REACH = 0.365
-"""A centre within this distance of another has reached it (paper)."""
+"""Distance of centres at which an object is reached (paper)."""
 AGENT_CLEARANCE, OBJECT_CLEARANCE = 0.55, 0.8
-"""Least distance between centres in a drawn scene: nothing touches, and reaching one object is not reaching the other."""
+"""Minimum distance between centres in drawn scenes: bodies do not touch, and only one object is within reach."""
 LEAST_DISTANCE = 0.2
-"""Least distance between centres in any scene; nearer bodies would overlap."""
+"""Minimum distance between centres in any scene; nearer bodies would overlap."""
 
 STATE = 13
 """Columns of the agent's state: position 3, quaternion (x, y, z, w) 4, velocity 3, angular velocity 3."""
 _TAIL = len(TYPES) + 4 + len(SHAPES)
 _OBJECT = 3 + _TAIL
 INITIAL = STATE + _TAIL + 2 * _OBJECT
-"""52 columns of an initial state: the agent's state, type, rgba and shape, and for each object position, type, rgba and shape."""
+"""Columns of an initial state, 52: the agent's state, type, rgba and shape; each object's position, type, rgba and shape."""
 OBJECT_COLUMNS = tuple(slice(start, start + _OBJECT) for start in range(STATE + _TAIL, INITIAL, _OBJECT))
 PLANE = (0, 2)
-"""x and z within a position."""
+"""Columns x and z of a position."""
 OBSERVED = "world"
 """Name of the observed feature: the agent and both objects."""
 FEATURE = Feature(
     shape=(INITIAL,),
-    # Of each object its position and, as attributes, colour and shape; its type would tell apart what should be alike.
+    # Position, colour and shape (as attributes) of each object; the type would break their symmetry.
     entities=tuple(
         (*range(columns.start, columns.start + 3), *range(columns.start + 3 + len(TYPES), columns.stop))
         for columns in OBJECT_COLUMNS
@@ -60,7 +60,7 @@ TRAINING_GROUPS = (
     tuple(itertools.product(("red", "yellow"), ("cone", "sphere"))),
     tuple(itertools.product(("purple", "green"), ("bowl", "cube"))),
 )
-"""Colour and shape of the objects of pretraining; the two objects of a training scene belong to one group (paper)."""
+"""Colour and shape of pretraining objects; both objects of a training scene belong to the same group (paper)."""
 _TRAINING_LOOKS = tuple(itertools.chain(*TRAINING_GROUPS))
 
 Look = tuple[str, str]
@@ -69,7 +69,7 @@ Look = tuple[str, str]
 
 @dataclass(frozen=True)
 class Goal:
-    """The look of the target; ``None`` for any.
+    """Look of the target; ``None`` for any.
 
     Attributes:
         colour: a key of :data:`COLOURS`.
@@ -80,7 +80,7 @@ class Goal:
     shape: str | None
 
     def matches(self, look: Look) -> bool:
-        """Whether an object of this look is a target."""
+        """Whether a look is that of a target."""
         return self.colour in (None, look[0]) and self.shape in (None, look[1])
 
 
@@ -93,21 +93,21 @@ def parse(task: str) -> Goal:
     Raises:
         UserError: for anything else.
     """
-    found = _GRAMMAR.fullmatch(task)
-    if not found or found.groups() == (None, "object"):
+    match = _GRAMMAR.fullmatch(task)
+    if not match or match.groups() == (None, "object"):
         raise UserError(
             f"agent task: expected 'go to [{'|'.join(COLOURS)}] [object|{'|'.join(SHAPES)}]' with a colour, a shape or both, "
             f"found {task!r}"
         )
-    colour, shape = found.groups()
+    colour, shape = match.groups()
     return Goal(colour, None if shape == "object" else shape)
 
 
 def pairs(goal: Goal) -> list[tuple[Look, Look]]:
-    """The looks of target and distractor that a task shows (paper, appendix on data).
+    """Looks of target and distractor for a goal (paper, appendix on data).
 
-    A goal of one attribute shows both objects from one group of pretraining. The target of a goal of two attributes meets
-    distractors from pretraining that share one of its attributes.
+    For goals of a single attribute, both objects are from the same group of pretraining. For goals of two attributes, distractors
+    are from pretraining and share an attribute of the target.
     """
     if goal.colour and goal.shape:
         target = (goal.colour, goal.shape)
@@ -121,18 +121,18 @@ def pairs(goal: Goal) -> list[tuple[Look, Look]]:
 
 
 def scenes(task: str, count: int, seed: int) -> Tensor:
-    """Draw initial states of a task, its pairs of looks equally often, the target on either side.
+    """Draw initial states of a task, with pairs of looks and sides of the target balanced.
 
     Args:
         task: see :func:`parse`.
         count: number of scenes.
-        seed: the same task and seed give the same bytes, whatever else is drawn.
+        seed: seed; the same task and seed give the same bytes.
 
     Returns:
         ``(count, 52)`` float32.
     """
     goal = parse(task)
-    # Two streams, so that fewer scenes of the same seed are the first of more.
+    # Two streams: fewer scenes are a prefix of more.
     order, place = (np.random.default_rng([seed, task_key(task), stream]) for stream in range(2))
     looks: list[tuple[Look, Look]] = []
     while len(looks) < count:
@@ -143,7 +143,7 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
 
 
 def _positions(rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Places ``(x, z)`` of both objects, uniform where they keep clear of each other and of the agent."""
+    """Positions ``(x, z)`` of both objects, uniform subject to clearances."""
     agent = np.array([AGENT_START[0], AGENT_START[2]])
     while True:
         place = np.stack((rng.uniform(*OBJECT_X, 2) * (1, -1), rng.uniform(*OBJECT_Z, 2)), axis=-1)
@@ -153,11 +153,11 @@ def _positions(rng: np.random.Generator) -> list[tuple[float, float]]:
 
 
 def initial_state(looks: Sequence[Look], positions: Sequence[tuple[float, float]]) -> NDArray[np.float32]:
-    """The 52 numbers of a scene with a resting agent.
+    """Initial state ``(52,)`` with a resting agent.
 
     Args:
-        looks: of object 1 and 2.
-        positions: their ``(x, z)``.
+        looks: looks of objects 1 and 2.
+        positions: positions ``(x, z)`` of objects 1 and 2.
     """
     state = np.zeros(INITIAL, dtype=np.float32)
     state[:3] = AGENT_START
@@ -172,52 +172,52 @@ def _tail(kind: int, look: Look) -> list[float]:
     """One-hot type, rgba and one-hot shape."""
     colour, shape = look
     rgba = [*(value / 255 for value in COLOURS[colour]), 1.0]
-    return [*(float(kind == other) for other in range(len(TYPES))), *rgba, *(float(shape == other) for other in SHAPES)]
+    return [*(float(kind == index) for index in range(len(TYPES))), *rgba, *(float(shape == name) for name in SHAPES)]
 
 
 def looks(initial: Sequence[float] | NDArray[np.float32]) -> list[Look]:
     """Colour and shape of both objects of an initial state."""
     values = np.asarray(initial, dtype=np.float32)
-    found = []
+    names = []
     for columns in OBJECT_COLUMNS:
         tail = values[columns][3:]
         rgb = tail[len(TYPES) : len(TYPES) + 3] * 255
         colour = min(COLOURS, key=lambda name: float(np.abs(rgb - COLOURS[name]).sum()))
-        found.append((colour, SHAPES[int(tail[-len(SHAPES) :].argmax())]))
-    return found
+        names.append((colour, SHAPES[int(tail[-len(SHAPES) :].argmax())]))
+    return names
 
 
 def target(task: str, initial_states: Tensor) -> Tensor:
-    """Which object is the target, ``(scene,)`` int64 0 or 1.
+    """Index of the target ``(scene,)``, int64 0 or 1.
 
     Args:
         task: see :func:`parse`.
         initial_states: ``(scene, 52)``.
 
     Raises:
-        UserError: if a scene does not hold exactly one target.
+        UserError: if a scene does not contain exactly one target.
     """
     goal = parse(task)
-    found = []
+    indices = []
     for row, state in enumerate(initial_states.tolist()):
         matching = [index for index, look in enumerate(looks(state)) if goal.matches(look)]
         if len(matching) != 1:
             both = " and ".join(" ".join(look) for look in looks(state))
             raise UserError(f"agent task {task!r}: expected one target in initial state {row}, found {len(matching)} ({both})")
-        found.append(matching[0])
-    return torch.tensor(found)
+        indices.append(matching[0])
+    return torch.tensor(indices)
 
 
 def object_positions(initial_states: Tensor) -> Tensor:
-    """``(scene, 2 objects, 3)`` of initial states ``(scene, 52)``."""
+    """Positions ``(scene, 2 objects, 3)`` in initial states ``(scene, 52)``."""
     return torch.stack([initial_states[:, columns][:, :3] for columns in OBJECT_COLUMNS], dim=1)
 
 
 def check(initial: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
-    """An initial state as an array, checked.
+    """Validate an initial state and return it as an array.
 
     Raises:
-        UserError: for another size, numbers that are not finite, or bodies that overlap.
+        UserError: for a wrong size, numbers that are not finite, or bodies that overlap.
     """
     state = np.asarray(initial, dtype=np.float32)
     if state.shape != (INITIAL,):

@@ -1,4 +1,4 @@
-"""Drives that a person leads: the agent follows the hand's way through the same physics, as it follows the expert's."""
+"""Drives led by hand: the agent follows the drawn route in the same physics as the expert."""
 
 import numpy as np
 import torch
@@ -15,48 +15,48 @@ from ftl_lightning.domains.recorder import Numbers, Piece, Scene
 from ftl_lightning.errors import UserError
 
 BRAKING = 20
-"""States of a demonstration that are left for coming to rest."""
+"""States of a demonstration reserved for braking."""
 LONGEST = (LENGTH - BRAKING) * STEP * SPEED
-"""Metres of a way, which the expert's speed takes most states of a demonstration for."""
+"""Maximum length of a route in metres."""
 SHORTEST = 0.1
-"""Metres; a way that is shorter shows nothing."""
+"""Minimum length of a route in metres."""
 BLUR, CORNER = 0.08, 0.04
-"""Metres: standard deviation along the way by which a hand's trembling is smoothed, and how far apart its corners then are."""
+"""Standard deviation of the smoothing along the route, and distance between its corners afterwards, in metres."""
 FINE = 0.005
-"""Metres: how exactly the way ends before an object."""
+"""Accuracy in metres of the end of a route before an object."""
 
 
 def scene(task: str, seed: int) -> Scene:
-    """A scene from above with the agent at its start.
+    """Top-view scene with the agent at its start.
 
     Args:
-        task: whose objects stand there; a goal of the paper's compositions for ''.
-        seed: of the scene.
+        task: task of the scene; '' for the first of the paper's compositions.
+        seed: seed of the scene.
 
     Raises:
-        UserError: without the simulator, or for a task that is none.
+        UserError: without the simulator, or for an invalid task.
     """
     expect_simulator()
     world = scenes(task or COMPOSITIONS[0], 1, seed)
     film = from_above(world[0], world[:, :3])
     x, z = world[0, list(PLANE)].tolist()
-    faster = STEPS_A_SECOND * STEP  # the hand leads as fast as films play
+    faster = STEPS_A_SECOND * STEP  # the hand moves at the speed of films
     agent = Piece("agent", (x, z), (len(film.shapes) - 1,))
     return Scene(film, (agent,), faster * SPEED, LONGEST / (faster * SPEED), initial_states(world))
 
 
 def record(seen: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
-    """One drive along the hand's way, at the expert's speed, to just before the first object that the way comes to.
+    """Drive along the drawn route at the expert's speed, to just before the first object on it.
 
     Args:
-        seen: the scene before.
-        path: ``(step, 1, 2)``, x and z in metres; what leaves the picture is brought back to its edge.
-        seconds: do not matter: how fast a hand is, is no property of a drive.
+        seen: scene before the drive.
+        path: ``(step, 1, 2)``, x and z in metres, clipped to the picture.
+        seconds: ignored, as the speed of the hand is not a property of the drive.
 
     Raises:
-        UserError: for a way too short to show anything, or without the simulator.
+        UserError: for a route shorter than :data:`SHORTEST`, or without the simulator.
     """
-    assert seen.starts is not None  # of every scene of this domain
+    assert seen.starts is not None  # set by `scene`
     world = seen.starts.observed[OBSERVED]
     start = world[:, list(PLANE)].double().numpy()
     (left, right), (low, high) = SEEN
@@ -73,7 +73,7 @@ def record(seen: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
 
 
 def _before_objects(way: Plane, objects: Plane) -> Plane:
-    """A way's corners ``(corner, 2)`` up to where bodies would touch, as the expert stops, and at most :data:`LONGEST`."""
+    """Corners ``(corner, 2)`` of a route up to contact with an object, at most :data:`LONGEST` metres."""
     fine = at_even_steps(way, int(np.ceil(reached(way)[-1] / FINE)) + 1)
     near = (np.linalg.norm(fine[:, None] - objects, axis=-1) < STOP).any(axis=1) | (reached(fine) > LONGEST)
     kept = fine[: int(near.argmax()) if near.any() else None]

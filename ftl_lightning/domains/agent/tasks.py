@@ -1,4 +1,4 @@
-"""The paper's settings for navigation, as data, and the validation suite on which everything is tuned."""
+"""Tasks of navigation: the paper's settings, and the validation suite for tuning."""
 
 from collections.abc import Sequence
 
@@ -23,12 +23,12 @@ PAPER = _suite(COMPOSITIONS)
 VALIDATION = _suite(
     ("go to green cone", "go to purple sphere", "go to green sphere", "go to red cone", "go to yellow sphere", "go to purple bowl")
 )
-"""Other targets by the paper's rule of distractors: three whose colour was never with their shape in pretraining (as in the paper's
-tasks), three that were, with one distractor they met in pretraining and two they did not."""
+"""Other targets with distractors by the paper's rule: three new combinations of colour and shape (as in the paper's tasks), three
+from pretraining, each with a known and two new distractors."""
 
 
 def _parts(task: str) -> tuple[str, str]:
-    """The two concepts that a composition is made of, as the paper's analysis names them."""
+    """The two concepts of a composition, named as in the paper's analysis."""
     goal = parse(task)
     return f"go to {goal.colour} object", f"go to {goal.shape}"
 
@@ -41,7 +41,7 @@ COMPONENTS = Suite(
         for component in (1, 2)
     )
 )
-"""What each of two learned components generates alone (paper, table 'Analysis of learned concepts')."""
+"""Generation with each of two learned components alone (paper, table 'Analysis of learned concepts')."""
 
 COMPOSED = Suite(
     (
@@ -54,7 +54,7 @@ COMPOSED = Suite(
         EvaluationTask("new + training", "go to purple bowl", learned=("go to purple object",), texts=("go to bowl",)),
     )
 )
-"""The targets of the validation suite once more, each composed of a colour and a shape that were learned apart, or of one that was
-learned and one of pretraining. For tuning, like the validation suite."""
+"""Targets of the validation suite as compositions of colour and shape: two concepts learned separately, or a learned and a training
+concept. For tuning, like the validation suite."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSED}

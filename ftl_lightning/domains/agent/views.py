@@ -1,4 +1,4 @@
-"""Views of a drive: states as in files, or changes from one state to the next (``steps``)."""
+"""Views of a drive: states as in files, or differences between states (``steps``)."""
 
 import itertools
 
@@ -11,15 +11,15 @@ from ftl_lightning.domains.domain import View
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
-    """How each state ``(sample, horizon, 13)`` differs from the one before; the first, from the present."""
+    """Difference of each state ``(sample, horizon, 13)`` from the preceding state; the first from the present."""
     return torch.diff(states, dim=1, prepend=observed[OBSERVED][:, None, :STATE])
 
 
 def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
-    """The inverse."""
+    """Inverse of :func:`_encode_steps`."""
     # Not cumsum, which has no deterministic form on GPUs.
     return torch.stack(list(itertools.accumulate(steps.unbind(dim=1), initial=observed[OBSERVED][:, :STATE]))[1:], dim=1)
 
 
 VIEWS = {"steps": View({OBSERVED: FEATURE}, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps)}
-"""With ``steps``, methods that predict one state after another need not copy the state, of which a step changes a hundredth."""
+"""With ``steps``, autoregressive methods need not copy the state, which changes by about 1% per step."""

@@ -4,10 +4,10 @@ from ftl_lightning.domains.data import PretrainingData
 
 
 class DrivingData(PretrainingData):
-    """The expert's episodes of the four training scenarios that ship; at most 100 of each.
+    """Shipped expert episodes of the four training scenarios, at most 100 each.
 
-    Its settings name no domain. Those of ``PretrainingData(domain=...)`` do, so that the results file would know the same run by
-    another hash: configurations and committed rows go by this class.
+    Configurations and committed results use this class: ``PretrainingData(domain=...)`` would change the configuration hash, as its
+    settings name the domain.
     """
 
     own_domain = "driving"

@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows about driving."""
+"""Domain object of driving."""
 
 from dataclasses import asdict
 from functools import partial
@@ -47,18 +47,18 @@ RENDERING = "ftl_lightning.domains.driving.rendering"
 
 
 class Expert:
-    """Episodes of the expert that succeeded: those that ship, and new ones.
+    """Source of successful episodes of the expert, shipped and new.
 
     Args:
-        root: folder of a user's own episodes of the training scenarios, in place of those that ship.
-        blind: whether new ones are of the expert that knows no more than what can be seen.
+        root: folder of user episodes of the training scenarios, instead of the shipped episodes.
+        blind: whether new episodes are of the expert that knows only observations.
     """
 
     def __init__(self, root: Path | None = None, blind: bool = False) -> None:
         self.root, self.blind = root, blind
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """The same for every seed: the expert takes half an hour for them."""
+        """The same for every seed, as generation takes half an hour."""
         return training_set(name, count, self.root)
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
@@ -81,26 +81,26 @@ class Expert:
         return cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, self.blind))
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
-        """Scenes ``(count, 37)`` of new episodes."""
+        """Initial states of new episodes, scenes ``(count, 37)``."""
         expect_scenario(task)
         expect_simulator()
         from ftl_lightning.domains.driving.scenarios import make, observe
 
         env = make(task)
-        found = []
+        scenes = []
         for number in range(count):
             start = episode_seed(seed, number)
             env.reset(seed=start)
-            found.append(torch.from_numpy(scene(observe(env), task, start)))
+            scenes.append(torch.from_numpy(scene(observe(env), task, start)))
         env.close()
-        return initial_states(torch.stack(found))
+        return initial_states(torch.stack(scenes))
 
 
 def environment(veto: str = BELIEF) -> "DrivingEnvironment":
-    """The domain's environment, with one of the planner's vetoes.
+    """Environment of the domain with a veto of the planner.
 
     Raises:
-        UserError: without the simulator, or for another veto.
+        UserError: without the simulator, or for an unknown veto.
     """
     expect_simulator()
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
@@ -109,28 +109,27 @@ def environment(veto: str = BELIEF) -> "DrivingEnvironment":
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """What happened in episodes.
+    """Outcomes of episodes.
 
     Returns:
-        ``(episode,)`` each: ``success``, the paper's count (in the roundabout: past it, crashed or not); ``strict success``, on
-        the right road without a crash; ``crash``; ``return``; ``length`` in steps; all 0 for an
-        episode that broke off.
+        ``(episode,)`` each: ``success``, the paper's criterion (roundabout: past it, crashed or not); ``strict success``, on the
+        right road without a crash; ``crash``; ``return``; ``length`` in steps. All are 0 for an aborted episode.
     """
     columns = {"success": "passed", "strict success": "arrived", "crash": "crashed", "return": "return", "length": "length"}
-    found = {name: torch.tensor([float(info.get(key, 0)) for info in rollout.infos]) for name, key in columns.items()}
-    return found | {name: found[name] > 0 for name in ("success", "strict success", "crash")}
+    outcomes = {name: torch.tensor([float(info.get(key, 0)) for info in rollout.infos]) for name, key in columns.items()}
+    return outcomes | {name: outcomes[name] > 0 for name in ("success", "strict success", "crash")}
 
 
 def _from_start(states: Tensor) -> Tensor:
-    """Paths ``(plan, horizon, 2)``: metres along and across from where, and as, each starts."""
+    """Paths ``(plan, horizon, 2)`` in metres, along and across the initial heading from the initial position."""
     first = states[:, :1]
     return turned(states[..., 1:3] - first[..., 1:3], first[..., 5], -first[..., 6])
 
 
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Root mean square distance ``(a, b)`` in metres of the controlled vehicle's paths, each seen from its own start and heading.
+    """Root mean square distance ``(a, b)`` in metres between paths of the controlled vehicle, relative to their initial pose.
 
-    Where a plan starts is given, not generated; how it goes on depends on the traffic.
+    The initial pose is given, not generated; the path depends on the traffic.
     """
     return path_distance(_from_start(states), _from_start(others))
 
@@ -141,7 +140,7 @@ DOMAIN = Domain(
     concepts=Concepts(
         training=TRAINING_CONCEPTS,
         suites=SUITES,
-        descriptions=(*TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # others are driven by a concept of these
+        descriptions=(*TRAINING_CONCEPTS, "roundabout", "roundabout third exit"),  # other scenarios use these concepts
         reads=NAMES.__contains__,
         table=Path(__file__).parent / "embeddings.safetensors",
     ),
@@ -164,6 +163,6 @@ DOMAIN = Domain(
         expect=expect_simulator,
     ),
     distance=distance,
-    fresh=False,  # the expert takes some four seconds for an episode
+    fresh=False,  # the expert takes about four seconds per episode
     paper=Paper(PUBLISHED, omega="learned", ours="learned"),
 )

@@ -1,4 +1,4 @@
-"""Closed loop: an environment whose actions are wishes for the next state; a look-ahead planner turns them into decisions."""
+"""Environment whose actions are desired next states; a look-ahead planner turns them into decisions."""
 
 import math
 from typing import Any
@@ -29,30 +29,29 @@ from ftl_lightning.domains.driving.traffic import (
 from ftl_lightning.errors import UserError
 
 DRIVE = 4
-"""Numbers of a drive."""
+"""Columns of a drive."""
 
 Seen = dict[str, NDArray[np.float32]]
 """Observed features by name."""
 
 
 class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
-    """Any scenario, from a start that its number and seed decide.
+    """Driving scenarios; scenario and seed determine the initial state.
 
-    An observation is an initial state (37 numbers). An action is the state (7 numbers) that the controlled vehicle should be in a
-    step later; or the drive there (4, see :func:`~ftl_lightning.domains.driving.motion.drive`), for those who do not know where
-    the road turns; or the number of one of the scenario's decisions, for policies that decide themselves. Of the decisions that
-    the veto finds least risky (:mod:`ftl_lightning.domains.driving.foresight`) the one that comes nearest to the wish (Euclidean,
-    in raw units) is taken, at random among equals; to brake if all crash. A decision that is riskier than others is replaced by a
-    random one of these.
+    An observation is an initial state (37 numbers). An action is the desired state of the controlled vehicle after the step
+    (7 numbers), the desired drive (4, see :func:`~ftl_lightning.domains.driving.motion.drive`) for policies that do not know the
+    road, or the number of a decision of the scenario (1). The planner selects the decisions of minimum risk
+    (:mod:`ftl_lightning.domains.driving.foresight`) and takes the nearest to the action (Euclidean, raw units), at random among
+    ties; it brakes if all crash. A numbered decision of higher risk is replaced by a random decision of minimum risk.
 
-    The information of the last step tells what happened: ``crashed``, ``arrived`` (where the scenario wants the vehicle, and no
-    crash), ``passed`` (the count of the paper's code), ``return`` (sum of rewards) and ``length``.
+    The last step's info contains ``crashed``, ``arrived`` (at the destination without a crash), ``passed`` (criterion of the
+    paper's code), ``return`` (sum of rewards) and ``length``.
 
     Args:
         veto: ``'belief'``, ``'simulation'`` or ``'step'`` (the paper's).
 
     Raises:
-        UserError: for another one.
+        UserError: for an unknown veto.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (gymnasium's)
@@ -72,14 +71,14 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._length = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Go to a start.
+        """Reset to an initial state.
 
         Args:
-            seed: of the start, if no scene is given.
+            seed: seed of the initial state if no scene is given.
             options: ``scene``, 37 numbers; or ``task``, a scenario (default 'roundabout').
 
         Raises:
-            UserError: for a scene that is not the start that its scenario and seed lead to.
+            UserError: for a scene that its scenario and seed do not reproduce.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -90,7 +89,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             name, start = origin(np.asarray(given))
         if name != self._name:
             self._env, self._name = make(name), name
-        super().reset(seed=start)  # of the draws among equal decisions
+        super().reset(seed=start)  # for ties between decisions
         self._env.reset(seed=start)
         self._seed, self._return, self._length = start, 0.0, 0
         self._beliefs = Beliefs(self._env, name)
@@ -108,15 +107,15 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self._env
 
     def observation(self) -> Seen:
-        """What is observed now."""
+        """Current observation."""
         number = np.array([NAMES.index(self._name)], dtype=np.float32)
         return {TRAFFIC: observe(self._env).reshape(OBSERVED).astype(np.float32), SCENARIO: number}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Decide and drive on until the next decision.
+        """Take a decision and simulate until the next.
 
         Raises:
-            UserError: for an action of another size, or with numbers that are not finite.
+            UserError: for an action of the wrong size or with numbers that are not finite.
         """
         wish = np.asarray(action, dtype=np.float64)
         if wish.shape not in ((STATE,), (DRIVE,), (1,)) or not np.isfinite(wish).all():
@@ -129,9 +128,9 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self.observation(), reward, ended, self._length >= MAX_STEPS, info
 
     def decide(self, wish: NDArray[np.float64]) -> int:
-        """The decision that is nearest to a wish (see the class) among those of least risk; to brake if all crash.
+        """Return the decision of minimum risk nearest to an action (see the class); brake if all crash.
 
-        The simulation stays as it is; draws among equals are used up.
+        The simulation is left unchanged; random numbers for ties are consumed.
         """
         now = observe(self._env)[0].astype(np.float64)
         self._beliefs.look()
@@ -145,7 +144,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         risks: dict[int, float] = {}
         nearest = math.inf
         for decision, distance in sorted(zip(there, far.tolist(), strict=True), key=lambda pair: pair[1]):
-            if distance > nearest + 1e-6:  # one that is nearer has no risk
+            if distance > nearest + 1e-6:  # a nearer decision has no risk
                 break
             risks[decision] = worlds.risk(decision)
             nearest = distance if risks[decision] == 0 else nearest
@@ -160,7 +159,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
 
     @staticmethod
     def _far(now: NDArray[np.float64], states: NDArray[np.float64], wish: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far states ``(decision, 7)`` that follow the present ``(7,)`` are from the wish ``(decision,)``."""
+        """Distances ``(decision,)`` of next states ``(decision, 7)`` after the present ``(7,)`` from the action."""
         if len(wish) == DRIVE:
             states = drive(torch.from_numpy(now).expand(len(states), -1), torch.from_numpy(states)).numpy()
         distances: NDArray[np.float64] = np.linalg.norm(states - wish, axis=1)
@@ -183,7 +182,7 @@ class DrivingEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """A picture from above ``(height, width, 3)``."""
+        """Top-view picture ``(height, width, 3)``."""
         picture: NDArray[np.uint8] = self._env.render()
         return picture
 

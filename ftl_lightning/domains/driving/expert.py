@@ -1,4 +1,4 @@
-"""The expert: optimistic planning for deterministic systems (Hren and Munos, 2008) through the simulation itself."""
+"""Expert: optimistic planning of deterministic systems (Hren and Munos, 2008) in the simulation."""
 
 import heapq
 import itertools
@@ -19,14 +19,14 @@ from ftl_lightning.domains.driving.traffic import BELIEF
 
 @dataclass(frozen=True)
 class Search:
-    """How far a scenario's search goes.
+    """Search settings of a scenario.
 
     Attributes:
-        budget: simulated decisions for each that is made.
+        budget: simulated decisions per decision taken.
         gamma: discount; rewards are in [0, 1].
-        frequency: Hz of the simulation while searching.
-        hold: steps that each decision is kept while searching.
-        sight: metres; vehicles farther away are left out while searching.
+        frequency: simulation frequency during search in Hz.
+        hold: steps per decision during search.
+        sight: distance in metres; farther vehicles are ignored during search.
     """
 
     budget: int
@@ -52,12 +52,12 @@ IDLE = 1
 
 @dataclass(frozen=True)
 class Blind:
-    """How the expert searches that knows no more than what can be seen.
+    """Search settings of the blind expert, which knows only observations.
 
     Attributes:
-        beliefs: worlds that it imagines at a decision.
-        expansions: decisions that it simulates in each for every action there is.
-        tolerated: risk that it takes: without any it waits until the time is up, since somebody may always come.
+        beliefs: sampled worlds per decision.
+        expansions: simulated decisions per world and available action.
+        tolerated: accepted risk; without any the expert waits until time is up, as a vehicle may always appear.
     """
 
     beliefs: int = 4
@@ -69,10 +69,10 @@ BLIND = Blind()
 
 
 def plan(env: AbstractEnv, name: str) -> int:
-    """The action to take now; the environment is left as it was.
+    """Return the next action; the environment is left unchanged.
 
-    A tree of action sequences is grown where an optimist would: a leaf's value is what it has earned and, from there on, the
-    best there is, 1 a step. After the budget is spent the action with the best sequence so far, by what it has earned, is taken.
+    A tree of action sequences grows at the leaf of highest optimistic value: its discounted return plus the maximum reward, 1 per
+    step, from there on. Once the budget is spent, the first action of the sequence with the highest return is taken.
     """
     search = SEARCH[name]
     with _searching(env, search):
@@ -81,16 +81,16 @@ def plan(env: AbstractEnv, name: str) -> int:
 
 
 def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Generator) -> int:
-    """The action to take now for one who sees no more than its pupils: the same search in imagined worlds, with the same veto.
+    """Return the next action of the blind expert: the same search in sampled worlds, with the same veto.
 
-    An action's value is the mean of what the best sequence after it earns in each. The best of tolerated risk is taken, or if there
-    is none, the best of least.
+    The value of an action is the mean return of its best sequence over the worlds. The best action of tolerated risk is taken, else
+    the best action of minimum risk.
 
     Args:
-        env: left as it was.
-        name: of the scenario.
-        beliefs: what is known; they have looked.
-        rng: draws worlds from them.
+        env: left unchanged.
+        name: name of the scenario.
+        beliefs: beliefs, updated for this decision.
+        rng: generator for sampled worlds.
     """
     search, actual = SEARCH[name], save(env)
     actions = list({meaning(env, action): action for action in env.get_available_actions()[::-1]}.values())[::-1]
@@ -112,7 +112,7 @@ def plan_blind(env: AbstractEnv, name: str, beliefs: Beliefs, rng: np.random.Gen
 
 @contextmanager
 def _searching(env: AbstractEnv, search: Search) -> Iterator[None]:
-    """As coarse as a search is; the environment is left as it was."""
+    """Apply search settings; restore the environment afterwards."""
     actual, frequency, vehicles = save(env), env.config["simulation_frequency"], env.road.vehicles
     env.config["simulation_frequency"] = search.frequency
     if search.sight < math.inf:
@@ -126,10 +126,10 @@ def _searching(env: AbstractEnv, search: Search) -> Iterator[None]:
 
 
 def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence[int], budget: int) -> dict[int, float]:
-    """What the best sequence found after each action earns; none for actions after which nothing was tried."""
+    """Return of the best sequence after each action; actions that were not expanded are missing."""
     order = itertools.count()
     root = save(env)
-    found: dict[int, float] = {}
+    returns: dict[int, float] = {}
     # Leaves by optimistic value: (-value, order, earned, depth, first action, state).
     leaves: list[tuple[float, int, float, int, int | None, Snapshot]] = [(0.0, next(order), 0.0, 0, None, root)]
     left = budget
@@ -149,28 +149,28 @@ def _values(env: AbstractEnv, name: str, search: Search, first_actions: Sequence
                     break
             future = search.gamma**below / (1 - search.gamma)
             if ended and arrived(env, name) and not env.vehicle.crashed:
-                total += future  # it has arrived for good, or arriving would be worth nothing
+                total += future  # otherwise arriving would be worth nothing
             start = action if first is None else first
-            if total > found.get(start, -math.inf):
-                found.pop(start, None)  # of equals the one that was found first stands first
-                found[start] = total
+            if total > returns.get(start, -math.inf):
+                returns.pop(start, None)  # keep ties in order of discovery
+                returns[start] = total
             if not ended:
                 heapq.heappush(leaves, (-(total + future), next(order), total, below, start, save(env)))
     restore(env, root)
-    return found
+    return returns
 
 
 def drive(name: str, seed: int, env: AbstractEnv | None = None, blind: bool = False) -> tuple[NDArray[np.float32], bool]:
-    """One episode of the expert.
+    """Run an episode of the expert.
 
     Args:
-        name: of the scenario.
-        seed: of the episode.
-        env: of this scenario, if there is one already.
-        blind: whether it knows no more than what can be seen.
+        name: name of the scenario.
+        seed: seed of the episode.
+        env: existing environment of this scenario, if any.
+        blind: whether the expert knows only observations.
 
     Returns:
-        Observations ``(time, 5, 7)``, and whether it succeeded: without a crash, and where the scenario wants it.
+        Observations ``(time, 5, 7)``, and success: at the destination without a crash.
     """
     env = env or make(name)
     env.reset(seed=seed)

@@ -1,8 +1,8 @@
-"""The same simulation, faster: scalar arithmetic, one lane lookup a frame, a broad phase of collisions.
+"""Faster simulation: scalar arithmetic, a single lane lookup per frame, broad-phase collision detection.
 
-highway-env spends its time on numpy calls for two numbers and on looking at all pairs of vehicles again and again. The classes here
-take the place of its own in one environment; none of them changes what is computed, only in what order numbers are added
-(tests compare both on random actions). ``scenarios.make(name, fast=False)`` does without them.
+highway-env spends most time on numpy calls for pairs of numbers and on all pairs of vehicles. These classes replace highway-env's
+within an environment. Results are the same up to the order of additions, see the tests.
+``scenarios.make(name, fast=False)`` does not use them.
 """
 
 import math
@@ -29,7 +29,7 @@ def _wrap(angle: float) -> float:
 
 
 class FastStraightLane(StraightLane):
-    """A straight lane."""
+    """Straight lane with scalar arithmetic."""
 
     def local_coordinates(self, position: Any) -> tuple[float, float]:
         x, y = position.tolist()
@@ -38,18 +38,18 @@ class FastStraightLane(StraightLane):
         return x * dx + y * dy, y * dx - x * dy
 
     def nearer(self, x: float, y: float, heading: float, than: float) -> float | None:
-        """``distance_with_heading`` if it is below a bound."""
+        """Return ``distance_with_heading`` if it is below the bound ``than``, else ``None``."""
         x0, y0, dx, dy = self._line
         x, y = x - x0, y - y0
         s = x * dx + y * dy
-        found = abs(y * dx - x * dy) + (s - self.length if s > self.length else -s if s < 0 else 0)
-        if found < than and (found := found + abs(_wrap(heading - self.heading))) < than:
-            return found
+        distance = abs(y * dx - x * dy) + (s - self.length if s > self.length else -s if s < 0 else 0)
+        if distance < than and (distance := distance + abs(_wrap(heading - self.heading))) < than:
+            return distance
         return None
 
 
 class FastSineLane(SineLane):
-    """A lane that swings to one side."""
+    """Sine-shaped lane with scalar arithmetic."""
 
     local_coordinates_along = FastStraightLane.local_coordinates
 
@@ -69,14 +69,14 @@ class FastSineLane(SineLane):
         beyond = s - self.length if s > self.length else -s if s < 0 else 0
         if abs(r) - abs(self.amplitude) + beyond > than:
             return None
-        found = abs(r - self.amplitude * math.sin(self.pulsation * s + self.phase)) + beyond
-        if found < than and (found := found + abs(_wrap(heading - self.heading_at(s)))) < than:
-            return found
+        distance = abs(r - self.amplitude * math.sin(self.pulsation * s + self.phase)) + beyond
+        if distance < than and (distance := distance + abs(_wrap(heading - self.heading_at(s)))) < than:
+            return distance
         return None
 
 
 class FastCircularLane(CircularLane):
-    """A lane along an arc."""
+    """Circular lane with scalar arithmetic."""
 
     def local_coordinates(self, position: Any) -> tuple[float, float]:
         x, y = position.tolist()
@@ -89,13 +89,13 @@ class FastCircularLane(CircularLane):
         """As of :class:`FastStraightLane`."""
         x0, y0 = self._centre
         x, y = x - x0, y - y0
-        found = abs(self.radius - math.sqrt(x * x + y * y))
-        if found >= than:
+        distance = abs(self.radius - math.sqrt(x * x + y * y))
+        if distance >= than:
             return None
         s = self.direction * _wrap(math.atan2(y, x) - self.start_phase) * self.radius
-        found += s - self.length if s > self.length else -s if s < 0 else 0
-        if found < than and (found := found + abs(_wrap(heading - self.heading_at(s)))) < than:
-            return found
+        distance += s - self.length if s > self.length else -s if s < 0 else 0
+        if distance < than and (distance := distance + abs(_wrap(heading - self.heading_at(s)))) < than:
+            return distance
         return None
 
 
@@ -103,27 +103,27 @@ _LANES = {StraightLane: FastStraightLane, SineLane: FastSineLane, CircularLane: 
 
 
 class FastNetwork(RoadNetwork):
-    """Looks for the closest lane without building lists."""
+    """Road network with a lane lookup that builds no lists."""
 
     def get_closest_lane_index(self, position: Any, heading: float | None = None, likely: LaneIndex | None = None) -> LaneIndex:
         if heading is None:
             return super().get_closest_lane_index(position, heading)
         x, y = position.tolist()
         lanes = self._lanes
-        best, found = math.inf, lanes[0][0]
+        best, nearest = math.inf, lanes[0][0]
         if likely is not None:
-            # Nearly all lanes are farther than the one it was on. Of equally near lanes the first counts.
+            # Most lanes are farther than the previous lane. Ties go to the first lane.
             best = math.nextafter(self.get_lane(likely).nearer(x, y, heading, math.inf), math.inf)
             off_x, off_y, reach = self._middles[0] - x, self._middles[1] - y, self._middles[2] + best
             lanes = [lanes[number] for number in (off_x * off_x + off_y * off_y <= reach * reach).nonzero()[0].tolist()]
         for index, lane in lanes:
             if (distance := lane.nearer(x, y, heading, best)) is not None:
-                best, found = distance, index
-        return found
+                best, nearest = distance, index
+        return nearest
 
 
 class FastVehicle(IDMVehicle):
-    """The other drivers."""
+    """Other drivers."""
 
     position: Any
     impact: Any
@@ -157,16 +157,16 @@ class FastVehicle(IDMVehicle):
         return _clip(math.atan(2 * math.tan(slip)), -self.MAX_STEERING_ANGLE, self.MAX_STEERING_ANGLE)
 
     def acceleration(self, ego_vehicle: Any, front_vehicle: Any = None, rear_vehicle: Any = None) -> float:
-        if not hasattr(ego_vehicle, "action"):  # nobody, or an obstacle
+        if not hasattr(ego_vehicle, "action"):  # no vehicle, or an obstacle
             return 0
         wanted = getattr(ego_vehicle, "target_speed", 0)
         if ego_vehicle.lane and ego_vehicle.lane.speed_limit is not None:
             wanted = _clip(wanted, 0, ego_vehicle.lane.speed_limit)
-        found = self.COMFORT_ACC_MAX * (1 - math.pow(max(ego_vehicle.speed, 0) / abs(utils.not_zero(wanted)), self.DELTA))
+        pull = self.COMFORT_ACC_MAX * (1 - math.pow(max(ego_vehicle.speed, 0) / abs(utils.not_zero(wanted)), self.DELTA))
         if front_vehicle:
             gap = self.desired_gap(ego_vehicle, front_vehicle) / utils.not_zero(ego_vehicle.lane_distance_to(front_vehicle))
-            found -= self.COMFORT_ACC_MAX * gap * gap
-        return found
+            pull -= self.COMFORT_ACC_MAX * gap * gap
+        return pull
 
     def desired_gap(self, ego_vehicle: Any, front_vehicle: Any = None, projected: bool = True) -> float:
         speed = ego_vehicle.speed
@@ -199,7 +199,7 @@ class FastVehicle(IDMVehicle):
 
 
 class FastController(MDPVehicle):
-    """The controlled vehicle."""
+    """Controlled vehicle."""
 
     lane_index: Any
     lane: Any
@@ -214,10 +214,10 @@ class FastController(MDPVehicle):
 
 
 class FastRoad(Road):
-    """Knows who is on which lane, and which vehicles are near enough to touch."""
+    """Road that caches the vehicles per lane and checks only near pairs for collisions."""
 
     def act(self) -> None:
-        # Nothing moves while everybody decides.
+        # Vehicles do not move while deciding.
         self._on_lane: dict[LaneIndex, list[tuple[float, RoadObject]]] | None = {}
         super().act()
         self._on_lane = None
@@ -244,13 +244,13 @@ class FastRoad(Road):
         return v_front, v_rear
 
     def _along(self, lane: Any) -> list[tuple[float, RoadObject]]:
-        found = []
+        there = []
         for v in self.vehicles + self.objects:
             if not isinstance(v, Landmark):
                 s, r = lane.local_coordinates(v.position)
                 if abs(r) <= lane.width / 2 + 1 and -lane.VEHICLE_LENGTH <= s < lane.length + lane.VEHICLE_LENGTH:
-                    found.append((s, v))
-        return found
+                    there.append((s, v))
+        return there
 
     def step(self, dt: float) -> None:
         for vehicle in self.vehicles:
@@ -262,12 +262,12 @@ class FastRoad(Road):
         for i, vehicle in enumerate(self.vehicles):
             while pairs and pairs[-1][0] == i:
                 vehicle.handle_collisions(self.vehicles[pairs.pop()[1]], dt)
-            for other in self.objects:
-                vehicle.handle_collisions(other, dt)
+            for thing in self.objects:
+                vehicle.handle_collisions(thing, dt)
 
 
 class FastRegulatedRoad(FastRoad, RegulatedRoad):
-    """Predicts each vehicle's way once, and looks closer only at ways that come near each other."""
+    """Predicts each trajectory once and checks only pairs that come near each other."""
 
     def step(self, dt: float) -> None:
         self.steps += 1
@@ -276,7 +276,7 @@ class FastRegulatedRoad(FastRoad, RegulatedRoad):
         FastRoad.step(self, dt)
 
     def enforce_road_rules(self) -> None:
-        times = np.arange(0.25, 3, 0.25)  # as of is_conflict_possible
+        times = np.arange(0.25, 3, 0.25)  # as in is_conflict_possible
         ways = [vehicle.predict_trajectory_constant_speed(times) for vehicle in self.vehicles]
         places = np.array([positions for positions, _ in ways])
         gaps = ((places[:, None] - places[None]) ** 2).sum(axis=-1)
@@ -302,7 +302,7 @@ _ROADS = {Road: FastRoad, RegulatedRoad: FastRegulatedRoad}
 
 
 def accelerate(road: Road) -> None:
-    """Let a road, its network and lanes compute as the classes above."""
+    """Convert a road and its network, lanes and controlled vehicle."""
     network = road.network
     for lane in network.lanes_list():
         if type(lane) in (StraightLane, SineLane):
@@ -320,12 +320,12 @@ def accelerate(road: Road) -> None:
 
 
 def _around(lane: Any) -> tuple[float, float, float]:
-    """Middle and radius of a circle that a lane's line stays within."""
+    """Centre and radius of a circle around a lane's centre line."""
     line = np.array([lane.position(s, 0) for s in np.linspace(0, lane.length, 50)])
     middle = (line.min(axis=0) + line.max(axis=0)) / 2
     return float(middle[0]), float(middle[1]), float(np.linalg.norm(line - middle, axis=1).max()) + ROUND
 
 
 ROUND = 8.0
-"""Metres that are added to circles around lanes, for what lies between the points looked at, and for sine lanes' distance beyond
-their ends, which is not quite a distance."""
+"""Margin of circles around lanes in metres, for the gaps between sampled points and the inexact distance beyond the ends of sine
+lanes."""

@@ -1,13 +1,13 @@
-"""The planner's veto: which decisions may crash, as far as it looks ahead and as much as it knows.
+"""The planner's veto: risk of crashes within its look-ahead and knowledge.
 
-Three kinds, the same for every method and every reference line:
+Three vetoes, shared by all methods and baselines:
 
-- ``step``: a decision is tried in the true simulation until the next one (the paper's);
-- ``simulation``: it is followed for some decisions in the true simulation;
-- ``belief``: likewise, in worlds that are imagined from what can be seen, see :class:`Beliefs`.
+- ``step``: one-step look-ahead in the true simulation (the paper's);
+- ``simulation``: several decisions of look-ahead in the true simulation;
+- ``belief``: the same look-ahead in worlds sampled from observations, see :class:`Beliefs`.
 
-A decision is as risky as the share of worlds in which it crashes, or in which everything that may be decided after it does
-(proposals are simulated and scored likewise in PDM-Closed; Dauner et al., 2023).
+The risk of a decision is the share of worlds in which it, or everything that may follow it, crashes (compare the simulation and
+scoring of proposals in PDM-Closed; Dauner et al., 2023).
 """
 
 import itertools
@@ -28,11 +28,11 @@ from ftl_lightning.domains.driving.traffic import BELIEF, SIMULATION, STEP
 
 @dataclass(frozen=True)
 class Foresight:
-    """How far a veto looks, and into what.
+    """Settings of a veto.
 
     Attributes:
-        depth: decisions that are followed, the first one included.
-        beliefs: imagined worlds; 0 looks into the true simulation.
+        depth: decisions of look-ahead, including the first.
+        beliefs: number of sampled worlds; 0 for the true simulation.
     """
 
     depth: int
@@ -41,26 +41,25 @@ class Foresight:
 
 VETOES = {BELIEF: Foresight(3, 8), SIMULATION: Foresight(3), STEP: Foresight(1)}
 FRAMES = 5
-"""Of an imagined world between two decisions."""
+"""Simulation frames per decision in sampled worlds."""
 SIGHT = 100.0
-"""Metres from the controlled vehicle, within which others are imagined."""
+"""Distance in metres within which other vehicles are part of sampled worlds."""
 AFTERWARDS = ("IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT")
-"""What may be decided after the decision in question, in the order in which it is tried."""
+"""Follow-up decisions, in the order in which they are tried."""
 Meaning = tuple[float, tuple[str, str, int]]
 """Target speed and lane."""
 
 
 class Beliefs:
-    """What can be known of the other vehicles, from where they are and were.
+    """Beliefs about the other vehicles, from their present and past observations.
 
-    Seen are each one's place, heading, speed, and whether it has crashed. Hidden are where it is going, how it follows (the
-    exponent of the IDM), at what speed it would drive alone, and which lane it changes to. A belief draws these: the destination
-    uniformly from those of the scenario that its way so far leaves open, the exponent from highway-env's range; it would drive at
-    the highest speed at which it was seen, and stays in its lane. Who will come next is unknown too.
+    Position, heading, speed and crash are observed. Destination, IDM exponent, desired speed and lane changes are hidden. A belief
+    samples the destination uniformly from those still reachable in the scenario, and the exponent from highway-env's range. The
+    desired speed is the highest observed speed; vehicles keep their lane. Vehicles that appear later are unknown too.
 
     Args:
         env: the simulation.
-        name: of the scenario.
+        name: name of the scenario.
     """
 
     def __init__(self, env: AbstractEnv, name: str) -> None:
@@ -69,7 +68,7 @@ class Beliefs:
         self._passed: dict[Any, list[str]] = {}
 
     def look(self) -> None:
-        """Take in where everybody is now; before each decision."""
+        """Update from the present observation; call before each decision."""
         network = self._env.road.network
         fastest, passed = {}, {}
         for vehicle in self._others():
@@ -81,11 +80,11 @@ class Beliefs:
 
     def _others(self) -> list[Any]:
         ego = self._env.vehicle
-        near = [one for one in self._env.road.vehicles if one is not ego]
-        return [one for one in near if math.dist(one.position, ego.position) < SIGHT]
+        others = [vehicle for vehicle in self._env.road.vehicles if vehicle is not ego]
+        return [vehicle for vehicle in others if math.dist(vehicle.position, ego.position) < SIGHT]
 
     def draw(self, rng: np.random.Generator) -> None:
-        """Put an imagined world in the simulation's place: other vehicles as one may believe them to be, and another future."""
+        """Replace the simulation's state by a sampled world: other vehicles and random state."""
         env, road = self._env, self._env.road
         others = [self._believed(vehicle, rng) for vehicle in self._others()]
         road.vehicles = [env.vehicle, *others]
@@ -93,7 +92,7 @@ class Beliefs:
         env.np_random.bit_generator.state = np.random.default_rng(rng.integers(2**32)).bit_generator.state
 
     def _believed(self, vehicle: Any, rng: np.random.Generator) -> Any:
-        found = type(vehicle)(
+        driver = type(vehicle)(
             vehicle.road,
             vehicle.position.copy(),
             vehicle.heading,
@@ -102,35 +101,35 @@ class Beliefs:
             enable_lane_change=vehicle.enable_lane_change,
             timer=rng.uniform(),
         )
-        found.check_collisions, found.crashed = vehicle.check_collisions, vehicle.crashed
-        found.DELTA = rng.uniform(*found.DELTA_RANGE)
+        driver.check_collisions, driver.crashed = vehicle.check_collisions, vehicle.crashed
+        driver.DELTA = rng.uniform(*driver.DELTA_RANGE)
         network, passed = vehicle.road.network, self._passed[vehicle]
-        ways = [network.shortest_path(found.lane_index[1], end) for end in self._scenario.destinations]
+        ways = [network.shortest_path(driver.lane_index[1], end) for end in self._scenario.destinations]
         open_ways = [way for way in ways if way and not set(way) & set(passed)]
-        found.route = [found.lane_index]
+        driver.route = [driver.lane_index]
         if open_ways:
             way = open_ways[rng.integers(len(open_ways))]
-            found.route += [(start, end, None) for start, end in itertools.pairwise(way)]
-        return found
+            driver.route += [(start, end, None) for start, end in itertools.pairwise(way)]
+        return driver
 
 
 def meaning(env: AbstractEnv, decision: int) -> Meaning:
-    """What a decision makes of the vehicle: two that make the same of it are one, such as speeding up at the highest speed."""
+    """Effect of a decision; decisions of equal effect are equivalent, such as speeding up at the highest speed."""
     now = save(env)
     env.action_type.act(decision)
-    found = env.vehicle.target_speed, env.vehicle.target_lane_index
+    effect = env.vehicle.target_speed, env.vehicle.target_lane_index
     restore(env, now)
-    return found
+    return effect
 
 
 class Worlds:
-    """The worlds that a veto looks into at one moment.
+    """Worlds of a veto at the present time.
 
     Args:
-        env: the simulation, which is left as it is.
+        env: the simulation, left unchanged.
         foresight: the veto.
-        beliefs: what is known.
-        rng: draws from them.
+        beliefs: beliefs about other vehicles.
+        rng: generator for sampled worlds.
     """
 
     def __init__(self, env: AbstractEnv, foresight: Foresight, beliefs: Beliefs, rng: np.random.Generator) -> None:
@@ -150,7 +149,7 @@ class Worlds:
 
     @contextmanager
     def _imagining(self) -> Iterator[None]:
-        """With fewer frames, where the world is not the true one; the simulation is left as it was."""
+        """Use :data:`FRAMES` in sampled worlds; restore the simulation afterwards."""
         env, actual = self._env, save(self._env)
         frequency = env.config["simulation_frequency"]
         if self._foresight.beliefs:
@@ -162,7 +161,7 @@ class Worlds:
             restore(env, actual)
 
     def state(self, decision: int) -> NDArray[np.float64] | None:
-        """The state ``(7,)`` that a decision leads to in the first world in which it does not crash; ``None`` if there is none."""
+        """State ``(7,)`` after a decision in the first world without a crash; ``None`` if all crash."""
         with self._imagining():
             key = self._key(decision)
             for world in range(len(self._worlds)):
@@ -172,12 +171,12 @@ class Worlds:
         return None
 
     def risk(self, decision: int) -> float:
-        """The share of worlds in which a decision crashes, or all that may be decided after it."""
+        """Share of worlds in which a decision, or everything that may follow it, crashes."""
         with self._imagining():
             key = self._key(decision)
             if key not in self._risks:
                 after = [self._followed(key, decision, world) for world in range(len(self._worlds))]
-                self._risks[key] = sum(not self._survives(one, self._foresight.depth - 1) for one in after) / len(after)
+                self._risks[key] = sum(not self._survives(end, self._foresight.depth - 1) for end in after) / len(after)
             return self._risks[key]
 
     def _key(self, decision: int) -> Meaning:
@@ -185,7 +184,7 @@ class Worlds:
         return meaning(self._env, decision)
 
     def _followed(self, key: Meaning, decision: int, world: int) -> Snapshot | None:
-        """A world after a decision; ``None`` if it crashes there."""
+        """Snapshot of a world after a decision; ``None`` after a crash."""
         if (key, world) not in self._after:
             restore(self._env, self._worlds[world])
             advance(self._env, decision)
@@ -193,7 +192,7 @@ class Worlds:
         return self._after[key, world]
 
     def _survives(self, after: Snapshot | None, left: int) -> bool:
-        """Whether some decisions can follow, as many as are left, without a crash."""
+        """Whether ``left`` further decisions are possible without a crash."""
         if after is None or not left:
             return after is not None
         env = self._env

@@ -1,4 +1,4 @@
-"""The expert's episodes: kept one by one as they are made, so that a run that is killed goes on where it stopped."""
+"""Episodes of the expert, cached individually, so that an interrupted run resumes."""
 
 import logging
 import multiprocessing
@@ -37,23 +37,23 @@ _LOG = logging.getLogger(__name__)
 
 KIND = "driving episode"
 MOST = 4
-"""Episodes that are driven at most for each that is kept."""
+"""Maximum number of episodes driven per kept episode."""
 
 
 def shard(name: str, seed: int, blind: bool = False) -> Path:
-    """File of one episode."""
+    """Cache file of an episode."""
     belief = [expert.BLIND.__dict__, VETOES[BELIEF].__dict__] if blind else []
     key = content_hash([name, SCENARIOS[name].config, SEARCH[name].__dict__, *belief])
     return cache_folder() / f"{NAME}-{key}" / f"{seed}.safetensors"
 
 
 def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool]:
-    """Observations ``(time, 5, 7)`` of the expert and whether it succeeded, from the cache if they are there.
+    """Observations ``(time, 5, 7)`` and success of an expert episode, from the cache if present.
 
-    Kept is what the rules of the scenario decide. An episode at which the simulation fails counts as rejected this time alone.
+    Outcomes by the scenario's rules are cached. If the simulation fails, the episode counts as rejected and is not cached.
 
     Raises:
-        UserError: where the machine fails, which says nothing of the episode.
+        UserError: if the machine fails, independently of the episode.
     """
     path = shard(name, seed, blind)
     if path.is_file():
@@ -61,12 +61,12 @@ def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool
             tensors, header = load_tensors(path, KIND)
             return tensors["observations"].numpy(), bool(header["succeeded"])
         except UserError:
-            path.unlink()  # damaged from outside: driven again
+            path.unlink()  # damaged: drive again
     try:
         seen, succeeded = expert.drive(name, seed, blind=blind)
     except (MemoryError, OSError) as error:
         raise UserError(f"driving {name!r}, seed {seed}: the machine failed ({error!r}); run it again, it goes on here") from error
-    except Exception as error:  # whatever the simulation raises: the other episodes go on
+    except Exception as error:  # errors of the simulation: continue with further episodes
         _LOG.warning("driving %r, seed %d: %r; the episode counts as rejected and is not kept", name, seed, error)
         return np.zeros((1, VEHICLES, STATE), dtype=np.float32), False
     save_tensors(path, KIND, {"observations": torch.from_numpy(seen)}, {"succeeded": succeeded})
@@ -74,10 +74,10 @@ def episode(name: str, seed: int, blind: bool = False) -> tuple[np.ndarray, bool
 
 
 def driven_on(seen: np.ndarray, name: str, length: int) -> np.ndarray:
-    """An episode's observations ``(time, 5, 7)``, longer: every vehicle drives straight on after the end.
+    """Extend observations ``(time, 5, 7)`` to ``length``: vehicles drive straight on after the end.
 
-    Plans look beyond the end of an episode, which ends because time is up or there is nothing left to decide. Vehicles that stood
-    still there, as if turned to stone, would teach that a drive ends with a stop.
+    Plans extend beyond the end of an episode, which ends when time is up or nothing is left to decide. Padding with standing
+    vehicles would teach that episodes end with a stop.
     """
     times = decision_seconds(name) * np.arange(1, length - len(seen) + 1)[:, None, None]
     beyond = np.repeat(seen[-1:], len(times), axis=0)
@@ -94,7 +94,7 @@ def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterato
     if workers == 1:
         yield from map(_made, jobs)
         return
-    # Ctrl-C is for this process, which then ends the others.
+    # Only this process handles Ctrl-C; it then ends the workers.
     with multiprocessing.get_context("spawn").Pool(workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         yield from pool.imap(_made, jobs)
 
@@ -102,15 +102,15 @@ def _episodes(name: str, seeds: list[int], workers: int, blind: bool) -> Iterato
 def demonstrations(
     name: str, count: int, seed: int, workers: int, progress: Callable[[], None], blind: bool = False
 ) -> Demonstrations:
-    """The first ``count`` successful episodes of a scenario, in the order of their seeds, whatever the number of workers.
+    """The first ``count`` successful episodes of a scenario in order of their seeds, for any number of workers.
 
     Args:
-        name: of the scenario.
-        count: demonstrations.
-        seed: decides the episodes' seeds.
-        workers: processes.
+        name: name of the scenario.
+        count: number of demonstrations.
+        seed: seed of the episodes' seeds.
+        workers: number of processes.
         progress: called after each successful episode.
-        blind: whether the expert knows no more than what can be seen.
+        blind: whether the expert knows only observations.
 
     Raises:
         UserError: if too few episodes succeed.

@@ -1,27 +1,27 @@
-"""Motion between two states of a vehicle ``(..., 7)``, relative to the vehicle: the same numbers on any road."""
+"""Motion between states of a vehicle ``(..., 7)`` in its frame, independent of the road."""
 
 import torch
 from torch import Tensor
 
 
 def turned(pairs: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """``(..., 2)`` turned by an angle."""
+    """Rotate ``(..., 2)`` by an angle."""
     x, y = pairs.unbind(-1)
     return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
 
 
 def speed(states: Tensor) -> Tensor:
-    """Velocity ``(..., 2)`` along and across their own headings, in m/s."""
+    """Velocity ``(..., 2)`` along and across the heading in m/s."""
     return turned(states[..., 3:5], states[..., 5], -states[..., 6])
 
 
 def turn(before: Tensor, after: Tensor) -> Tensor:
-    """Cosine and sine ``(..., 2)`` of the turn from one heading to the other."""
+    """Cosine and sine ``(..., 2)`` of the rotation between the headings."""
     return turned(after[..., 5:7], before[..., 5], -before[..., 6])
 
 
 def way(before: Tensor, after: Tensor) -> Tensor:
-    """Metres ``(..., 2)`` along and across the mean of both headings: of a curve, its length (all but) and 0."""
+    """Metres ``(..., 2)`` along and across the mean heading; on a curve: nearly its length, and 0."""
     seen = turned(after[..., 1:3] - before[..., 1:3], before[..., 5], -before[..., 6])
     cos, sin = turn(before, after).unbind(-1)
     half = torch.atan2(sin, cos) / 2
@@ -29,5 +29,5 @@ def way(before: Tensor, after: Tensor) -> Tensor:
 
 
 def drive(before: Tensor, after: Tensor) -> Tensor:
-    """The way and the speed after it ``(..., 4)``: what a driver decides, without where the road turns."""
+    """Displacement and final velocity ``(..., 4)``: the driver's decision, independent of the road's direction."""
     return torch.cat((way(before, after), speed(after)), dim=-1)

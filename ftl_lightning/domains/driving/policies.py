@@ -1,4 +1,4 @@
-"""Reference policies: what one decision always, chance, a look-up, regressions and the expert achieve from the same starts."""
+"""Baseline policies from the same initial states: constant decision, random, look-up, regressions and the expert."""
 
 import itertools
 from collections.abc import Callable
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None]
 SHOWN = 100
-"""Demonstrations of a training scenario that the look-up and the regressions know."""
+"""Demonstrations per training scenario for the look-up and the regressions."""
 MLP_STEPS = 400
 
 
 def _made(goal: str) -> "AbstractEnv":
-    """The scenario's environment, which knows its decisions by name and number."""
+    """Environment of the scenario, for its names of decisions."""
     expect_simulator()
     from ftl_lightning.domains.driving.scenarios import make
 
@@ -35,7 +35,7 @@ def _made(goal: str) -> "AbstractEnv":
 
 
 def _always(name: str) -> Make:
-    """The same decision, replaced by a random one that does not crash where it would."""
+    """Constant decision, subject to the planner's veto."""
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
         number = float(_made(goal).action_type.actions_indexes[name])
@@ -45,14 +45,14 @@ def _always(name: str) -> Make:
 
 
 def _random(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
-    """Any decision at random, each as likely as the others."""
+    """Uniformly random decisions."""
     count = int(_made(goal).action_space.n)
     draws = [generator("cpu", seed, row) for row in range(len(starts))]
     return lambda observed, rows, step: torch.stack([torch.randint(count, (1,), generator=draws[row]).float() for row in rows])
 
 
 def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Observed, Tensor]:
-    """What is seen ``(n, *shape)`` by name and the next state ``(n, 7)``, of every step of the demonstrations."""
+    """Observations ``(n, *shape)`` by name and next states ``(n, 7)`` of all steps of the demonstrations."""
     known = training_set("train", SHOWN).select(goal) if demonstrations is None else demonstrations
     pairs = [(row, time) for row, length in enumerate(known.lengths.tolist()) for time in range(length - 1)]
     rows, times = torch.tensor(pairs).T
@@ -60,17 +60,17 @@ def _transitions(goal: str, demonstrations: Demonstrations | None) -> tuple[Obse
 
 
 def _nearest(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
-    """What comes next in the demonstration that was nearest to what is seen now, from here."""
+    """Successor of the nearest demonstrated state."""
     seen, following = _transitions(goal, demonstrations)
     places = seen[TRAFFIC][:, :STATE]
     return lambda observed, rows, step: following[torch.cdist(observed[TRAFFIC][:, :STATE], places).argmin(dim=1)]
 
 
 def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tensor], Tensor]]) -> Make:
-    """A drive ``(n, 4)`` that is predicted from the view that our models have too.
+    """Predict drives ``(n, 4)`` from the models' view of the observations.
 
     Args:
-        fit: ``(inputs (n, 35), drives (n, 4), generator) -> prediction``, both standardised.
+        fit: ``(inputs (n, 35), drives (n, 4), generator) -> prediction``, both arguments standardised.
     """
 
     def policy(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy:
@@ -87,13 +87,13 @@ def _regression(fit: Callable[[Tensor, Tensor, torch.Generator], Callable[[Tenso
 
 def _ridge(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
     """Least squares with a penalty of 1 on standardised inputs."""
-    one = torch.cat((inputs, torch.ones(len(inputs), 1)), dim=1).double()
-    weights = torch.linalg.solve(one.T @ one + torch.eye(one.shape[1], dtype=torch.double), one.T @ drives.double()).float()
+    terms = torch.cat((inputs, torch.ones(len(inputs), 1)), dim=1).double()
+    weights = torch.linalg.solve(terms.T @ terms + torch.eye(terms.shape[1], dtype=torch.double), terms.T @ drives.double()).float()
     return lambda seen: seen @ weights[:-1] + weights[-1]
 
 
 def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Tensor], Tensor]:
-    """Two hidden layers of 64, 400 steps of all transitions."""
+    """Two hidden layers of 64, 400 full-batch steps."""
     layers: list[Tensor] = []
 
     def predict(seen: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Ten
             seen = torch.nn.functional.silu(seen) if number < len(layers) - 2 else seen
         return seen
 
-    with torch.inference_mode(False), torch.enable_grad():  # whatever evaluates
+    with torch.inference_mode(False), torch.enable_grad():  # also within evaluation
         for before, after in itertools.pairwise((inputs.shape[1], 64, 64, drives.shape[1])):
             weight = torch.randn(before, after, generator=draw) / before**0.5
             layers += [weight.requires_grad_(), torch.zeros(after, requires_grad=True)]
@@ -116,7 +116,7 @@ def _mlp(inputs: Tensor, drives: Tensor, draw: torch.Generator) -> Callable[[Ten
 
 
 def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | None, seed: int) -> Policy | None:
-    """The expert's next state; not in the training scenarios, where it takes minutes (its rates there are in the data card)."""
+    """Next state of the expert; not in training scenarios, where it takes minutes (see the data card for its rates)."""
     if goal in TRAINING_CONCEPTS:
         return None
     expect_simulator()
@@ -135,4 +135,4 @@ POLICIES = {
     "MLP regression": _regression(_mlp),
     "expert (oracle)": _expert,
 }
-"""All pass the planner's veto of crashes."""
+"""Baseline policies by name; all are subject to the planner's veto."""

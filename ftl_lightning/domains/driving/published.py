@@ -1,6 +1,6 @@
-"""The paper's numbers for driving, to stand beside ours with the same planner: one that looks one decision ahead.
+"""The paper's numbers for driving, comparable with our results for one-step look-ahead.
 
-Its success rate counts a vehicle past the roundabout, crashed or not.
+Its success rate counts any vehicle past the roundabout, crashed or not.
 """
 
 from ftl_lightning.domains.driving.tasks import NEW
@@ -20,7 +20,7 @@ def _omega() -> list[Published]:
 
 
 def _baselines() -> list[Published]:
-    """The baselines' columns of that table."""
+    """Baselines in the same table."""
     rows = (("BC", 0.04, 0.64), ("CVAE", 0.24, 0.48), ("in-context", 0.0, 0.16))
     return [
         Published(NEW, value, metric=metric, method=method)
@@ -30,4 +30,4 @@ def _baselines() -> list[Published]:
 
 
 PUBLISHED = (*_omega(), *_baselines(), Published(NEW, 0.14, components=1, metric=SUCCESS))
-"""And of the table 'Ablation on the number of learned concepts' the row that is not in the other."""
+"""All rows, with K = 1 of the table 'Ablation on the number of learned concepts'."""

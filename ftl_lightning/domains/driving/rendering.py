@@ -1,4 +1,4 @@
-"""Pictures from above: roads, vehicles and plans."""
+"""Top-view pictures of roads, vehicles and plans."""
 
 import functools
 from collections.abc import Sequence
@@ -20,21 +20,21 @@ from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
 BETWEEN = 4
-"""Pictures of an episode for each decision."""
+"""Frames per decision in films of episodes."""
 EGO, OTHER, ROAD, PLAN = "#2f8f57", "#3f6fb5", "#d8d8d8", "#e4704a"
 MARK = "#f4f4f4"
-"""Of the middle of a lane."""
+"""Colour of lane centre lines."""
 RIGHT, WRONG = "#2e9e46", "#d03a3a"
 LENGTH, WIDTH, LANE = 5.0, 2.0, 4.0
-"""Metres: of a vehicle, and a lane's width."""
+"""Length and width of a vehicle and width of a lane in metres."""
 MARGIN = 20.0
-"""Metres of road that are shown around what moves."""
+"""Metres of road shown around moving objects."""
 MAX_ASPECT = 1.8
-"""Nothing is shown that is longer than so many times its width."""
+"""Maximum aspect ratio of a picture."""
 AREA, PAGE = 9.0, 13.0
-"""Square inches of a panel, and inches of a figure's width."""
+"""Area of a panel in square inches and width of a figure in inches."""
 PLAN_REACH = 25.0
-"""Metres around the way driven within which plans decide what is shown of an episode."""
+"""Distance from the driven path, in metres, within which plans extend the window of a film."""
 LEGEND = (
     Patch(color=EGO, label="controlled vehicle, its way"),
     Patch(color=OTHER, label="other vehicles"),
@@ -59,7 +59,7 @@ def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
 
 
 def _window(around: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner ``(2,)`` of the part of the map that holds points ``(points, 2)``, not too long and narrow."""
+    """Lower and upper corner ``(2,)`` of a map section around points ``(points, 2)``, within :data:`MAX_ASPECT`."""
     low, high = around.min(axis=0).astype(float) - MARGIN, around.max(axis=0).astype(float) + MARGIN
     missing = np.maximum((high - low).max() / MAX_ASPECT - (high - low), 0) / 2
     return low - missing, high + missing
@@ -72,7 +72,7 @@ def _draw(
     plan: NDArray[np.float32] | None,
     window: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
-    """A scenario's lanes and vehicles ``(vehicle, 7)``, the controlled one first, to scale."""
+    """Draw lanes and vehicles ``(vehicle, 7)`` to scale, the controlled vehicle first."""
     low, high = window
     for lane in _lanes(name):
         along = np.gradient(lane, axis=0)
@@ -92,13 +92,13 @@ def _draw(
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """A grid of at most :data:`MAX_PANELS` scenes with the plan from each, to scale, and a legend.
+    """Draw a grid of at most :data:`MAX_PANELS` scenes with their plans, to scale, and a legend.
 
     Args:
         states: plans ``(scene, horizon, 7)``.
-        right: green and red frames, where plans are judged and not only what comes of them; ``None`` for grey frames.
-        title: above the grid.
-        starts: of the scenes.
+        right: whether each plan is right (green and red frames); ``None`` for grey frames.
+        title: title above the grid.
+        starts: initial states of the scenes.
     """
     starts = expect_starts(starts)
     shown = states[:MAX_PANELS].numpy()
@@ -108,8 +108,8 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     columns = min(len(shown), MAX_COLUMNS, max(1, int(PAGE / width)))
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(max(width * columns, 5.0), AREA / width * rows + 0.8), layout="constrained")
-    told = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
-    figure.suptitle(figure_text(told), fontsize=11)
+    caption = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
+    figure.suptitle(figure_text(caption), fontsize=11)
     for number, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
         if number >= len(shown):
             axes.set_axis_off()
@@ -124,16 +124,16 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
 
 
 def _end(observations: Tensor) -> int:
-    """After how many of the decisions ``(decision, vehicle * 7)`` nothing moves any more."""
+    """Number of decisions ``(decision, vehicle * 7)`` until nothing moves any more."""
     moving = (observations[1:, 1:3] - observations[:-1, 1:3]).abs().amax(dim=1) > 0
     return int(moving.nonzero().max()) + 2 if moving.any() else 1
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """Pictures ``(height, width, 3)`` of an episode, :data:`BETWEEN` a decision, until nothing moves any more.
+    """Film an episode: frames ``(height, width, 3)``, :data:`BETWEEN` per decision, until nothing moves any more.
 
-    Between decisions vehicles are drawn as if they moved evenly. What was driven is green; the plan ``(time, 8, 7)`` that decided
-    where to go next is orange. The caption says the scenario, the time, the speed and, in the last picture, how the episode ended.
+    Positions are interpolated between decisions. The driven path is green, the current plan of ``plans (time, 8, 7)`` orange. The
+    caption shows scenario, time and speed, and in the last frame the outcome.
     """
     episode = take(rollout.observed, 0)
     observations = episode[TRAFFIC]
@@ -143,8 +143,8 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
     near = np.clip(planned[np.isfinite(planned).all(axis=1)], ways.min(axis=0) - PLAN_REACH, ways.max(axis=0) + PLAN_REACH)
     window = _window(np.concatenate((ways, near)))
     width, height = np.sqrt(1.7 * AREA) * np.sqrt((window[1] - window[0]) / (window[1] - window[0])[::-1])
-    name, told = NAMES[int(episode[SCENARIO][0].item())], rollout.infos[0]
-    ended = "crashed" if told.get("crashed") else "arrived" if told.get("arrived") else "time is up" if told else "broke off"
+    name, info = NAMES[int(episode[SCENARIO][0].item())], rollout.infos[0]
+    ended = "crashed" if info.get("crashed") else "arrived" if info.get("arrived") else "time is up" if info else "broke off"
     traffic = observations[:end].unflatten(1, (VEHICLES, -1)).numpy()
     vehicles = np.stack([traffic[:, 0], *_followed(traffic[:, 1:], decision_seconds(name))], axis=1)
     pictures = []
@@ -165,23 +165,23 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
 
 
 def _between(before: NDArray[np.float32], after: NDArray[np.float32], part: float) -> NDArray[np.float32]:
-    """Vehicles ``(vehicle, 7)`` a part of the way from one decision to the next; those that are not there then stay."""
+    """Interpolate vehicles ``(vehicle, 7)`` between decisions; vehicles absent at either stay."""
     moved = before + part * (after - before)
     return np.where((before[:, :1] > 0) & (after[:, :1] > 0), moved, before).astype(np.float32)
 
 
 PLAYED = 2.0
-"""Films of shapes play so many times as fast as one drives."""
+"""Playback speed of vector films relative to real time."""
 
 
 FAR = 100.0
-"""Metres of road that films of shapes have around what moves, of which a page shows some."""
+"""Metres of road around moving objects in vector films; a page shows a part of it."""
 SAME = 12.0
-"""Metres from where a vehicle was expected within which it is taken for the same one."""
+"""Maximum distance in metres from the predicted position to match a vehicle."""
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:
-    """An episode from above, a frame a decision, until nothing moves any more; roads in grey, the controlled vehicle in green."""
+    """Top-view film of an episode, a frame per decision, until nothing moves; roads grey, controlled vehicle green."""
     episode = take(rollout.observed, 0)
     name = NAMES[int(episode[SCENARIO][0].item())]
     traffic = episode[TRAFFIC][: _end(episode[TRAFFIC])].unflatten(1, (VEHICLES, -1)).numpy()
@@ -190,23 +190,23 @@ def vector_film(rollout: Rollout) -> VectorFilm:
 
 
 def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """A plan or a demonstration ``(time, 7)`` from above, a frame a state; the other vehicles stay where they are first.
+    """Top-view film of a plan or demonstration ``(time, 7)``, a frame per state; other vehicles stay at their initial places.
 
     Raises:
-        UserError: without the simulator, which knows the roads.
+        UserError: without the simulator, which provides the roads.
     """
     seen = take(expect_starts(starts).observed, 0)
     vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
     ego = states.numpy().copy()
     ego[:, 0] = 1
-    ego[:, 5:] /= np.maximum(np.linalg.norm(ego[:, 5:], axis=1, keepdims=True), 1e-6)  # a generated heading has any length
+    ego[:, 5:] /= np.maximum(np.linalg.norm(ego[:, 5:], axis=1, keepdims=True), 1e-6)  # generated headings are not normalised
     others = [Shape("area", _corners(vehicle[None]), OTHER) for vehicle in vehicles[1:] if vehicle[0] > 0]
     planned = Shape("dots", (ego[None, :, 1:3] * (1, -1)).astype(np.float32), PLAN, 0.9)
     return _from_above(NAMES[int(seen[SCENARIO].item())], [planned, *others], ego)
 
 
 def _from_above(name: str, others: Sequence[Shape], ego: NDArray[np.float32]) -> VectorFilm:
-    """A scenario's roads, what else is on them, and the controlled vehicle's way ``(time, 7)``, with itself as the last shape."""
+    """Film of roads, other shapes and the controlled vehicle's path ``(time, 7)``; the controlled vehicle is the last shape."""
     low, high = _window(ego[:, 1:3])
     near = [lane[((lane > low - FAR) & (lane < high + FAR)).all(axis=1)] for lane in _lanes(name)]
     lanes = [lane * (1, -1) for lane in near if len(lane) > 1]
@@ -217,7 +217,7 @@ def _from_above(name: str, others: Sequence[Shape], ego: NDArray[np.float32]) ->
 
 
 def _corners(seen: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Of a vehicle ``(decision, 7)`` its outline ``(decision, 4, 2)``, not finite where it is not present."""
+    """Outline ``(decision, 4, 2)`` of a vehicle ``(decision, 7)``, NaN where absent."""
     present, x, y, _, _, cos, sin = (column[:, None] for column in seen.T)
     along, aside = np.array((1, 1, -1, -1)) * LENGTH / 2, np.array((1, -1, -1, 1)) * WIDTH / 2
     corners = np.stack((x + cos * along - sin * aside, -(y + sin * along + cos * aside)), axis=-1)
@@ -225,16 +225,16 @@ def _corners(seen: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _followed(traffic: NDArray[np.float32], seconds: float) -> list[NDArray[np.float32]]:
-    """Each vehicle by itself ``(decision, 7)``; observed are the nearest ``(decision, vehicle, 7)``, in an order that changes."""
+    """Track vehicles ``(decision, 7)`` in the nearest vehicles ``(decision, vehicle, 7)``, whose order changes."""
     known: list[NDArray[np.float32]] = []
     for time, seen in enumerate(traffic):
         left = [vehicle for vehicle in seen if vehicle[0] > 0]
-        for one in known:
-            before = one[time - 1]
+        for track in known:
+            before = track[time - 1]
             expected = before[1:3] + seconds * before[3:5]
             away = [float(np.linalg.norm(vehicle[1:3] - expected)) for vehicle in left] if before[0] > 0 else []
             if away and min(away) < SAME:
-                one[time] = left.pop(int(np.argmin(away)))
+                track[time] = left.pop(int(np.argmin(away)))
         for vehicle in left:
             known.append(np.zeros((len(traffic), seen.shape[1]), dtype=np.float32))
             known[-1][time] = vehicle

@@ -1,6 +1,6 @@
-"""The paper's driving scenarios as thin configurations and subclasses of highway-env, and what success means in each.
+"""The paper's driving scenarios as configurations and subclasses of highway-env, with their success criteria.
 
-Axes of all: metres, x right, y down the page; metres a second. Importing this module registers each scenario with gymnasium, as
+Axes: x right, y down, in metres; speeds in m/s. Importing this module registers each scenario with gymnasium as
 ``ftl/driving-NAME-v0``.
 """
 
@@ -36,7 +36,7 @@ OBSERVATION = {
 
 
 class _Accelerated(AbstractEnv):
-    """The published simulation in quicker classes, unless its configuration says otherwise."""
+    """Scenario in the faster classes, unless ``config['fast']`` is false."""
 
     def _reset(self) -> None:
         super()._reset()
@@ -45,7 +45,7 @@ class _Accelerated(AbstractEnv):
 
 
 class Highway(_Accelerated, HighwayEnv):
-    """Fast and on the right, among fifty vehicles; there is no place to arrive at."""
+    """Drive fast and on the right among fifty vehicles; there is no destination."""
 
 
 class Exit(_Accelerated, ExitEnv):
@@ -58,7 +58,7 @@ class Exit(_Accelerated, ExitEnv):
 
     def _create_vehicles(self) -> None:
         super()._create_vehicles()
-        # The published scene starts in the leftmost lane. All others stand ahead, so that any lane is free beside it.
+        # The published scene starts in the leftmost lane. Other vehicles start ahead, so every lane is free here.
         ego = self.vehicle
         lane = self.road.network.get_lane(("0", "1", int(self.np_random.integers(self.config["lanes_count"]))))
         place = lane.position(ego.position[0], 0)
@@ -68,9 +68,7 @@ class Exit(_Accelerated, ExitEnv):
 
 
 class Merge(_Accelerated, MergeEnv):
-    """Past an access ramp from which one vehicle comes in: two lanes and the ramp, three vehicles and one on it (as in the paper's
-    code; its text says three lanes).
-    """
+    """Pass an access ramp: two lanes, three vehicles and a merging vehicle (paper's code; the paper's text says three lanes)."""
 
     END = 320.0
 
@@ -84,19 +82,19 @@ class Merge(_Accelerated, MergeEnv):
 
 
 class IntersectionVehicle(IDMVehicle):
-    """Its own class: the intersection sets constants of its vehicles' class, for every environment that is made later."""
+    """Separate class, as the intersection sets class constants, which would affect later environments."""
 
 
 class FastIntersectionVehicle(FastVehicle):
-    """The same, for the same reason."""
+    """Faster counterpart of :class:`IntersectionVehicle`."""
 
 
 class Intersection(_Accelerated, IntersectionEnv):
-    """Turn left at an intersection of two-way roads with ten vehicles."""
+    """Turn left at an intersection of two-way roads, with ten vehicles."""
 
 
 class Roundabout(_Accelerated, RoundaboutEnv):
-    """Take the second exit of a roundabout with four; four vehicles."""
+    """Take the second of four exits of a roundabout, with four vehicles."""
 
 
 class OtherRoundabout(_Accelerated, RoundaboutGenericEnv):
@@ -104,7 +102,7 @@ class OtherRoundabout(_Accelerated, RoundaboutGenericEnv):
 
 
 class ThirdExit(Roundabout):
-    """The same roundabout, its third exit; for validation."""
+    """Take the third exit of the same roundabout; for validation."""
 
     def _make_vehicles(self) -> None:
         super()._make_vehicles()
@@ -113,14 +111,14 @@ class ThirdExit(Roundabout):
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario.
+    """Scenario.
 
     Attributes:
-        environment: class.
+        environment: class of the environment.
         config: settings that differ from highway-env's.
-        drivers: class of the other vehicles, as published and fast.
-        arrived: whether the vehicle is where it should be, without regard to crashes; on the highway, whether time is up.
-        passed: the weaker count of the paper's code, crashed or not; ``None`` where it is ``arrived`` without a crash.
+        drivers: classes of the other vehicles, original and fast.
+        arrived: whether the vehicle is at its destination, crashed or not; on the highway, whether time is up.
+        passed: weaker criterion of the paper's code, crashed or not; ``None`` for ``arrived`` without a crash.
     """
 
     environment: type[AbstractEnv]
@@ -137,7 +135,7 @@ def _on(*roads: tuple[str, str]) -> Callable[[AbstractEnv], bool]:
 
 
 EXITS = ("exr", "sxr", "nxr")
-"""Of the roundabout, that other vehicles take."""
+"""Exits of the roundabout for other vehicles."""
 SCENARIOS = {
     "highway": Scenario(Highway, {"duration": 10}, lambda env: bool(env.time >= env.config["duration"])),
     "exit": Scenario(
@@ -189,44 +187,44 @@ SCENARIOS = {
 
 
 def scenario(name: str) -> Scenario:
-    """A scenario by its name.
+    """Scenario by name.
 
     Raises:
-        UserError: for a name that is none.
+        UserError: for an unknown name.
     """
     return SCENARIOS[expect_scenario(name)]
 
 
 def make(name: str, fast: bool = True) -> AbstractEnv:
-    """An environment of a scenario.
+    """Environment of a scenario.
 
     Args:
-        name: of the scenario.
-        fast: with the quicker classes of :mod:`ftl_lightning.domains.driving.fast`.
+        name: name of the scenario.
+        fast: whether to use :mod:`ftl_lightning.domains.driving.fast`.
 
     Raises:
-        UserError: for a name that is none.
+        UserError: for an unknown name.
     """
-    found = scenario(name)
-    drivers = found.drivers[fast]
+    chosen = scenario(name)
+    drivers = chosen.drivers[fast]
     config = {"observation": OBSERVATION, "other_vehicles_type": f"{drivers.__module__}.{drivers.__name__}", "fast": fast}
-    return found.environment(config | found.config, render_mode="rgb_array")
+    return chosen.environment(config | chosen.config, render_mode="rgb_array")
 
 
 def arrived(env: AbstractEnv, name: str) -> bool:
-    """Whether the controlled vehicle is where the scenario wants it, crashed or not."""
+    """Whether the controlled vehicle is at its destination, crashed or not."""
     return SCENARIOS[name].arrived(env)
 
 
 def observe(env: AbstractEnv) -> NDArray[np.float32]:
-    """What highway-env observes with :data:`OBSERVATION`, ``(5, 7)``, without its detour through data frames."""
+    """Observation of highway-env with :data:`OBSERVATION`, ``(5, 7)``, without data frames."""
     ego = env.vehicle
     others = env.road.close_objects_to(ego, env.PERCEPTION_DISTANCE, VEHICLES - 1, see_behind=False, vehicles_only=True)
-    found = np.zeros((VEHICLES, len(FEATURES)), dtype=np.float32)
+    rows = np.zeros((VEHICLES, len(FEATURES)), dtype=np.float32)
     for row, vehicle in enumerate((ego, *others)):
         cos, sin = np.cos(vehicle.heading), np.sin(vehicle.heading)
-        found[row] = (1, *vehicle.position, vehicle.speed * cos, vehicle.speed * sin, cos, sin)
-    return found
+        rows[row] = (1, *vehicle.position, vehicle.speed * cos, vehicle.speed * sin, cos, sin)
+    return rows
 
 
 for _name in SCENARIOS:

@@ -1,4 +1,4 @@
-"""The expert's episodes that ship with the package."""
+"""Expert episodes shipped with the package."""
 
 from pathlib import Path
 
@@ -8,20 +8,20 @@ from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.errors import UserError
 
 SHIPPED = Path(__file__).parent / "demonstrations"
-"""The expert's episodes of the training scenarios, a file each; see the data card beside them."""
+"""Folder with a file of expert episodes per training scenario; see its data card."""
 HELD_OUT = 10
-"""So many of the shipped episodes of each scenario, its last, are for validation."""
+"""Number of validation episodes per scenario, the last of its file."""
 
 
 def training_set(name: Split, count: int, folder: Path | None = None) -> Demonstrations:
-    """The first ``count`` shipped episodes of each training scenario; of ``'validation'``, of those that are held out.
+    """The first ``count`` shipped episodes per training scenario; for ``'validation'``, held-out episodes.
 
-    The expert takes half an hour for them, so they are the same for every seed.
+    They are the same for every seed, as generation takes half an hour.
 
     Args:
-        name: of the split.
-        count: of each scenario.
-        folder: of others, a file for each scenario as ``generate`` writes them.
+        name: name of the split.
+        count: number per scenario.
+        folder: folder of other episodes, a file per scenario as written by ``generate``.
 
     Raises:
         UserError: if there are fewer, or no file.

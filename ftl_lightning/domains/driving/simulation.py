@@ -1,4 +1,4 @@
-"""Exact save and restore of a simulation, a hundred times cheaper than a deep copy."""
+"""Exact snapshots of a simulation, a hundred times cheaper than a deep copy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from highway_env.vehicle.objects import RoadObject
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All that stepping changes.
+    """State that stepping changes.
 
     Attributes:
         time, steps, road_steps: counters.
-        vehicles, objects: each with a copy of its attributes.
-        random: state of the generator.
+        vehicles, objects: objects with copies of their attributes.
+        random: state of the random generator.
     """
 
     time: float
@@ -35,7 +35,7 @@ def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def save(env: AbstractEnv) -> Snapshot:
-    """Copy what stepping changes."""
+    """Copy the state that stepping changes."""
     road = env.road
     return Snapshot(
         env.time,
@@ -48,7 +48,7 @@ def save(env: AbstractEnv) -> Snapshot:
 
 
 def restore(env: AbstractEnv, snapshot: Snapshot) -> None:
-    """Go back to what was saved from this environment since its last reset."""
+    """Restore a snapshot of this environment, taken since its last reset."""
     env.time, env.steps = snapshot.time, snapshot.steps
     env.road.steps = snapshot.road_steps
     env.road.vehicles = [vehicle for vehicle, _ in snapshot.vehicles]
@@ -59,9 +59,9 @@ def restore(env: AbstractEnv, snapshot: Snapshot) -> None:
 
 
 def advance(env: AbstractEnv, action: int) -> tuple[float, bool]:
-    """A step without the observation, which costs more than the physics: reward, and whether the episode ends.
+    """Step without the observation, which costs more than the physics; return reward and end of the episode.
 
-    The intersection, whose step also lets vehicles come and go, does so here too.
+    At the intersection, vehicles still appear and disappear.
     """
     observe = env.observation_type.observe
     env.observation_type.observe = _nothing

@@ -1,4 +1,4 @@
-"""What is learned and evaluated: the paper's scenarios, and the validation suite on which everything is tuned."""
+"""Tasks of driving: the paper's scenarios, and the validation suite for tuning."""
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 
@@ -8,7 +8,7 @@ NEW = "new initial state"
 TRAINING = training_suite(TRAINING_CONCEPTS)
 PAPER = Suite((EvaluationTask(NEW, "roundabout", learned=("roundabout",)),))
 VALIDATION = Suite((EvaluationTask(NEW, "roundabout third exit", learned=("roundabout third exit",)),))
-"""Another way through the same roundabout."""
+"""Another route through the same roundabout."""
 
 OTHER = Suite(
     tuple(
@@ -16,6 +16,6 @@ OTHER = Suite(
         for name in ("roundabout of three lanes", "roundabout of one lane")
     )
 )
-"""Roundabouts of other sizes, for the concept that was learned in the paper's; nothing was tuned on them."""
+"""Roundabouts of other sizes, for the concept learned in the paper's roundabout; not used for tuning."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "validation": VALIDATION, "other roundabouts": OTHER}

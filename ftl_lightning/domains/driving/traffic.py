@@ -1,4 +1,4 @@
-"""What of traffic is known without the simulator: the scenarios by name, what is observed in them, and where episodes start."""
+"""Traffic without the simulator: scenario names, observed features and initial states."""
 
 import zlib
 
@@ -12,31 +12,31 @@ from ftl_lightning.extras import expect_extra
 
 NAME = "driving"
 HORIZON = 8
-"""States in a plan; the paper's number."""
+"""States in a plan (paper)."""
 MAX_STEPS = 30
-"""Decisions of an episode at most."""
+"""Maximum number of decisions in an episode."""
 
 FEATURES = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
 STATE = len(FEATURES)
 STATE_NAMES = tuple(f"ego.{feature}" for feature in FEATURES)
 STATE_UNITS = ("1", "m", "m", "m/s", "m/s", "1", "1")
 VEHICLES = 5
-"""Of which states are observed: the controlled vehicle and the four nearest that it does not have behind it."""
+"""Number of observed vehicles: the controlled vehicle and the four nearest that are not behind it."""
 OBSERVED = VEHICLES * STATE
 SCENE = OBSERVED + 2
-"""Columns of a scene: what is observed at its start, the scenario's number, and the seed of the start."""
+"""Columns of a scene: the initial observation, scenario number and seed."""
 TRAFFIC, SCENARIO = "traffic", "scenario"
-"""Names of the observed features: vehicles ``(35,)`` and the scenario's number ``(1,)``, by which views know the time between two
-decisions and which road is one of pretraining."""
+"""Names of the observed features: vehicles ``(35,)`` and scenario number ``(1,)``, from which views derive the seconds per
+decision and whether the road is part of pretraining."""
 FEATURES_SEEN = {
     TRAFFIC: Feature((OBSERVED,), entities=tuple(tuple(range(start, start + STATE)) for start in range(STATE, OBSERVED, STATE))),
     SCENARIO: Feature((1,)),
 }
 SEEDS = 2**24
-"""Seeds are below, so that float32 holds them exactly."""
+"""Upper bound of seeds, exact in float32."""
 
 BELIEF, SIMULATION, STEP = "belief", "simulation", "step"
-"""The planner's vetoes by name, see :mod:`ftl_lightning.domains.driving.foresight`."""
+"""Names of the planner's vetoes, see :mod:`ftl_lightning.domains.driving.foresight`."""
 
 DECISIONS = {
     "highway": 1,
@@ -48,13 +48,13 @@ DECISIONS = {
     "roundabout of three lanes": 1,
     "roundabout of one lane": 1,
 }
-"""Decisions a second, by scenario."""
+"""Decisions per second by scenario."""
 NAMES = tuple(DECISIONS)
-"""The scenarios; a scene knows its own by the number."""
+"""Scenario names; scenes contain the index."""
 
 
 def expect_simulator() -> None:
-    """Refuse to go on without highway-env.
+    """Check that highway-env is installed.
 
     Raises:
         UserError: with the command that installs it.
@@ -63,10 +63,10 @@ def expect_simulator() -> None:
 
 
 def expect_scenario(name: str) -> str:
-    """The name itself.
+    """Return the name if it is a scenario's.
 
     Raises:
-        UserError: for one that is no scenario's.
+        UserError: for an unknown name.
     """
     if name not in DECISIONS:
         raise UserError(f"driving task: expected one of {', '.join(NAMES)}, found {name!r}")
@@ -74,27 +74,27 @@ def expect_scenario(name: str) -> str:
 
 
 def decision_seconds(name: str) -> float:
-    """Seconds between two decisions.
+    """Seconds between decisions of a scenario.
 
     Raises:
-        UserError: for a name that is no scenario's.
+        UserError: for an unknown name.
     """
     return 1 / DECISIONS[expect_scenario(name)]
 
 
 def episode_seed(seed: int, number: int) -> int:
-    """Seed of the simulation of an episode, below 2^24."""
+    """Simulation seed of an episode, below 2^24."""
     return zlib.crc32(f"{seed} {number}".encode()) % SEEDS
 
 
 def scene(seen: NDArray[np.float32], name: str, seed: int) -> NDArray[np.float32]:
-    """The 37 numbers of a start ``(..., 5, 7)`` of this scenario and seed."""
+    """Scene ``(..., 37)`` of an initial observation ``(..., 5, 7)``, scenario and seed."""
     hidden = np.broadcast_to(np.array((NAMES.index(name), seed), dtype=np.float32), (*seen.shape[:-2], 2))
     return np.concatenate((seen.reshape(*seen.shape[:-2], OBSERVED), hidden), axis=-1)
 
 
 def initial_states(scenes: Tensor) -> InitialStates:
-    """Scenes ``(scene, 37)`` and what is observed in them."""
+    """Initial states of scenes ``(scene, 37)``."""
     return InitialStates({TRAFFIC: scenes[:, :OBSERVED], SCENARIO: scenes[:, OBSERVED : OBSERVED + 1]}, scenes)
 
 
@@ -102,7 +102,7 @@ def origin(given: NDArray[np.float32]) -> tuple[str, int]:
     """Scenario and seed of a scene.
 
     Raises:
-        UserError: for another size, or numbers that are none of a scenario and seed.
+        UserError: for a wrong size, or numbers that are not a scenario and seed.
     """
     if given.shape != (SCENE,) or not np.isfinite(given).all():
         raise UserError(f"driving scene: expected {SCENE} finite numbers, found shape {given.shape}")

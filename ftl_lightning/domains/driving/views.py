@@ -1,4 +1,4 @@
-"""How a model may see traffic: as it stands on the map, or from the controlled vehicle."""
+"""Views of traffic: in map coordinates, or relative to the controlled vehicle."""
 
 import torch
 from torch import Tensor
@@ -11,22 +11,22 @@ from ftl_lightning.domains.driving.traffic import FEATURES_SEEN, NAMES, SCENARIO
 from ftl_lightning.processes import drawn
 
 SECONDS = torch.tensor([decision_seconds(name) for name in NAMES])
-"""Between two decisions, by the number of the scenario."""
+"""Seconds between decisions by scenario number."""
 KNOWN = torch.tensor([name in TRAINING_CONCEPTS for name in NAMES])
-"""Whether it is a road of pretraining, by the number of the scenario."""
+"""Whether a scenario is part of pretraining, by scenario number."""
 NEAR = 20.0
-"""Metres; distances far beyond look alike, or a gap of some metres would be lost beside the hundred that can be seen."""
+"""Distance scale in metres; larger distances are compressed, so that small gaps stay resolved."""
 _PAIRS = ((1, 3, 5), (2, 4, 6))
-"""Columns of a direction and the one across."""
+"""Columns that share a scale: x and y of position, velocity and heading."""
 
 
 def _vehicles(observed: Observed) -> Tensor:
-    """The vehicles ``(sample, 5, 7)``."""
+    """Vehicles ``(sample, 5, 7)``."""
     return observed[TRAFFIC].unflatten(-1, (VEHICLES, STATE))
 
 
 def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
-    """States ``(sample, n, 7)`` seen from a vehicle ``(sample, 7)``: places from it, directions from its own."""
+    """States ``(sample, n, 7)`` in the frame of a vehicle ``(sample, 7)``."""
     cos, sin = ego[:, None, 5], ego[:, None, 6]
     presence, place, velocity, heading = states.split((1, 2, 2, 2), dim=-1)
     parts = (place - ego[:, None, 1:3], velocity, heading)
@@ -34,52 +34,52 @@ def _seen_from(states: Tensor, ego: Tensor) -> Tensor:
 
 
 def _near(places: Tensor) -> Tensor:
-    """``(..., n)`` with what is far squashed."""
+    """Compress large distances ``(..., n)``."""
     return places * NEAR / (NEAR + places.norm(dim=-1, keepdim=True))
 
 
 def _observe_from_ego(observed: Observed) -> Observed:
-    """The controlled vehicle's place, speed and heading, and the others seen from it, those that are none at 0 ``(7 + 4 * 7)``.
+    """Position, speed and heading of the controlled vehicle, and the others relative to it, 0 where absent ``(7 + 4 * 7)``.
 
-    Place and heading are known on the roads of pretraining alone, else 0: on a new road they say nothing that was ever learned.
+    Position and heading are 0 on roads that are not part of pretraining, where they carry no learned information.
     """
     vehicles = _vehicles(observed)
     ego, others = vehicles[:, 0], vehicles[:, 1:]
     seen = _seen_from(others, ego)
     presence, place, velocity, heading = seen.split((1, 2, 2, 2), dim=-1)
     seen = torch.cat((presence, _near(place), velocity - speed(ego)[:, None], heading), dim=-1) * presence
-    own = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(observed)
-    return {TRAFFIC: torch.cat((own[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), own[:, 4:], seen.flatten(1)), dim=-1)}
+    pose = torch.cat((ego[:, 1:3], _near(ego[:, 1:2]), _near(ego[:, 2:3]), ego[:, 5:]), dim=-1) * _known(observed)
+    return {TRAFFIC: torch.cat((pose[:, :4], ego[:, 3:5].norm(dim=-1, keepdim=True), pose[:, 4:], seen.flatten(1)), dim=-1)}
 
 
 def _known(observed: Observed) -> Tensor:
-    """Whether the place on the map is ``(sample, 1)``: the road is one of pretraining, and it was not hidden."""
+    """Whether the map position is known ``(sample, 1)``: the road is part of pretraining and not hidden."""
     traffic = observed[TRAFFIC]
     return (traffic[:, :1] > 0) & KNOWN.to(traffic.device)[observed[SCENARIO].long()[:, 0], None]
 
 
 def _seconds(step: int, observed: Observed) -> Tensor:
-    """Between the state that comes before a plan's step and the one there ``(sample, 1)``: a plan's first is the present."""
+    """Seconds ``(sample, 1)`` between the preceding state and a step of a plan; 0 for the first step, the present."""
     number = observed[SCENARIO].long()[:, 0]
     return SECONDS.to(number.device)[number, None] * min(step, 1)
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
-    """How each state ``(sample, horizon, 7)`` differs from the one before kept at its speed; the first, from the present.
+    """Change of each state ``(sample, horizon, 7)`` against the preceding state at constant speed; first against the present.
 
-    Presence; metres along and across the mean of both headings, which for a curve are its length and 0; metres a second along and
-    across the own heading; cosine and sine of the turn.
+    Columns: presence; metres along and across the mean of both headings (on a curve: its length and 0); change of velocity along
+    and across the heading in m/s; cosine and sine of the turn.
     """
-    found, before = [], _vehicles(observed)[:, 0]
+    changes, before = [], _vehicles(observed)[:, 0]
     for step, state in enumerate(states.unbind(dim=1)):
         ahead = way(before, state) - _seconds(step, observed) * speed(before)
-        found.append(torch.cat((state[:, :1], ahead, speed(state) - speed(before), turn(before, state)), dim=-1))
+        changes.append(torch.cat((state[:, :1], ahead, speed(state) - speed(before), turn(before, state)), dim=-1))
         before = state
-    return torch.stack(found, dim=1)
+    return torch.stack(changes, dim=1)
 
 
 def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
-    """The inverse, for turns of any length."""
+    """Inverse of :func:`_encode_steps`; turns need not be normalised."""
     states = [_vehicles(observed)[:, 0]]
     for step, change in enumerate(steps.unbind(dim=1)):
         before = states[-1]
@@ -93,19 +93,19 @@ def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
 
 
 def _act(plans: Tensor, step: int, observed: Observed) -> Tensor:
-    """The drive between two states of plans ``(episode, horizon, 7)``."""
+    """Drive between consecutive states of plans ``(episode, horizon, 7)``."""
     after = min(step + 1, plans.shape[1] - 1)
     return drive(plans[:, after - 1], plans[:, after])
 
 
 PERTURBATION = 4.0
-"""Standard deviation of the present's speed in m/s."""
+"""Standard deviation of the perturbed speed in m/s."""
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    """On an unknown road other speeds of the controlled vehicle in the present, from where it goes on as it did.
+    """Perturb the present speed of the controlled vehicle on unknown roads; future states are unchanged.
 
-    Half of the time a road is unknown; without a generator all are, at the speed that is.
+    Roads count as unknown with probability 1/2; without a generator always, at unchanged speed.
     """
     if draw is None:
         noise = torch.tensor([[0.0, -1.0]], device=states.device).expand(len(states), 2)
@@ -113,8 +113,8 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
         noise = drawn(len(states), lambda n: torch.randn((n, 2), generator=draw, device=draw.device))
     ego = _vehicles(observed)[:, 0]
     known = _known(observed) & (noise[:, 1:] > 0)
-    other = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
-    now = torch.cat((ego[:, :3], other * ego[:, 5:], ego[:, 5:]), dim=-1)
+    pace = (speed(ego)[:, :1] + torch.where(known, 0, PERTURBATION * noise[:, :1])).clamp(min=0)
+    now = torch.cat((ego[:, :3], pace * ego[:, 5:], ego[:, 5:]), dim=-1)
     traffic = torch.cat((ego[:, :1] * known, now[:, 1:], observed[TRAFFIC][:, STATE:]), dim=-1)
     return torch.cat((now[:, None], states[:, 1:]), dim=1), {**observed, TRAFFIC: traffic}
 
@@ -136,4 +136,4 @@ VIEWS = {
         scales=_PAIRS,
     ),
 }
-"""``map`` is the paper's. In ``steps`` a plan is the same numbers on any road where the vehicle drives on as before."""
+"""``map`` is the paper's view. In ``steps``, constant motion has the same encoding on any road."""

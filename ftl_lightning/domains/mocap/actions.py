@@ -1,13 +1,13 @@
-"""Which action a text names, as data: the classes that a judge tells apart.
+"""Actions of texts: the classes of a judge.
 
-The texts are descriptions of the CMU motion capture database, whose actions stand in
-:data:`~ftl_lightning.domains.mocap.tasks.ACTION_OF`, and labels of segments.
+Texts are descriptions of the CMU motion capture database, with actions in :data:`~ftl_lightning.domains.mocap.tasks.ACTION_OF`,
+and labels of segments.
 """
 
 from ftl_lightning.domains.mocap.tasks import ACTION_OF, cleaned, goal_parts
 
 OTHER = "other"
-"""None of the actions: what one person did once, people who stand still, and windows without motion (a frozen frame, trembling)."""
+"""No action: motions of a single person, standing people, and windows without motion (a frozen frame, trembling)."""
 
 _NAMES = (
     "walk",
@@ -32,47 +32,47 @@ _NAMES = (
     "swordplay",
 )
 CLASSES = (*_NAMES, OTHER)
-"""What a judge tells apart."""
+"""Classes of a judge."""
 
 TESTED = CLASSES[: CLASSES.index("toe touch") + 1]
-"""Classes of two subjects or more: what a judge can be tested on with people whom it has not seen."""
+"""Classes of two subjects or more, on which a judge can be tested with new people."""
 
 _LABELS = {"jog": "run", "leg kick": "kick", "toe touch one hand": "toe touch", "toe touch two hands": "toe touch"}
 """Labels of segments that are no training concepts."""
 _CLASS_OF = {name: name for name in _NAMES} | _LABELS | {text: name for text, name in ACTION_OF.items() if name is not None}
 
 STAND = "stand"
-"""What the legs do in actions of arms and trunk."""
+"""Class of the legs in actions of arms and trunk."""
 STANDING = ("punch", "signals", "twist", "arm circle", "toe touch", "swordplay")
 """Actions of arms and trunk."""
 STEPPING = ("walk", "run", "kick", "knee raise", "squat", "basketball")
-"""Actions of the legs, whatever the arms do."""
+"""Actions of the legs, independent of the arms."""
 REVERSIBLE = ("jumping jacks", "twist", "knee raise", "arm circle", "squat", "toe touch")
-"""Periodic actions: played backwards they are the same action."""
+"""Periodic actions, invariant to time reversal."""
 LEG_CLASSES = (*(name for name in CLASSES if name not in STANDING), STAND)
-"""What a judge tells apart by the legs alone."""
+"""Classes of a judge of the legs."""
 
 
 def action(text: str) -> str | None:
-    """The class of a description; ``None`` where it is of none, or of several one after the other."""
+    """Class of a description; ``None`` for no class, or several in sequence."""
     return _CLASS_OF.get(cleaned(text))
 
 
 def actions(goal: str) -> tuple[str, ...]:
-    """The class that a goal asks for; of two joined, that of arms and trunk first, then that of the legs.
+    """Classes of a goal; for two joined actions, arms and trunk first, then the legs.
 
     Returns:
-        Nothing where behaviour cannot be judged by the goal.
+        An empty tuple if the goal cannot be judged.
     """
-    found = [action(part) for part in goal_parts(goal)]
-    return tuple(name for name in found if name is not None) if None not in found and len(found) <= 2 else ()
+    classes = [action(part) for part in goal_parts(goal)]
+    return tuple(name for name in classes if name is not None) if None not in classes and len(classes) <= 2 else ()
 
 
 def judged(goal: str) -> bool:
-    """Whether behaviour can be judged by a goal."""
+    """Whether a goal can be judged."""
     return bool(actions(goal))
 
 
 def of_legs(name: str) -> str:
-    """What the legs do in an action of this class."""
+    """Class of the legs in an action."""
     return STAND if name in STANDING else name

@@ -1,8 +1,8 @@
-"""Skeletons (ASF) and their motion (AMC) in the Acclaim format, by forward kinematics.
+"""Acclaim skeletons (ASF) and motion (AMC), by forward kinematics.
 
-A bone of length l and direction d turns by ``R = parent R * C * M * C^-1``, where C is its ``axis`` and M its degrees of freedom
-of a frame, and ends ``l * R d`` from where its parent ends (M. Lander, Working with motion capture file formats, 1998). Rotations
-named XYZ are applied x first: ``Rz Ry Rx``.
+A bone of length l and direction d rotates by ``R = parent R * C * M * C^-1``, with its ``axis`` C and the degrees of freedom M of
+a frame, and ends at ``l * R d`` from the end of its parent (M. Lander, Working with motion capture file formats, 1998). Rotations
+named XYZ apply x first: ``Rz Ry Rx``.
 """
 
 import math
@@ -18,7 +18,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.limits import most_bytes, read_text
 
 INCH = 0.0254
-"""Metres. Lengths of the database are inches once they are divided by the ``length`` of the skeleton's ``units``."""
+"""Metres. Lengths in the database are inches after division by ``length`` in the skeleton's ``units``."""
 ROOT = "root"
 JOINT_BONES = (
     "rhipjoint", "rfemur", "rtibia", "lhipjoint", "lfemur", "ltibia", "rclavicle", "rhumerus", "rradius", "lclavicle", "lhumerus",
@@ -27,19 +27,19 @@ JOINT_BONES = (
 """Bones whose ends are the joints, in their order."""
 THORAX = "thorax"
 _NUMBERS = {"direction": 3, "length": 1, "axis": 3}
-"""How many a bone's lines hold."""
+"""Count of numbers per key of a bone."""
 _CHANNELS = {"TX", "TY", "TZ", "RX", "RY", "RZ"}
 
 
 @dataclass(frozen=True)
 class Bone:
-    """One bone.
+    """A bone.
 
     Attributes:
-        parent: name of the bone that it hangs on, or ``'root'``.
-        reach: ``(3,)`` from its start to its end in the rest pose, in the file's units.
-        axis: the turn of its own axes against the world's in the rest pose.
-        dof: its degrees of freedom in the order of the motion's numbers, such as ``('rx', 'rz')``.
+        parent: name of the parent bone, or ``'root'``.
+        reach: ``(3,)`` from start to end in the rest pose, in the file's units.
+        axis: rotation of the bone's axes relative to the world in the rest pose.
+        dof: degrees of freedom in the order of the motion's numbers, such as ``('rx', 'rz')``.
     """
 
     parent: str
@@ -50,14 +50,14 @@ class Bone:
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A subject's body.
+    """Body of a subject.
 
     Attributes:
-        metres: of one unit of the file.
-        order: of the root's numbers, such as ``('TX', 'TY', 'TZ', 'RX', 'RY', 'RZ')``.
+        metres: metres per unit of the file.
+        order: order of the root's numbers, such as ``('TX', 'TY', 'TZ', 'RX', 'RY', 'RZ')``.
         position: ``(3,)`` of the root in the rest pose, in the file's units.
         orientation: of the root in the rest pose.
-        bones: by name, each after its parent.
+        bones: by name, parents first.
     """
 
     metres: float
@@ -67,10 +67,10 @@ class Skeleton:
     bones: dict[str, Bone]
 
     def joints(self, motion: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Where the joints are ``(frame, 14, 3)`` in metres, y up.
+        """Joint positions ``(frame, 14, 3)`` in metres, y up.
 
         Args:
-            motion: of the root ``(frame, 6)`` and of each bone that moves ``(frame, dof)``, in degrees; others stay at rest.
+            motion: of the root ``(frame, 6)`` and of each moving bone ``(frame, dof)``, in degrees; others stay at rest.
         """
         frames = len(motion[ROOT])
         channels = [name.lower() for name in self.order]
@@ -88,17 +88,17 @@ class Skeleton:
 
 
 def _turns(values: NDArray[np.float64], channels: Sequence[str], order: str = "xyz") -> Rotation:
-    """Turns ``(frame,)`` about the axes of ``order``, the first one first, of degrees ``(frame, channel)``."""
+    """Rotations ``(frame,)`` about the axes of ``order``, in this order, from degrees ``(frame, channel)``."""
     zero = np.zeros(len(values))
     angles = [values[:, list(channels).index(f"r{axis}")] if f"r{axis}" in channels else zero for axis in order]
     return Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
 
 
 def read_asf(path: Path) -> Skeleton:
-    """A skeleton.
+    """Read a skeleton.
 
     Raises:
-        UserError: naming file and line, where it is malformed or not the database's.
+        UserError: with file and line, if the file is malformed or not from the database.
     """
     lines = _Lines(path)
     length, degrees = 1.0, True
@@ -143,18 +143,18 @@ def read_asf(path: Path) -> Skeleton:
     return Skeleton(INCH / length, order, position, orientation, _ordered(path, bones, parents))
 
 
-def _bone(lines: "_Lines", found: dict[str, list[str]], degrees: bool) -> tuple[str, Bone]:
+def _bone(lines: "_Lines", fields: dict[str, list[str]], degrees: bool) -> tuple[str, Bone]:
     for key in ("name", "direction", "length", "axis"):
-        if key not in found:
+        if key not in fields:
             raise lines.error(f"a bone with name, direction, length and axis (no {key!r} here)", ["end"])
-    direction = lines.numbers(found["direction"], 3)
+    direction = lines.numbers(fields["direction"], 3)
     norm = float(np.linalg.norm(direction))
-    turn = _rest(lines, lines.numbers(found["axis"][:3], 3), lines.word(found["axis"], 3), degrees)
-    dof = tuple(word.lower() for word in found.get("dof", ()))
+    turn = _rest(lines, lines.numbers(fields["axis"][:3], 3), lines.word(fields["axis"], 3), degrees)
+    dof = tuple(word.lower() for word in fields.get("dof", ()))
     if unknown := set(dof) - {"rx", "ry", "rz"}:
         raise lines.error("degrees of freedom rx, ry or rz", sorted(unknown))
-    reach = direction * (lines.number(found["length"], 0) / norm if norm > 0 else 0.0)
-    return lines.word(found["name"], 0), Bone(ROOT, reach, turn, dof)
+    reach = direction * (lines.number(fields["length"], 0) / norm if norm > 0 else 0.0)
+    return lines.word(fields["name"], 0), Bone(ROOT, reach, turn, dof)
 
 
 def _rest(lines: "_Lines", angles: NDArray[np.float64], order: str, degrees: bool) -> Rotation:
@@ -165,24 +165,24 @@ def _rest(lines: "_Lines", angles: NDArray[np.float64], order: str, degrees: boo
 
 
 def _ordered(path: Path, bones: dict[str, Bone], parents: dict[str, str]) -> dict[str, Bone]:
-    """Bones with their parents, each after its parent."""
-    found: dict[str, Bone] = {}
-    while len(found) < len(bones):
-        ready = [name for name in bones if name not in found and (parents.get(name) == ROOT or parents.get(name) in found)]
+    """Bones with their parents, parents first."""
+    ordered: dict[str, Bone] = {}
+    while len(ordered) < len(bones):
+        ready = [name for name in bones if name not in ordered and (parents.get(name) == ROOT or parents.get(name) in ordered)]
         if not ready:
-            lost = next(name for name in bones if name not in found)
+            lost = next(name for name in bones if name not in ordered)
             raise UserError(f"{path}: section ':hierarchy': expected what {lost!r} hangs on, up to the root, found no such bones")
         for name in ready:
-            one = bones[name]
-            found[name] = Bone(parents[name], one.reach, one.axis, one.dof)
-    return found
+            bone = bones[name]
+            ordered[name] = Bone(parents[name], bone.reach, bone.axis, bone.dof)
+    return ordered
 
 
 def read_amc(path: Path, skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
-    """A motion: of the root ``(frame, 6)`` and of each bone ``(frame, dof)``, in degrees.
+    """Read a motion: of the root ``(frame, 6)`` and of each bone ``(frame, dof)``, in degrees.
 
     Raises:
-        UserError: naming file and line, where it is malformed, of another skeleton, or without frames.
+        UserError: with file and line, if the file is malformed, of another skeleton, or without frames.
     """
     lines = _Lines(path)
     expected = {ROOT: len(skeleton.order)} | {name: len(bone.dof) for name, bone in skeleton.bones.items()}
@@ -211,18 +211,18 @@ def read_amc(path: Path, skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
     _complete(lines, values, frames)
     if not frames:
         raise UserError(f"{path}: expected frames of motion, found none")
-    found = {name: np.array(rows) for name, rows in values.items()}
-    for name, array in found.items():
+    motion = {name: np.array(rows) for name, rows in values.items()}
+    for name, array in motion.items():
         if not np.isfinite(array).all():
             frame = int((~np.isfinite(array)).any(axis=1).argmax()) + 1
             raise UserError(f"{path}: frame {frame}: expected finite numbers of {name!r}, found others")
-    if ROOT not in found:
+    if ROOT not in motion:
         raise UserError(f"{path}: expected the root's motion, found none")
     if scale != 1.0:
         rotations = [place for place, channel in enumerate(skeleton.order) if channel.startswith("R")]
-        for name, array in found.items():
+        for name, array in motion.items():
             array[:, rotations if name == ROOT else slice(None)] *= scale
-    return found
+    return motion
 
 
 def _complete(lines: "_Lines", values: dict[str, list[list[float]]], frames: int) -> None:
@@ -232,7 +232,7 @@ def _complete(lines: "_Lines", values: dict[str, list[list[float]]], frames: int
 
 
 class _Lines:
-    """The words of a text file's lines, without comments and empty ones."""
+    """Words per line of a text file, without comments and empty lines."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.line = path, 0
@@ -246,27 +246,27 @@ class _Lines:
                 yield words
 
     def error(self, expected: str, words: Sequence[str], what: str = "") -> UserError:
-        """A mistake in the line that was read last."""
-        told = " ".join(words)
+        """Error in the line read last."""
+        text = " ".join(words)
         hint = f"; {what}" if what else ""
-        return UserError(f"{self.path}: line {self.line}: expected {expected}, found {told[:60]!r}{hint}")
+        return UserError(f"{self.path}: line {self.line}: expected {expected}, found {text[:60]!r}{hint}")
 
     def word(self, words: Sequence[str], place: int) -> str:
-        """One of the words."""
+        """Word at a position."""
         if len(words) <= place:
             raise self.error("more words", words)
         return words[place]
 
     def number(self, words: Sequence[str], place: int) -> float:
-        """One of the words as a number."""
+        """Word at a position as a number."""
         return float(self.numbers([self.word(words, place)], 1)[0])
 
     def numbers(self, words: Sequence[str], count: int) -> NDArray[np.float64]:
-        """Words as that many finite numbers."""
+        """Words as ``count`` finite numbers."""
         try:
-            found = np.array([float(word) for word in words])
+            values = np.array([float(word) for word in words])
         except ValueError:
             raise self.error("numbers", words) from None
-        if len(found) != count or not np.isfinite(found).all():
+        if len(values) != count or not np.isfinite(values).all():
             raise self.error(f"{count} finite numbers", words)
-        return found
+        return values

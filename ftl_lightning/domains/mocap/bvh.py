@@ -1,7 +1,7 @@
-"""Motion in BVH files: those of B. Hahne's MotionBuilder-friendly conversion of the database (cgspeed), and our own.
+"""Motion from BVH files: B. Hahne's MotionBuilder-friendly conversion of the database (cgspeed), and exported files.
 
-The conversion leaves the thorax out: neck and collars hang where it starts. It is put back from the subject's ASF where there is
-one, else the bone below it stands for it. Its first frame is a T-pose, which is no motion.
+The conversion omits the thorax: neck and collars start at its base. It is restored from the subject's ASF, if available, else
+replaced by the bone below it. The first frame of the conversion, a T-pose, is skipped.
 """
 
 from pathlib import Path
@@ -19,12 +19,12 @@ from ftl_lightning.domains.mocap.source import moving, pieces
 from ftl_lightning.errors import UserError
 
 METRES = INCH / 0.45
-"""Of a unit of the conversion, which is that of the ASF files."""
+"""Metres per unit of the conversion, which is that of the ASF files."""
 NODES = (
     "RightUpLeg", "RightLeg", "RightFoot", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightArm", "RightForeArm", "RightHand", "LeftArm",
     "LeftForeArm", "LeftHand", "Neck1", "EndSiteHead",
 )  # fmt: skip
-"""Whose places are the joints, in their order."""
+"""Nodes at the joints, in their order."""
 _AFTER_THORAX = ("Neck", "LeftShoulder", "RightShoulder")
 _BELOW = "Spine1"
 _CONVERTED = (*NODES, *_AFTER_THORAX, _BELOW)
@@ -33,14 +33,14 @@ SAME_RATE = 0.01
 
 
 def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64], int]:
-    """Where the joints are ``(frame, 14, 3)`` in metres, y up, and frames a second.
+    """Joint positions ``(frame, 14, 3)`` in metres, y up, and frames per second.
 
     Args:
         path: the file.
-        skeleton: of the subject, if there is one.
+        skeleton: skeleton of the subject, if available.
 
     Raises:
-        UserError: naming the file, if it is damaged or of another conversion.
+        UserError: with the path, for a file that is damaged or of another conversion.
     """
     motion = read_motion(path)
     if missing := [name for name in _CONVERTED if name not in motion.names]:
@@ -51,7 +51,7 @@ def read_bvh(path: Path, skeleton: Skeleton | None) -> tuple[NDArray[np.float64]
 
 
 def _converted(motion: Motion, skeleton: Skeleton | None) -> NDArray[np.float64]:
-    """Joints ``(frame, 14, 3)`` of the conversion, without its first frame."""
+    """Joints ``(frame, 14, 3)`` of the conversion, without the first frame."""
     offsets = {node.name: node.offset for node in motion.nodes}
     thorax = offsets[_BELOW] if skeleton is None else skeleton.bones[THORAX].reach
     put_back = {name: np.asarray(thorax, dtype=np.float64) for name in _AFTER_THORAX if not np.any(offsets[name])}
@@ -59,13 +59,13 @@ def _converted(motion: Motion, skeleton: Skeleton | None) -> NDArray[np.float64]
 
 
 def demonstrated(path: Path) -> Demonstrations:
-    """Motion of one file as demonstrations without a text: one for each stretch without glitches, as of recordings.
+    """Demonstrations from the motion of a file, without text: each a piece without glitches, as for recordings.
 
     Args:
-        path: of a file that ``sample --export`` wrote, at any frame rate, or of the conversion.
+        path: file of ``sample --export``, at any frame rate, or of the conversion.
 
     Raises:
-        UserError: naming the file, if it is damaged, of another skeleton, or shorter than a plan.
+        UserError: with the path, for a file that is damaged, of another skeleton, or shorter than a plan.
     """
     motion = read_motion(path)
     if motion.names.issuperset(_CONVERTED):
@@ -79,16 +79,16 @@ def demonstrated(path: Path) -> Demonstrations:
             f"database, found one without {missing!r}"
         )
     poses = normalised(z_up(_at_rate(joints, motion.seconds))).positions.astype(np.float32).reshape(-1, len(COLUMNS))
-    found = pieces(poses)
-    if not found:
+    parts = pieces(poses)
+    if not parts:
         raise UserError(
             f"{path}: expected a motion of {HORIZON} frames or more at {FPS} a second, without jumps, found {len(poses)} frames"
         )
-    return moving(found, [""] * len(found), {"generator": "BVH file", "file": path.name})
+    return moving(parts, [""] * len(parts), {"generator": "BVH file", "file": path.name})
 
 
 def _at_rate(joints: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-    """Joints ``(frame, 14, 3)`` at :data:`FPS`, in between as if they moved evenly."""
+    """Joints ``(frame, 14, 3)`` resampled to :data:`FPS` by linear interpolation."""
     step = 1 / FPS / seconds
     whole = max(round(step), 1)
     step = whole if abs(step - whole) < SAME_RATE * whole else step

@@ -1,6 +1,6 @@
-"""BVH files: a skeleton, how its joints turn in every frame, and where that puts them.
+"""BVH files: skeleton, rotations per frame, and forward kinematics.
 
-A joint may also have a place in every frame, which then stands for its offset, as Blender reads it.
+A joint may also have a position per frame, which replaces its offset, as in Blender.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,20 +15,20 @@ from ftl_lightning.limits import read_text
 
 Numbers = NDArray[np.float64]
 END = "EndSite"
-"""Begins the name of an end site, followed by that of its joint."""
+"""Prefix of the name of an end site, before its joint's name."""
 _POSITIONS = {f"{axis}position": number for number, axis in enumerate("XYZ")}
 _ROTATIONS = {f"{axis}rotation": number for number, axis in enumerate("XYZ")}
 
 
 @dataclass(frozen=True)
 class Node:
-    """A joint or an end site.
+    """Joint or end site.
 
     Attributes:
         name: of the joint; of an end site, see :data:`END`.
-        parent: its number; -1 for the root.
+        parent: index of the parent; -1 for the root.
         offset: ``(3,)`` from the parent, in the file's unit.
-        channels: names of its numbers in a frame, in their order.
+        channels: names of the node's numbers in a frame, in order.
     """
 
     name: str
@@ -39,12 +39,12 @@ class Node:
 
 @dataclass(frozen=True)
 class Motion:
-    """What a file holds.
+    """Content of a file.
 
     Attributes:
-        nodes: parents before their children; the root is the first.
-        frames: ``(frame, channel)``, the nodes' numbers one after another, angles in degrees.
-        seconds: between two frames.
+        nodes: parents first; the root is the first.
+        frames: ``(frame, channel)``, the nodes' numbers in sequence, angles in degrees.
+        seconds: time between frames.
     """
 
     nodes: tuple[Node, ...]
@@ -53,54 +53,54 @@ class Motion:
 
     @property
     def names(self) -> frozenset[str]:
-        """Of all nodes."""
+        """Names of all nodes."""
         return frozenset(node.name for node in self.nodes)
 
     def places(self, wanted: Sequence[str], offsets: Mapping[str, Numbers] | None = None) -> Numbers:
-        """Where nodes are ``(frame, node, 3)``, in the file's unit and axes.
+        """Positions of nodes ``(frame, node, 3)``, in the file's unit and axes.
 
         Args:
-            wanted: their names.
-            offsets: in place of the file's, by name of the node.
+            wanted: node names.
+            offsets: replacements of the file's offsets, by node name.
         """
         count, column = len(self.frames), 0
-        found: dict[str, Numbers] = {}
+        positions: dict[str, Numbers] = {}
         at: list[Numbers] = []
         turned: list[Numbers] = []
         for node in self.nodes:
-            own = np.tile((offsets or {}).get(node.name, node.offset), (count, 1))
+            place = np.tile((offsets or {}).get(node.name, node.offset), (count, 1))
             turn = np.broadcast_to(np.eye(3), (count, 3, 3))
             for channel in node.channels:
                 values = self.frames[:, column]
                 column += 1
                 if channel in _POSITIONS:
-                    own[:, _POSITIONS[channel]] = values
+                    place[:, _POSITIONS[channel]] = values
                 else:
                     turn = turn @ _turned(_ROTATIONS[channel], np.deg2rad(values))
             if node.parent >= 0:
-                own = at[node.parent] + np.einsum("tij,tj->ti", turned[node.parent], own)
+                place = at[node.parent] + np.einsum("tij,tj->ti", turned[node.parent], place)
                 turn = turned[node.parent] @ turn
-            at.append(own)
+            at.append(place)
             turned.append(turn)
-            found.setdefault(node.name, own)
-        return np.stack([found[name] for name in wanted], axis=1)
+            positions.setdefault(node.name, place)
+        return np.stack([positions[name] for name in wanted], axis=1)
 
 
 def _turned(axis: int, angles: Numbers) -> Numbers:
-    """Turns ``(frame, 3, 3)`` about an axis by angles ``(frame,)`` in radians."""
-    one, other = (axis + 1) % 3, (axis + 2) % 3
+    """Rotations ``(frame, 3, 3)`` about an axis by angles ``(frame,)`` in radians."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
     turns = np.tile(np.eye(3), (len(angles), 1, 1))
-    turns[:, one, one] = turns[:, other, other] = np.cos(angles)
-    turns[:, other, one] = np.sin(angles)
-    turns[:, one, other] = -turns[:, other, one]
+    turns[:, first, first] = turns[:, second, second] = np.cos(angles)
+    turns[:, second, first] = np.sin(angles)
+    turns[:, first, second] = -turns[:, second, first]
     return turns
 
 
 def read_motion(path: Path) -> Motion:
-    """A file's motion.
+    """Read a motion.
 
     Raises:
-        UserError: naming the file, if it is damaged.
+        UserError: with the path, for a damaged file.
     """
     text = read_text(path, "BVH")
     try:
@@ -126,20 +126,20 @@ def read_motion(path: Path) -> Motion:
 
 
 def _nodes(words: Iterator[str]) -> Iterable[Node]:
-    """Those of a file's part before its motion, word by word.
+    """Nodes from the words of a file's hierarchy.
 
     Raises:
-        ValueError: where it is damaged.
+        ValueError: for a damaged hierarchy.
     """
     if next(words, "") != "HIERARCHY":
         raise ValueError("no line HIERARCHY")
-    found: list[Node] = []
-    path: list[int] = []  # from the root to the node whose bracket is open
+    nodes: list[Node] = []
+    path: list[int] = []  # from the root to the open node
     for word in words:
         if word == "}" and path:
             path.pop()
             continue
-        if word not in ("ROOT", "JOINT", "End") or (word == "ROOT") == bool(found) or bool(found) != bool(path):
+        if word not in ("ROOT", "JOINT", "End") or (word == "ROOT") == bool(nodes) or bool(nodes) != bool(path):
             raise ValueError(f"{word!r} where a joint was expected")
         name = next(words, "")
         parent = path[-1] if path else -1
@@ -153,8 +153,8 @@ def _nodes(words: Iterator[str]) -> Iterable[Node]:
             channels = tuple(next(words, "") for _ in range(min(int(next(words, "")), 7)))
             if unknown := set(channels) - {*_POSITIONS, *_ROTATIONS}:
                 raise ValueError(f"channel {min(unknown)!r} of {name!r}")
-        path.append(len(found))
-        found.append(Node(f"{END}{found[parent].name}" if word == "End" else name, parent, offset, channels))
-    if path or not found:
+        path.append(len(nodes))
+        nodes.append(Node(f"{END}{nodes[parent].name}" if word == "End" else name, parent, offset, channels))
+    if path or not nodes:
         raise ValueError("brackets that do not close")
-    return found
+    return nodes

@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows of human motion."""
+"""Domain object of human motion."""
 
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from ftl_lightning.domains.tasks import training_suite
 _DRAWING, _MEASURES = "ftl_lightning.domains.mocap.rendering", "ftl_lightning.domains.mocap.measures"
 
 _KINEMATIC = ("rule", "level", "strides", "rise", "feet in time", "amplitude of hands", "amplitude of feet", "degrees turned")
-"""Metrics of :mod:`~ftl_lightning.domains.mocap.measures` that need no judge, by name."""
+"""Metrics of :mod:`~ftl_lightning.domains.mocap.measures` without the judge, by name."""
 
 
 def _frozen(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    """Plans in which nobody moves."""
+    """Plans without motion."""
     return expect_starts(starts).observed[POSE][:, None].repeat(1, HORIZON, 1)
 
 
@@ -57,5 +57,5 @@ DOMAIN = Domain(
     ),
     imports={".bvh": deferred("ftl_lightning.domains.mocap.bvh:demonstrated")},
     prepare=deferred("ftl_lightning.domains.mocap.prepare:prepare"),
-    fresh=False,  # there is no more behaviour than what was recorded
+    fresh=False,  # recordings are finite
 )

@@ -1,8 +1,8 @@
-"""Motion as a BVH file, which Blender and other programs of animation open.
+"""Export of motion to BVH files, readable by Blender and other animation software.
 
-In the file y is up, the person faces +z, +x is the person's left, and a unit is a metre. The root is the middle of the hips. Joints
-turn; those that hang on no rigid bone (shoulders, neck, head) also have a place in every frame, which stands for their offset, as
-Blender reads it. Ankles and wrists are end sites.
+In the file y is up, the person faces +z, +x is the person's left, and the unit is the metre. The root is the middle of the hips.
+Joints rotate; joints without rigid bone to the parent (shoulders, neck, head) also have a position per frame, which replaces their
+offset, as in Blender. Ankles and wrists are end sites.
 """
 
 from typing import NamedTuple
@@ -20,23 +20,23 @@ from ftl_lightning.errors import UserError
 
 Numbers = NDArray[np.float64]
 HIPS = len(skeleton.JOINTS)
-"""The number of the middle of the hips, after those of the joints."""
+"""Index of the middle of the hips, after those of the joints."""
 TIP = 0.08
-"""Metres of a head's bone beyond its joint, which only makes it seen."""
+"""Length in metres of the head's visible bone."""
 SHORTEST = 1e-6
-"""Metres: a bone shorter than this has no direction and does not turn."""
+"""Minimum length in metres of a bone with a direction; shorter bones do not rotate."""
 
 
 class Joint(NamedTuple):
-    """One of the file.
+    """Joint of the file.
 
     Attributes:
-        name: as the MotionBuilder-friendly conversion calls it.
-        parent: the number of its parent among :data:`TREE`; -1 for the root.
-        place: the number of the joint that it is at.
-        tip: the number of the joint that its bone points to, from its place; ``None`` where it does not turn.
-        free: whether its place is told in every frame.
-        end: whether its bone ends in an end site.
+        name: name in the MotionBuilder-friendly conversion.
+        parent: index of the parent in :data:`TREE`; -1 for the root.
+        place: index of the joint's position.
+        tip: index of the joint at the end of the bone; ``None`` without rotation.
+        free: whether the joint has a position per frame.
+        end: whether the bone ends in an end site.
     """
 
     name: str
@@ -61,20 +61,20 @@ TREE = (
     Joint("LeftArm", 5, skeleton.L_SHOULDER, skeleton.L_ELBOW, free=True),
     Joint("LeftForeArm", 10, skeleton.L_ELBOW, skeleton.L_WRIST, end=True),
 )
-"""Parents before their children, and each followed by all that hangs on it."""
+"""Joints in depth-first order."""
 _NAMES = {joint.place: joint.name for joint in TREE if joint.place != HIPS} | {
     joint.tip: f"{END}{joint.name}" for joint in TREE if joint.end and joint.tip is not None
 }
 NODES = tuple(_NAMES[number] for number in range(len(skeleton.JOINTS)))
-"""Joints and end sites of the file whose places are the body's joints, in their order."""
+"""Joints and end sites of the file at the body's joints, in their order."""
 _PLACE, _TURN = "Xposition Yposition Zposition", "Zrotation Yrotation Xrotation"
 
 
 def bvh(states: Tensor) -> str:
-    """One motion as the text of a BVH file.
+    """Convert a motion to the text of a BVH file.
 
-    Bones have the lengths of the first frame, and at rest the directions of somebody who stands. From frame to frame each turns by
-    the smallest angle, so that no arm spins about itself, not even overhead.
+    Bones have the lengths of the first frame and the rest directions of a standing pose. Rotations between frames are minimal, so
+    that no arm spins about its axis, not even overhead.
 
     Args:
         states: ``(frame, 42)`` in metres.
@@ -86,7 +86,7 @@ def bvh(states: Tensor) -> str:
         raise UserError("export: expected motion of finite numbers, found others; draw it anew with another --seed")
     places = _places(states)
     (rest,) = _places(standing_poses(1, torch.Generator().manual_seed(0)))
-    turns: list[Numbers] = []  # of each joint against the file's axes, (frame, 3, 3)
+    turns: list[Numbers] = []  # of each joint in the file's axes, (frame, 3, 3)
     offsets, ends, rows = [], [], []
     for joint in TREE:
         parent = HIPS if joint.parent < 0 else TREE[joint.parent].place
@@ -107,7 +107,7 @@ def bvh(states: Tensor) -> str:
 
 
 def _places(states: Tensor) -> Numbers:
-    """Where the joints and the middle of the hips are ``(frame, 15, 3)``, in the file's axes."""
+    """Positions of the joints and the middle of the hips ``(frame, 15, 3)``, in the file's axes."""
     joints = as_joints(states.detach().cpu()).double().numpy()
     joints = np.stack((-joints[..., 0], joints[..., 2], joints[..., 1]), axis=-1)
     middle = joints[:, list(skeleton.HIPS)].mean(axis=1, keepdims=True)
@@ -115,18 +115,18 @@ def _places(states: Tensor) -> Numbers:
 
 
 def _seen(turns: Numbers, ways: Numbers) -> Numbers:
-    """Ways ``(frame, 3)`` as what has turned ``(frame, 3, 3)`` sees them."""
+    """Vectors ``(frame, 3)`` in frames with rotations ``(frame, 3, 3)``."""
     return np.einsum("tji,tj->ti", turns, ways)
 
 
 def _sized(way: Numbers, like: Numbers) -> Numbers:
-    """A way ``(3,)`` of the length of another; of the other, where it has no direction."""
+    """A vector ``(3,)`` scaled to the length of ``like``; ``like`` if it has no direction."""
     length = float(np.linalg.norm(way))
     return way * (np.linalg.norm(like) / length) if length > SHORTEST else like
 
 
 def _followed(rest: Numbers, bone: Numbers) -> Numbers:
-    """Turns ``(frame, 3, 3)`` that take a bone at rest ``(3,)`` to its directions ``(frame, 3)``, each nearest to the last."""
+    """Rotations ``(frame, 3, 3)`` from a bone at rest ``(3,)`` to its directions ``(frame, 3)``, each nearest to the last."""
     turn, before, turns = np.eye(3), rest / np.linalg.norm(rest), []
     for way in bone:
         if (length := np.linalg.norm(way)) > SHORTEST:
@@ -135,34 +135,34 @@ def _followed(rest: Numbers, bone: Numbers) -> Numbers:
     return np.stack(turns)
 
 
-def _smallest(one: Numbers, other: Numbers) -> Numbers:
-    """The smallest turn ``(3, 3)`` from a direction to another."""
-    cosine = float(one @ other)
-    if cosine < -1 + 1e-9:  # half a turn, about any axis across
-        across = np.cross(one, np.eye(3)[np.abs(one).argmin()])
+def _smallest(start: Numbers, end: Numbers) -> Numbers:
+    """Smallest rotation ``(3, 3)`` between two directions."""
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-9:  # 180 degrees, about any orthogonal axis
+        across = np.cross(start, np.eye(3)[np.abs(start).argmin()])
         across /= np.linalg.norm(across)
         return 2 * np.outer(across, across) - np.eye(3)
-    x, y, z = np.cross(one, other)
+    x, y, z = np.cross(start, end)
     skew = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
     return np.eye(3) + skew + skew @ skew / (1 + cosine)
 
 
 def _angles(turns: Numbers) -> Numbers:
-    """Degrees about z, then y, then x ``(frame, 3)`` of turns ``(frame, 3, 3)``, without jumps by full turns."""
+    """Degrees about z, then y, then x ``(frame, 3)`` of rotations ``(frame, 3, 3)``, unwrapped."""
     y = np.arcsin(np.clip(-turns[:, 2, 0], -1, 1))
-    upright = np.abs(turns[:, 2, 0]) > 1 - 1e-12  # z and x turn about the same axis: all of it is z
+    upright = np.abs(turns[:, 2, 0]) > 1 - 1e-12  # gimbal lock: all of the rotation is z
     z = np.where(upright, np.arctan2(-turns[:, 0, 1], turns[:, 1, 1]), np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))
     x = np.where(upright, 0.0, np.arctan2(turns[:, 2, 1], turns[:, 2, 2]))
     return np.unwrap(np.rad2deg(np.stack((z, y, x), axis=1)), axis=0, period=360)
 
 
 def _hierarchy(number: int, offsets: list[Numbers], ends: list[Numbers]) -> list[str]:
-    """Lines of a joint and of all that hangs on it."""
+    """Lines of a joint and its descendants."""
     joint = TREE[number]
     channels = f"6 {_PLACE} {_TURN}" if joint.free else f"3 {_TURN}"
     inside = [f"OFFSET {_line(offsets[number])}", f"CHANNELS {channels}"]
-    for child, other in enumerate(TREE):
-        if other.parent == number:
+    for child, node in enumerate(TREE):
+        if node.parent == number:
             inside += _hierarchy(child, offsets, ends)
     if joint.end:
         inside += ["End Site", "{", f"\tOFFSET {_line(ends[number])}", "}"]

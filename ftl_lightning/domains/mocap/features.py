@@ -1,7 +1,7 @@
-"""What a judge sees of a window of motion.
+"""Motion features of the judge.
 
-Joints are seen from the one they hang on, in units of the body's size, and by how fast they move: a body of another size is judged
-alike, and a frozen frame or trembling joints are another motion.
+Joints are relative to their parents, in units of body size, with velocities: features are invariant to body size and tell frozen
+or trembling motion from real motion.
 """
 
 from collections.abc import Sequence
@@ -16,30 +16,30 @@ RH, RK, RA, LH, LK, LA, RS, RE, RW, LS, LE, LW = range(12)
 """Joints of the right and the left side: hip, knee, ankle, shoulder, elbow, wrist."""
 JOINTS = len(skeleton.JOINTS)
 LOWER, UPPER = (RH, RK, RA, LH, LK, LA), (RS, RE, RW, LS, LE, LW, NECK, HEAD)
-"""Joints of the legs; of arms and trunk."""
+"""Joints of the legs, and of arms and trunk."""
 PARENT = {RK: RH, RA: RK, LK: LH, LA: LK, HEAD: NECK, RS: NECK, LS: NECK, RE: RS, LE: LS, RW: RE, LW: LE}
-"""The joint that each hangs on, those near the hips first; hips and neck hang on the middle of the hips, which is the origin."""
+"""Parent of each joint, from the hips outwards; parent of hips and neck is the origin, the middle of the hips."""
 _FREQUENCIES = 6
 _SIDEWAYS = (-1.0, 1.0, 1.0)
 
 
 def bones(joints: Tensor) -> Tensor:
-    """Each joint ``(..., 14, 3)`` relative to its parent."""
+    """Joints ``(..., 14, 3)`` relative to their parents."""
     origin = torch.zeros_like(joints[..., 0, :])
     base = [joints[..., PARENT[joint], :] if joint in PARENT else origin for joint in range(JOINTS)]
     return joints - torch.stack(base, dim=-2)
 
 
 def places(relative: Tensor) -> Tensor:
-    """The inverse of :func:`bones`."""
-    found = dict(enumerate(relative.unbind(dim=-2)))
+    """Invert :func:`bones`."""
+    joints = dict(enumerate(relative.unbind(dim=-2)))
     for joint, parent in PARENT.items():
-        found[joint] = found[joint] + found[parent]
-    return torch.stack([found[joint] for joint in range(JOINTS)], dim=-2)
+        joints[joint] = joints[joint] + joints[parent]
+    return torch.stack([joints[joint] for joint in range(JOINTS)], dim=-2)
 
 
 def sizes(relative: Tensor) -> Tensor:
-    """Length of all bones of the half of the body that each bone ``(sample, frame, 14, 3)`` is in: ``(sample, 1, 14, 1)``."""
+    """Total bone length of the body half of each bone ``(sample, frame, 14, 3)``: ``(sample, 1, 14, 1)``."""
     length = torch.linalg.vector_norm(relative, dim=-1).mean(dim=1, keepdim=True)
     half = [length[..., list(part)].sum(dim=-1) for part in (LOWER, UPPER)]
     return torch.stack([half[joint in UPPER] for joint in range(JOINTS)], dim=-1)[..., None].clamp_min(1e-3)
@@ -51,9 +51,9 @@ def _in_sizes(states: Tensor) -> Tensor:
 
 
 def signals(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Courses over time for a network: of windows ``(sample, frame, 42)``, ``(sample, 9 * joints, frame)``.
+    """Time series for a network: ``(sample, 9 * joints, frame)`` for windows ``(sample, frame, 42)``.
 
-    Bones and places in body sizes, and velocities in body sizes in a third of a second.
+    Bones and positions in body sizes, and velocities in body sizes per third of a second.
     """
     relative = _in_sizes(states)
     where = places(relative)
@@ -68,7 +68,7 @@ def _log(values: Tensor, floor: float) -> Tensor:
 
 
 def _of_joints(where: Tensor) -> Tensor:
-    """Of joints' places ``(sample, frame, joint, 3)``: ``(sample, joint, feature)``, where they are, how far and how they move."""
+    """Position and motion features ``(sample, joint, feature)`` of joints ``(sample, frame, joint, 3)``."""
     velocity = torch.diff(where, dim=1) * FPS
     speed = torch.linalg.vector_norm(velocity, dim=-1)
     change = torch.linalg.vector_norm(torch.diff(velocity, dim=1), dim=-1)
@@ -91,7 +91,7 @@ def _of_joints(where: Tensor) -> Tensor:
 
 
 def _of_course(values: Tensor) -> Tensor:
-    """Of a course ``(sample, frame)``: ``(sample, 5)``, its mean, spread, extremes and how fast it changes."""
+    """Mean, spread, extremes and rate of change ``(sample, 5)`` of a time series ``(sample, frame)``."""
     change = torch.diff(values, dim=1).abs().mean(dim=1) * FPS
     return torch.stack(
         [values.mean(dim=1), _log(values.std(dim=1), 0.02), values.amax(dim=1), values.amin(dim=1), _log(change, 0.1)], dim=1
@@ -99,29 +99,29 @@ def _of_course(values: Tensor) -> Tensor:
 
 
 def _sides(right: Tensor, left: Tensor) -> list[Tensor]:
-    """Mean and difference of both sides, which are the same for the mirror image."""
+    """Mean and difference of both sides, which are invariant to mirroring."""
     return [(right + left) / 2, (right - left).abs()]
 
 
-def _angle(one: Tensor, other: Tensor) -> Tensor:
-    """Between vectors ``(..., 3)``, radians."""
-    across = torch.linalg.vector_norm(torch.linalg.cross(one, other.expand_as(one)), dim=-1)
-    return torch.atan2(across, (one * other).sum(dim=-1))
+def _angle(first: Tensor, second: Tensor) -> Tensor:
+    """Angle between vectors ``(..., 3)`` in radians."""
+    across = torch.linalg.vector_norm(torch.linalg.cross(first, second.expand_as(first)), dim=-1)
+    return torch.atan2(across, (first * second).sum(dim=-1))
 
 
 def _spread(values: Tensor) -> Tensor:
     return _log(torch.stack([values.std(dim=1), values.amax(dim=1) - values.amin(dim=1)], dim=1), 0.03)
 
 
-def _together(one: Tensor, other: Tensor) -> Tensor:
-    """Correlation of two trajectories ``(sample, frame)``: ``(sample, 1)`` from -1 to 1, near 0 where they hardly change."""
-    one, other = (values - values.mean(dim=1, keepdim=True) for values in (one, other))
-    lengths = torch.linalg.vector_norm(one, dim=1) * torch.linalg.vector_norm(other, dim=1)
-    return ((one * other).sum(dim=1) / (lengths + 0.05))[:, None]
+def _together(first: Tensor, second: Tensor) -> Tensor:
+    """Correlation ``(sample, 1)`` of time series ``(sample, frame)``, -1..1, near 0 without variation."""
+    first, second = (values - values.mean(dim=1, keepdim=True) for values in (first, second))
+    lengths = torch.linalg.vector_norm(first, dim=1) * torch.linalg.vector_norm(second, dim=1)
+    return ((first * second).sum(dim=1) / (lengths + 0.05))[:, None]
 
 
 def _alike(where: Tensor, right: int, left: int) -> list[Tensor]:
-    """Correlation of a right and a left joint: sideways, forwards, upwards, in speed."""
+    """Correlations of a right and a left joint: sideways, forwards, upwards, in speed."""
     speed = torch.linalg.vector_norm(torch.diff(where, dim=1), dim=-1)
     return [
         _together(-where[:, :, right, 0], where[:, :, left, 0]),
@@ -132,15 +132,13 @@ def _alike(where: Tensor, right: int, left: int) -> list[Tensor]:
 
 
 def _distances(where: Tensor, *pairs: tuple[int, int]) -> list[Tensor]:
-    """Between two joints, and between their mirror images where they have any."""
-    found = [
-        _of_course(_log(torch.linalg.vector_norm(where[:, :, one] - where[:, :, other], dim=-1), 0.05)) for one, other in pairs
-    ]
-    return _sides(*found) if len(found) == 2 else found
+    """Distance features of a pair of joints, and of its mirror image if given."""
+    courses = [_of_course(_log(torch.linalg.vector_norm(where[:, :, a] - where[:, :, b], dim=-1), 0.05)) for a, b in pairs]
+    return _sides(*courses) if len(courses) == 2 else courses
 
 
 def _upper(where: Tensor, limbs: Tensor) -> list[Tensor]:
-    """Of arms and trunk."""
+    """Features of arms and trunk."""
     neck, up = where[:, :, NECK], where.new_tensor((0.0, 0.0, 1.0))
     shoulders = where[:, :, RS] - where[:, :, LS]
     turn, side = torch.atan2(shoulders[..., 1], shoulders[..., 0]), torch.atan2(neck[..., 0], neck[..., 2])
@@ -167,17 +165,17 @@ def _upper(where: Tensor, limbs: Tensor) -> list[Tensor]:
 
 
 def _lower(where: Tensor, limbs: Tensor) -> list[Tensor]:
-    """Of the legs."""
+    """Features of the legs."""
     down = where.new_tensor((0.0, 0.0, -1.0))
-    found: list[Tensor] = []
+    features: list[Tensor] = []
     for right, left in (
         (_angle(limbs[:, :, RK], limbs[:, :, RA]), _angle(limbs[:, :, LK], limbs[:, :, LA])),
         (_angle(limbs[:, :, RK], down), _angle(limbs[:, :, LK], down)),
         (_angle(limbs[:, :, RA], down), _angle(limbs[:, :, LA], down)),
     ):
-        found += _sides(_of_course(right), _of_course(left))
+        features += _sides(_of_course(right), _of_course(left))
     return [
-        *found,
+        *features,
         _of_course(-where[:, :, [RA, LA], 2].amin(dim=-1)),
         _of_course((where[:, :, RA, 0] - where[:, :, LA, 0]).abs()),
         *_distances(where, (RA, LA)),
@@ -187,60 +185,60 @@ def _lower(where: Tensor, limbs: Tensor) -> list[Tensor]:
     ]
 
 
-def _ways_together(where: Tensor, one: tuple[int, int], other: tuple[int, int], axis: int) -> Tensor:
-    """How much two joints go together along an axis, and their mirror images: the mean ``(sample, 1)``."""
-    first, second = (_together(where[:, :, a, axis], where[:, :, b, axis]) for a, b in (one, other))
-    return (first + second) / 2
+def _ways_together(where: Tensor, first: tuple[int, int], second: tuple[int, int], axis: int) -> Tensor:
+    """Correlation of two joints along an axis, averaged over both sides: ``(sample, 1)``."""
+    right, left = (_together(where[:, :, a, axis], where[:, :, b, axis]) for a, b in (first, second))
+    return (right + left) / 2
 
 
 def _arms_and_legs(where: Tensor) -> list[Tensor]:
-    """Correlation of arms and legs, of the same and of opposite sides."""
-    found = [_together(where[:, :, [RW, LW], 2].mean(dim=-1), (where[:, :, RA, 0] - where[:, :, LA, 0]).abs())]
-    for one, other in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA)), ((RW, RK), (LW, LK)), ((RW, LK), (LW, RK))):
-        found += _distances(where, one, other)
-        found += [_ways_together(where, one, other, axis) for axis in (1, 2)]
-    return found
+    """Correlations of arms and legs, of the same and of opposite sides."""
+    features = [_together(where[:, :, [RW, LW], 2].mean(dim=-1), (where[:, :, RA, 0] - where[:, :, LA, 0]).abs())]
+    for first, second in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA)), ((RW, RK), (LW, LK)), ((RW, LK), (LW, RK))):
+        features += _distances(where, first, second)
+        features += [_ways_together(where, first, second, axis) for axis in (1, 2)]
+    return features
 
 
 def summary(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Features of the whole window for a linear classifier, the same for its mirror image: ``(sample, feature)``.
+    """Window features for a linear classifier, invariant to mirroring: ``(sample, feature)``.
 
     Args:
         states: windows ``(sample, frame, 42)``.
-        joints: :data:`LOWER`, :data:`UPPER` or all; what of others is not looked at.
+        joints: :data:`LOWER`, :data:`UPPER` or all; others are ignored.
     """
     limbs = _in_sizes(states)
     where = places(limbs)
     right = [joint for joint in (RK, RA, RS, RE, RW) if joint in joints]
     left = [skeleton.MIRROR[joint] for joint in right]
-    found = [
+    features = [
         values.flatten(1)
         for values in _sides(_of_joints(where[:, :, right]), _of_joints(where[:, :, left] * where.new_tensor(_SIDEWAYS)))
     ]
     if NECK in joints:
         middle = where[:, :, [NECK, HEAD]]
-        # Sideways counts by how far, not by which side.
-        found.append(_of_joints(torch.cat([middle[..., :1].abs(), middle[..., 1:]], dim=-1)).flatten(1))
-        found += _upper(where, limbs)
+        # Sideways distance only, for invariance to mirroring.
+        features.append(_of_joints(torch.cat([middle[..., :1].abs(), middle[..., 1:]], dim=-1)).flatten(1))
+        features += _upper(where, limbs)
     if RK in joints:
-        found += _lower(where, limbs)
+        features += _lower(where, limbs)
     if NECK in joints and RK in joints:
-        found += _arms_and_legs(where)
-    return torch.cat(found, dim=1)
+        features += _arms_and_legs(where)
+    return torch.cat(features, dim=1)
 
 
 def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """How round joints' ways are, the same for the mirror image: ``(sample, feature)``.
+    """Roundness of joint paths, invariant to mirroring: ``(sample, feature)``.
 
-    A way there and back on one line has one extent and encloses no area; a circle has two alike.
+    A path to and fro on a line has one extent and no area; a circle has two equal extents.
 
     Args:
         states: windows ``(sample, frame, 42)``.
-        joints: :data:`LOWER`, :data:`UPPER` or all; what of others is not looked at.
+        joints: :data:`LOWER`, :data:`UPPER` or all; others are ignored.
     """
     where = places(_in_sizes(states))
     right = [joint for joint in (RK, RA, RE, RW) if joint in joints]
-    found: list[Tensor] = []
+    features: list[Tensor] = []
     for side in (right, [skeleton.MIRROR[joint] for joint in right]):
         way = (where[:, :, side] - where[:, :, side].mean(dim=1, keepdim=True)).transpose(1, 2)
         extents = torch.linalg.eigvalsh(way.transpose(2, 3) @ way / way.shape[2]).flip(-1).clamp_min(0).sqrt()
@@ -248,14 +246,14 @@ def turns(states: Tensor, joints: Sequence[int]) -> Tensor:
         area = torch.linalg.vector_norm(torch.linalg.cross(way[:, :, :-1], steps).sum(dim=2), dim=-1, keepdim=True) / 2
         length = torch.linalg.vector_norm(steps, dim=-1).sum(dim=2)[..., None]
         first = extents[..., :1] + 0.02
-        found.append(torch.cat([_log(extents, 0.01), extents[..., 1:] / first, area / first**2, length / first], dim=-1))
-    return torch.cat([values.flatten(1) for values in _sides(*found)], dim=1)
+        features.append(torch.cat([_log(extents, 0.01), extents[..., 1:] / first, area / first**2, length / first], dim=-1))
+    return torch.cat([values.flatten(1) for values in _sides(*features)], dim=1)
 
 
 def _extremes(values: Tensor) -> Tensor:
-    """Of both sides' courses ``(sample, frame, 2)``: ``(sample, 8)``.
+    """Extremes ``(sample, 8)`` of both sides' time series ``(sample, frame, 2)``.
 
-    Highest, lowest and mean of the side where it is most and where it is least, and the extremes that both reach at a time.
+    Highest, lowest and mean of the larger and of the smaller side, and the extremes that both reach at once.
     """
     courses = torch.stack([values.amax(dim=1), values.amin(dim=1), values.mean(dim=1)], dim=1)
     at_once = torch.stack([values.amin(dim=-1).amax(dim=1), values.amax(dim=-1).amin(dim=1)], dim=1)
@@ -263,22 +261,22 @@ def _extremes(values: Tensor) -> Tensor:
 
 
 def _paces(speed: Tensor) -> Tensor:
-    """Of both sides' speeds ``(sample, frame, 2)``: ``(sample, 5)``."""
+    """Speed features ``(sample, 5)`` of both sides' speeds ``(sample, frame, 2)``."""
     top, mean, rest = (_log(values, 0.05) for values in (speed.amax(dim=1), speed.mean(dim=1), speed.amin(dim=1)))
     return torch.stack([top.amax(dim=-1), top.amin(dim=-1), mean.amax(dim=-1), mean.amin(dim=-1), rest.mean(dim=-1)], dim=1)
 
 
 def _both(where: Tensor, right: int, axis: int) -> Tensor:
-    """A joint's places along an axis on both sides ``(sample, frame, 2)``, sideways away from the body."""
+    """Coordinate of a joint on both sides ``(sample, frame, 2)``, sideways away from the body."""
     sign = where.new_tensor((1.0, -1.0 if axis == 0 else 1.0))
     return where[:, :, [right, skeleton.MIRROR[right]], axis] * sign
 
 
 def _bent(limbs: Tensor, upper: int, lower: int) -> Tensor:
-    """How far a joint is bent on both sides, radians ``(sample, frame, 2)``."""
-    other = skeleton.MIRROR
+    """Flexion of a joint on both sides in radians ``(sample, frame, 2)``."""
+    mirror = skeleton.MIRROR
     return torch.stack(
-        [_angle(limbs[:, :, upper], limbs[:, :, lower]), _angle(limbs[:, :, other[upper]], limbs[:, :, other[lower]])], dim=-1
+        [_angle(limbs[:, :, upper], limbs[:, :, lower]), _angle(limbs[:, :, mirror[upper]], limbs[:, :, mirror[lower]])], dim=-1
     )
 
 
@@ -287,34 +285,34 @@ def _pair_together(values: Tensor) -> Tensor:
 
 
 def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
-    """Fewer features of the whole window for a second linear classifier, the same for its mirror image: ``(sample, feature)``.
+    """Fewer window features for a second linear classifier, invariant to mirroring: ``(sample, feature)``.
 
-    How high, how far, how bent, how fast joints get, on the side that does more and on the one that does less.
+    Extremes of height, distance, flexion and speed, on the more and on the less active side.
 
     Args:
         states: windows ``(sample, frame, 42)``.
-        joints: :data:`LOWER`, :data:`UPPER` or all; what of others is not looked at.
+        joints: :data:`LOWER`, :data:`UPPER` or all; others are ignored.
     """
     limbs = _in_sizes(states)
     where = places(limbs)
     velocity = torch.diff(where, dim=1) * FPS
     speed = torch.linalg.vector_norm(velocity, dim=-1).unfold(1, 3, 1).mean(dim=-1)
     down = where.new_tensor((0.0, 0.0, -1.0))
-    found: list[Tensor] = []
+    features: list[Tensor] = []
     if RK in joints:
         apart = where[:, :, RA, 0] - where[:, :, LA, 0]
-        found += [_extremes(_both(where, joint, axis)) for joint, axis in ((RA, 2), (RA, 1), (RA, 0), (RK, 2), (RK, 1))]
-        found += [_paces(speed[:, :, [RA, LA]]), _paces(speed[:, :, [RK, LK]])]
-        found += [_extremes(_bent(limbs, RK, RA)), _extremes(_angle(limbs[:, :, [RK, LK]], down))]
-        found += [_pair_together(_both(where, joint, axis)) for joint, axis in ((RA, 1), (RA, 2), (RK, 2))]
-        found += [_pair_together(speed[:, :, [RA, LA]]), torch.stack([apart.amax(1), apart.amin(1), apart.mean(1)], dim=1)]
+        features += [_extremes(_both(where, joint, axis)) for joint, axis in ((RA, 2), (RA, 1), (RA, 0), (RK, 2), (RK, 1))]
+        features += [_paces(speed[:, :, [RA, LA]]), _paces(speed[:, :, [RK, LK]])]
+        features += [_extremes(_bent(limbs, RK, RA)), _extremes(_angle(limbs[:, :, [RK, LK]], down))]
+        features += [_pair_together(_both(where, joint, axis)) for joint, axis in ((RA, 1), (RA, 2), (RK, 2))]
+        features += [_pair_together(speed[:, :, [RA, LA]]), torch.stack([apart.amax(1), apart.amin(1), apart.mean(1)], dim=1)]
     if NECK in joints:
         neck, shoulders = where[:, :, NECK], where[:, :, RS] - where[:, :, LS]
         turn = torch.atan2(shoulders[..., 1], shoulders[..., 0])
         hands = torch.linalg.vector_norm(where[:, :, RW] - where[:, :, LW], dim=-1)
-        found += [_extremes(_both(where, joint, axis)) for joint, axis in ((RW, 2), (RW, 1), (RW, 0), (RE, 2))]
-        found += [_paces(speed[:, :, [RW, LW]]), _paces(speed[:, :, [RE, LE]]), _extremes(_bent(limbs, RE, RW))]
-        found += [
+        features += [_extremes(_both(where, joint, axis)) for joint, axis in ((RW, 2), (RW, 1), (RW, 0), (RE, 2))]
+        features += [_paces(speed[:, :, [RW, LW]]), _paces(speed[:, :, [RE, LE]]), _extremes(_bent(limbs, RE, RW))]
+        features += [
             _log(velocity[:, :, [RW, LW]].abs().mean(dim=(1, 2)), 0.02),
             neck.amax(dim=1)[:, 1:],
             neck.amin(dim=1)[:, 1:],
@@ -329,7 +327,7 @@ def extremes(states: Tensor, joints: Sequence[int]) -> Tensor:
         ]
     if NECK in joints and RK in joints:
         legs, arms = (_log(speed[:, :, pair].mean(dim=1), 0.05).mean(dim=1, keepdim=True) for pair in ([RA, LA], [RW, LW]))
-        found += [legs - arms, _together(where[:, :, [RW, LW], 2].mean(dim=-1), apart.abs())]
-        for one, other in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA))):
-            found.append(_ways_together(where, one, other, 1))
-    return torch.cat(found, dim=1)
+        features += [legs - arms, _together(where[:, :, [RW, LW], 2].mean(dim=-1), apart.abs())]
+        for right, left in (((RW, RA), (LW, LA)), ((RW, LA), (LW, RA))):
+            features.append(_ways_together(where, right, left, 1))
+    return torch.cat(features, dim=1)

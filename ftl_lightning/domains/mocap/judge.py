@@ -1,11 +1,10 @@
-"""The judge: which action a window of motion shows, learned from recordings of people.
+"""Judge: classifier of the action in a window of motion, trained on recordings of people.
 
-Three kinds of recognisers vote: small convolutional networks over time, and two linear ones on numbers of the whole window. There
-is such a jury for the whole body, one for arms and trunk, and one for the legs, so that actions at the same time are judged apart.
-A jury picks the likeliest action, also where half of it is missing. Therefore the one for the whole body has verifiers: they have
-learned to tell an action from motion made to look like it, such as its arms on the legs of somebody who walks, or a third of its
-size. Where they do not confirm an action, it is not said. None has seen generated motion, or people who demonstrate new concepts.
-``benchmarks/mocap_judge.py`` trains it.
+An ensemble averages three kinds of classifiers: small convolutional networks over time, and two linear classifiers on window
+features. There are ensembles for the whole body, for arms and trunk, and for the legs, so that simultaneous actions are judged
+separately. An ensemble picks the likeliest action, even if half of it is missing. Verifiers of the whole body therefore reject hard
+negatives, such as an action's arms on the legs of a walk, or an action at a third of its size. Training excludes generated motion
+and demonstrators of new concepts. ``benchmarks/experiments/mocap_judge.py`` trains the judge.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,46 +24,46 @@ from ftl_lightning.tensor_file import file_hash, load_tensors, save_tensors
 
 KIND = "motion judge"
 PATH = Path("pretrained/mocap/judge.safetensors")
-"""The judge that ships."""
+"""File of the shipped judge."""
 WHOLE, ARMS, LEGS = "whole", "arms", "legs"
 PARTS: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
     WHOLE: ((*LOWER, *UPPER), CLASSES),
     ARMS: (UPPER, CLASSES),
     LEGS: (LOWER, LEG_CLASSES),
 }
-"""Joints that each part of the judge sees, and the classes it tells apart; the trunk belongs to the arms."""
+"""Joints and classes of each part of the judge; the trunk belongs to the arms."""
 NUMBERS = {"summary": summary, "extremes": extremes}
-"""What linear recognisers see, by name."""
+"""Features of linear classifiers by name."""
 VERIFIED_BY = {**NUMBERS, "turns": turns}
-"""What verifiers see, by name."""
+"""Features of verifiers by name."""
 VERIFIER = 32
 """Hidden units of a verifier."""
 WIDTH, EMBEDDING = 40, 32
-"""Channels of a network; numbers that its last layer decides by."""
+"""Channels and embedding size of a network."""
 STILL = 0.3
-"""Metres a second. Where every joint is slower over a sixth of a second, nobody does anything, however it may look."""
+"""Speed in metres per second. If every joint is slower over a sixth of a second, there is no action."""
 RESTING = ("pose", STAND, OTHER)
-"""Classes that are seen in windows without movement."""
+"""Classes of windows without movement."""
 CONFIRMED = -3.0
-"""Mean verifier logit from which an action is confirmed: a probability of .05 that it is whole. Far lower than one half, as people
-whom the judge has not seen do an action a little otherwise than those it has learned from. Hard negatives get less still."""
+"""Minimum mean verifier logit of a confirmed action: probability .05 of the whole action. It is far below one half, as new people
+perform actions a little differently from the training set. Hard negatives have lower logits."""
 VERIFIED = {"walk": CONFIRMED, "jump": CONFIRMED, "jumping jacks": CONFIRMED, "knee raise": CONFIRMED, "arm circle": 2.2}
-"""Actions that verifiers confirm or exclude, each with the least mean logit.
+"""Minimum mean logits of the verified actions.
 
-More is asked of circles: they were recorded in all sizes, and a third of a large one is hardly smaller than a small one. Of actions
-that are not listed, verifiers refuse too many people whom they have not seen.
+Circles need more: they were recorded in all sizes, and a third of a large circle is hardly smaller than a small circle. For
+unlisted actions, verifiers reject too many new people.
 """
 _SIXTH = FPS // 6
 _OUTLIER = 5.0
-"""Standard deviations beyond which a feature says no more."""
+"""Standard deviations at which features are clipped."""
 
 
 class Network(nn.Module):
-    """A convolutional network over time.
+    """Convolutional network over time.
 
     Args:
-        channels: courses that it sees, see :func:`~ftl_lightning.domains.mocap.features.signals`.
-        classes: that it tells apart.
+        channels: number of time series, see :func:`~ftl_lightning.domains.mocap.features.signals`.
+        classes: number of classes.
     """
 
     def __init__(self, channels: int, classes: int) -> None:
@@ -79,7 +78,7 @@ class Network(nn.Module):
         self.head = nn.Linear(EMBEDDING, classes)
 
     def embedding(self, courses: Tensor) -> Tensor:
-        """``(sample, channels, frame)`` to ``(sample, EMBEDDING)``, at least zero."""
+        """Map ``(sample, channels, frame)`` to ``(sample, EMBEDDING)``, nonnegative."""
         inside = self.layers(courses)
         return self.embed(torch.cat([inside.mean(dim=-1), inside.amax(dim=-1)], dim=1))
 
@@ -89,11 +88,11 @@ class Network(nn.Module):
 
 
 class Verifier(nn.Sequential):
-    """A perceptron on numbers of the whole window: logits ``(sample, class)`` that it shows the whole of an action.
+    """Perceptron on window features: logits ``(sample, class)`` that the window shows a whole action.
 
     Args:
-        numbers: that it sees.
-        classes: that it verifies.
+        numbers: number of features.
+        classes: number of classes.
     """
 
     def __init__(self, numbers: int, classes: int) -> None:
@@ -101,13 +100,13 @@ class Verifier(nn.Sequential):
 
 
 class Recogniser(nn.Module):
-    """Networks and linear recognisers of the same joints and classes.
+    """Ensemble of networks and linear classifiers with the same joints and classes.
 
     Args:
-        joints: that it sees.
-        classes: that it tells apart.
+        joints: visible joints.
+        classes: class names.
         members: number of networks.
-        verifiers: number of perceptrons that say of each class whether a window shows all of it; without any, all is confirmed.
+        verifiers: number of perceptrons that confirm whole actions; with 0, all are confirmed.
     """
 
     def __init__(self, joints: Sequence[int], classes: Sequence[str], members: int = 2, verifiers: int = 0) -> None:
@@ -125,7 +124,7 @@ class Recogniser(nn.Module):
             self.register_buffer(f"{name}_std", torch.ones(size))
 
     def set_scale(self, name: str, values: Tensor, floor: float) -> None:
-        """Take mean and standard deviation from values ``(sample, size)`` or ``(sample, size, frame)``."""
+        """Set mean and standard deviation from values ``(sample, size)`` or ``(sample, size, frame)``."""
         flat = values.transpose(1, -1).flatten(0, -2)
         getattr(self, f"{name}_mean").copy_(flat.mean(dim=0))
         getattr(self, f"{name}_std").copy_(flat.std(dim=0).clamp_min(floor))
@@ -136,29 +135,29 @@ class Recogniser(nn.Module):
         return ((values - mean.view(shape)) / std.view(shape)).clamp(-_OUTLIER, _OUTLIER)
 
     def courses(self, states: Tensor) -> Tensor:
-        """What networks see of windows ``(sample, 32, 42)``."""
+        """Network inputs of windows ``(sample, 32, 42)``."""
         return self._scaled("signals", signals(states, self.joints))
 
     def numbers(self, name: str, states: Tensor) -> Tensor:
-        """What of :data:`VERIFIED_BY` is seen of them."""
+        """Scaled features of :data:`VERIFIED_BY`."""
         return self._scaled(name, VERIFIED_BY[name](states, self.joints))
 
     def features(self, states: Tensor) -> Tensor:
-        """What the first network decides by: ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
+        """Embedding of the first network ``(sample, EMBEDDING)``, with about unit variance over the training windows."""
         network = cast(Network, self.networks[0])
         return self._scaled("embedding", network.embedding(self.courses(states)))
 
     def votes(self, states: Tensor) -> dict[str, Tensor]:
-        """Log probabilities ``(sample, class)`` by the networks, and by each linear recogniser."""
+        """Log probabilities ``(sample, class)`` of the networks, and of each linear classifier."""
         courses = self.courses(states)
         networks = torch.stack([network(courses).log_softmax(dim=-1) for network in self.networks]).mean(dim=0)
         linear = {name: layer(self.numbers(name, states)).log_softmax(dim=-1) for name, layer in self.linear.items()}
         return {"networks": networks, **linear}
 
     def forward(self, states: Tensor) -> Tensor:
-        """The mean of all votes: scores ``(sample, class)``.
+        """Mean log probabilities ``(sample, class)``.
 
-        Of actions, minus infinity where no joint that it sees moves, or where verifiers do not confirm that it is the whole action.
+        Minus infinity for actions if no visible joint moves, or if verifiers reject the whole action.
         """
         scores = torch.stack(list(self.votes(states).values())).mean(dim=0)
         actions_only = torch.tensor([name not in RESTING for name in self.classes])
@@ -169,36 +168,36 @@ class Recogniser(nn.Module):
         return scores.masked_fill(excluded & actions_only, -torch.inf)
 
     def verified(self, states: Tensor) -> Tensor:
-        """Of each class, mean logit ``(sample, class)`` that a window which looks like it shows the whole of it.
+        """Mean logits ``(sample, class)`` that a window shows the whole action of a class.
 
-        It means something for those of :data:`VERIFIED`.
+        They are meaningful for the classes of :data:`VERIFIED`.
         """
         numbers = self.all_numbers(states)
         return torch.stack([verifier(numbers) for verifier in self.verifiers]).mean(dim=0)
 
     def all_numbers(self, states: Tensor) -> Tensor:
-        """What verifiers see of windows ``(sample, 32, 42)``: ``(sample, number)``."""
+        """Verifier inputs ``(sample, number)`` of windows ``(sample, 32, 42)``."""
         return torch.cat([self.numbers(name, states) for name in VERIFIED_BY], dim=1)
 
     def _still(self, states: Tensor) -> Tensor:
-        """Whether no joint gets anywhere within a sixth of a second: ``(sample,)``. Trembling joints do not."""
+        """Whether no joint moves far within a sixth of a second: ``(sample,)``. Trembling joints are still."""
         positions = as_joints(states)[:, :, list(self.joints)]
         way = torch.linalg.vector_norm(positions[:, _SIXTH:] - positions[:, :-_SIXTH], dim=-1)
         return way.amax(dim=(1, 2)) * (FPS / _SIXTH) < STILL
 
     def says(self, states: Tensor, name: str) -> Tensor:
-        """Whether each window ``(sample, 32, 42)`` shows a class: ``(sample,)`` of bool; ``False`` where one is not finite."""
+        """Whether windows ``(sample, 32, 42)`` show a class: ``(sample,)`` of bool; ``False`` for nonfinite windows."""
         finite = states.flatten(1).isfinite().all(dim=1)
         return finite & (self(states.nan_to_num(0.0, 0.0, 0.0)).argmax(dim=-1) == self.classes.index(name))
 
 
 class Judge(nn.Module):
-    """Recognisers by the part of the body that they see.
+    """Ensembles by part of the body.
 
-    Called like a module, it gives the whole body's features, as metrics of torchmetrics ask for it.
+    ``forward`` returns features of the whole body, the interface of torchmetrics.
 
     Args:
-        members: networks of each, and verifiers of the one that sees the whole body.
+        members: networks per ensemble, and verifiers of the whole body.
     """
 
     def __init__(self, members: int = 2) -> None:
@@ -214,11 +213,11 @@ class Judge(nn.Module):
         self.eval()
 
     def train(self, mode: bool = True) -> Self:
-        """Stay as it is: torchmetrics and Lightning switch modules that they hold; parts are trained one by one."""
+        """Stay in evaluation mode: torchmetrics and Lightning switch their submodules; parts are trained separately."""
         return super().train(False)
 
     def part(self, name: str) -> Recogniser:
-        """That of :data:`PARTS`."""
+        """Ensemble of a key of :data:`PARTS`."""
         return cast(Recogniser, self.parts[name])
 
     @torch.no_grad()
@@ -228,27 +227,27 @@ class Judge(nn.Module):
 
     @torch.no_grad()
     def recognised(self, goal: str, states: Tensor) -> Tensor:
-        """Whether windows ``(sample, 32, 42)`` show what a goal asks for: ``(sample,)`` of bool.
+        """Whether windows ``(sample, 32, 42)`` show a goal: ``(sample,)`` of bool.
 
-        Of two actions joined, arms and trunk show the first and the legs the second, each judged without the other's joints.
+        For two joined actions, arms and trunk show the first and the legs the second, judged independently.
 
         Raises:
-            UserError: for a goal that behaviour cannot be judged by.
+            UserError: for a goal without an action.
         """
-        asked = actions(goal)
-        if not asked:
+        names = actions(goal)
+        if not names:
             raise UserError(f"goal: expected an action that the judge of motion knows, such as 'walk', found {goal!r}")
-        if len(asked) == 1:
-            return self.part(WHOLE).says(states, asked[0])
-        return self.part(ARMS).says(states, asked[0]) & self.part(LEGS).says(states, of_legs(asked[1]))
+        if len(names) == 1:
+            return self.part(WHOLE).says(states, names[0])
+        return self.part(ARMS).says(states, names[0]) & self.part(LEGS).says(states, of_legs(names[1]))
 
     def save(self, path: str | Path, training: Mapping[str, Any]) -> None:
-        """Write it with how it was trained, whole or not at all."""
+        """Write weights and training settings atomically."""
         save_tensors(path, KIND, self.state_dict(), {"classes": CLASSES, "members": self.members, "training": training})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read one.
+        """Read a judge.
 
         Raises:
             UserError: for a file that is missing, damaged or of another form.
@@ -256,7 +255,7 @@ class Judge(nn.Module):
         if not Path(path).is_file():
             raise UserError(
                 f"{path}: expected the judge of motion, found nothing; "
-                "take it from the project's repository, or make it with benchmarks/mocap_judge.py"
+                "take it from the project's repository, or make it with benchmarks/experiments/mocap_judge.py"
             )
         tensors, header = load_tensors(path, KIND)
         if header.get("classes") != list(CLASSES):
@@ -274,11 +273,11 @@ class Judge(nn.Module):
 
 @cache
 def shipped_judge() -> Judge:
-    """The one that ships, read once."""
+    """The shipped judge, read once."""
     return Judge.load(shipped(PATH))
 
 
 def identity() -> str:
-    """Hash of the shipped judge's file; empty where there is none."""
+    """Hash of the shipped judge's file; empty if it is missing."""
     path = shipped(PATH)
     return file_hash(path) if path.is_file() else ""

@@ -1,7 +1,7 @@
-"""Rules that say what the body does: how high, how far, how often, in time with what. Trembling shows nothing.
+"""Kinematic rules of actions: height, distance, number and synchrony of movements. Trembling motion fails.
 
-They look at joints alone, know nothing of recordings, and are calibrated on them (docs/experiments-mocap.md): a second opinion
-beside the judge that has learned what actions look like.
+Rules use joints only, without training, calibrated on recordings (docs/experiments-mocap.md): a second opinion beside the trained
+judge.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,29 +24,29 @@ from ftl_lightning.domains.mocap.skeleton import (
 )
 
 STRIDE = 0.3
-"""Metres between the ankles from which a pose is a stride; below it, a person stands level."""
+"""Minimum ankle distance in metres of a stride; closer ankles are a level pose."""
 SETTLED = 12
-"""Frames after which a plan no longer comes from where it started; what goes together, and what arms draw, is judged from here."""
+"""First frame that is independent of the initial pose; synchrony and arm paths are judged from here."""
 OVERHEAD = -0.12
-"""Metres above the top of the head that both wrists reach at once in jumping jacks; with bent arms they stay a little below."""
+"""Jumping jacks: minimum height in metres of both wrists at once above the top of the head; bent arms stay a little below it."""
 OPENED, OPEN = 0.2, 0.4
-"""Metres sideways by which the feet open and close in jumping jacks, and how far they are apart at most, at least."""
+"""Jumping jacks: minimum range and minimum peak of the sideways distance of the feet, in metres."""
 HANGING = 0.15
-"""Metres that the hands are below the shoulders at one time in jumping jacks."""
+"""Jumping jacks: minimum depth in metres of the hands below the shoulders at some time."""
 IN_TIME = 0.6
-"""Correlation of hands' height and feet's opening from which they go together, or one against the other."""
+"""Minimum absolute correlation of hand height and foot distance that counts as synchronous, in phase or in antiphase."""
 TURN = 240.0
-"""Degrees that the arms turn at least in an arm circle, as a mean; each, two thirds of it."""
+"""Minimum rotation of the arms in degrees in an arm circle, as a mean; two thirds for each arm."""
 WIDTH, ROUND = 0.12, 0.2
-"""Metres that the wrists' path is wide at least, and its width compared to its length: it is no line."""
+"""Minimum width of the wrists' path, in metres and relative to its length, of a round path."""
 RAISED, LOWERED = 0.15, 0.3
-"""Metres below the hips: a raised knee is higher than the first, and lower than the second at another time, as the other one is."""
+"""Knee raise, in metres below the hips: maximum of a raised knee; minimum of this knee at another time, and of the other knee."""
 BENT, STRETCHED = 70.0, 30.0
-"""Degrees: in a squat both knees are bent by more than the first at once, and at another time by less, by the second at least."""
+"""Squat, in degrees: minimum flexion of both knees at once, and minimum range of this flexion."""
 TREMBLING = 900.0
-"""Jerk in metres a second cubed that no action has: that of 99 windows of 100 of recordings is less."""
+"""Maximum jerk of an action in metres per second cubed: the 99th percentile of recorded windows."""
 UPRIGHT, ON_FEET = 0.35, 0.5
-"""Metres from the hips up to the neck, and down to each ankle, at least, of somebody who stands or hops."""
+"""Minimum distances in metres from the hips up to the neck, and down to each ankle, of an upright pose."""
 
 
 def strides(poses: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ def _hands(states: Tensor) -> Tensor:
 
 
 def _feet(states: Tensor) -> Tensor:
-    """How far the ankles are apart sideways ``(sample, frame)`` in metres; negative where they are crossed."""
+    """Sideways distance of the ankles ``(sample, frame)`` in metres; negative for crossed feet."""
     joints = as_joints(states)
     return joints[..., R_ANKLE, 0] - joints[..., L_ANKLE, 0]
 
@@ -71,36 +71,36 @@ def _range(values: Tensor) -> Tensor:
 
 
 def upright(states: Tensor) -> Tensor:
-    """Whether somebody stands or hops upright on both feet all the time: ``(sample,)`` of bool."""
+    """Whether all poses stand or hop upright on both feet: ``(sample,)`` of bool."""
     height = as_joints(states)[..., 2]
     return (height[..., NECK] > UPRIGHT).all(dim=1) & (height[..., list(ANKLES)] < -ON_FEET).all(dim=-1).all(dim=1)
 
 
 def jerk(states: Tensor) -> Tensor:
-    """How much motion trembles: ``(sample,)``, mean size of the joints' third derivative, metres a second cubed."""
+    """Mean jerk ``(sample,)``: size of the joints' third derivative in metres per second cubed."""
     third = torch.diff(as_joints(states), n=3, dim=1) * FPS**3
     return torch.linalg.vector_norm(third, dim=-1).mean(dim=(1, 2))
 
 
 def calm(states: Tensor) -> Tensor:
-    """Whether motion trembles no more than people's: ``(sample,)`` of bool. Joints that jump about pass through anything."""
+    """Whether jerk is below that of recordings: ``(sample,)`` of bool. Jumping joints would pass through any pose."""
     return jerk(states) < TREMBLING
 
 
 def hands_amplitude(states: Tensor) -> Tensor:
-    """How far the hands go up and down: metres ``(sample,)``, of windows ``(sample, frame, 42)``."""
+    """Vertical range of the hands in metres ``(sample,)``, of windows ``(sample, frame, 42)``."""
     return _range(_hands(states))
 
 
 def feet_amplitude(states: Tensor) -> Tensor:
-    """How far the feet open and close sideways: metres ``(sample,)``."""
+    """Range of the sideways distance of the feet in metres ``(sample,)``."""
     return _range(_feet(states))
 
 
 def feet_in_time(states: Tensor) -> Tensor:
     """Whether feet open and close in time with the hands: ``(sample,)`` of bool.
 
-    People open their feet while the hands rise; some, while they sink. TaskResult from :data:`SETTLED` on.
+    Most people open their feet as the hands rise; some, as they sink. Judged from :data:`SETTLED` on.
     """
     settled = states[:, SETTLED:]
     hands, feet = (values - values.mean(dim=1, keepdim=True) for values in (_hands(settled), _feet(settled)))
@@ -125,9 +125,9 @@ def jumping_jacks(states: Tensor) -> Tensor:
 
 
 def _paths(states: Tensor) -> Tensor:
-    """Both wrists' paths seen from the side, from their shoulders and about their own middle: ``(sample, frame, 2, 2)``.
+    """Paths of both wrists from the side, relative to the shoulders, centred: ``(sample, frame, 2, 2)``.
 
-    The middle is that of the frames from :data:`SETTLED` on.
+    The centre is that of the frames from :data:`SETTLED` on.
     """
     joints = as_joints(states)
     paths = (joints[..., list(WRISTS), :] - joints[..., list(SHOULDERS), :])[..., 1:]
@@ -136,12 +136,12 @@ def _paths(states: Tensor) -> Tensor:
 
 
 def degrees_turned(states: Tensor) -> Tensor:
-    """How far the arms turn about the middle of the wrists' paths, seen from the side: degrees ``(sample,)``, mean of both arms."""
+    """Rotation of the arms about the centre of the wrists' paths, from the side: degrees ``(sample,)``, mean of both arms."""
     return _turned(states).mean(dim=-1)
 
 
 def _turned(states: Tensor) -> Tensor:
-    """Of each arm ``(sample, side)``; to and fro cancel."""
+    """Rotation of each arm in degrees ``(sample, side)``; opposite rotations cancel."""
     paths = _paths(states)
     angles = torch.atan2(paths[..., 1], paths[..., 0])
     steps = torch.remainder(torch.diff(angles, dim=1) + torch.pi, 2 * torch.pi) - torch.pi
@@ -149,10 +149,10 @@ def _turned(states: Tensor) -> Tensor:
 
 
 def arm_circle(states: Tensor) -> Tensor:
-    """The arms of somebody upright turn by :data:`TURN` on paths that are round: ``(sample,)`` of bool."""
+    """Whether upright arms rotate by :data:`TURN` on round paths: ``(sample,)`` of bool."""
     size = torch.linalg.svdvals(_centred(_paths(states)[:, SETTLED:].transpose(1, 2)))  # (sample, side, 2)
     frames = states.shape[1] - SETTLED
-    width = 8**0.5 * size / frames**0.5  # of a circle, its diameter
+    width = 8**0.5 * size / frames**0.5  # diameter of a circle
     wide = (width[..., 1] >= WIDTH) & (size[..., 1] >= ROUND * size[..., 0])
     turned = _turned(states)
     return calm(states) & upright(states) & (wide & (turned >= TURN * 2 / 3)).all(dim=-1) & (turned.mean(dim=-1) >= TURN)
@@ -163,14 +163,14 @@ def _centred(values: Tensor) -> Tensor:
 
 
 def knee_raise(states: Tensor) -> Tensor:
-    """A knee is raised, and hangs at another time: ``(sample,)`` of bool."""
+    """Whether a knee is raised, and down at another time: ``(sample,)`` of bool."""
     below = as_joints(states)[..., list(HIPS), 2] - as_joints(states)[..., list(KNEES), 2]
     raised = (below < RAISED) & (below.flip(-1) > LOWERED)
     return (raised.any(dim=1) & (below.amax(dim=1) > LOWERED)).any(dim=-1) & calm(states)
 
 
 def squat(states: Tensor) -> Tensor:
-    """Both knees are bent at once, and stretched at another time: ``(sample,)`` of bool."""
+    """Whether both knees are bent at once, and stretched at another time: ``(sample,)`` of bool."""
     joints = as_joints(states)
     thigh = joints[..., list(KNEES), :] - joints[..., list(HIPS), :]
     shank = joints[..., list(ANKLES), :] - joints[..., list(KNEES), :]
@@ -185,4 +185,4 @@ RULES: Mapping[str, Callable[[Tensor], Tensor]] = {
     "knee raise": knee_raise,
     "squat": squat,
 }
-"""Whether windows ``(sample, frame, 42)`` show an action, by its goal: ``(sample,)`` of bool."""
+"""Rules of actions by goal, from windows ``(sample, frame, 42)`` to ``(sample,)`` of bool."""

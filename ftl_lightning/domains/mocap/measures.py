@@ -1,7 +1,7 @@
-"""Measures of generated motion: what it shows, how natural it is, how far a set of it is from recordings.
+"""Measures of generated motion: action, naturalness, and distance to recordings.
 
-The first ones are metrics of a domain: ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``. The others compare
-sets of windows by the features of the judge, which has seen neither generated motion nor the generator.
+Domain metrics map ``(goal, states (sample, 32, 42), initial states or None) -> (sample,)``. Other measures compare sets of windows
+by features of the judge, which was trained on neither generated motion nor the generator.
 """
 
 import itertools
@@ -22,23 +22,23 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.extras import expect_extra
 
 POSE = "pose"
-"""The observed feature that holds where a window starts."""
+"""Observed feature of the initial pose."""
 ENOUGH = 500
-"""Windows on each side from which distances of distributions say more about motion than about the number of windows."""
+"""Windows per side above which distances of distributions depend more on motion than on the number of windows."""
 JACKS, CIRCLES = ("jumping jacks",), ("arm circle",)
-"""Goals of which measures of the hands and feet, or of turning arms, say something."""
+"""Goals with measures of hands and feet, and of turning arms."""
 _RIGID = [BONES.index(bone) for bone in RIGID]
 
 
 def recognised(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether the judge that ships sees what was asked for: ``(sample,)`` of bool, see :meth:`Judge.recognised`."""
+    """Whether the shipped judge recognises the goal: ``(sample,)`` of bool, see :meth:`Judge.recognised`."""
     return shipped_judge().recognised(goal, states)
 
 
 def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """How much bones change their lengths: ``(sample,)``, the mean share by which rigid bones differ from those of the start.
+    """Mean relative difference of rigid bone lengths from those of the initial state: ``(sample,)``.
 
-    Without initial states, from those of the window's first frame. People have 0.
+    Without initial states, from those of the first frame. Recordings have 0.
     """
     first = states[:, 0] if starts is None else starts.observed[POSE]
     usual = bone_lengths(first)[:, None, _RIGID]
@@ -46,14 +46,14 @@ def bone_error(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
 
 
 def jerk(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """How much motion trembles: ``(sample,)``, see :func:`~ftl_lightning.domains.mocap.kinematics.jerk`."""
+    """Mean jerk: ``(sample,)``, see :func:`~ftl_lightning.domains.mocap.kinematics.jerk`."""
     return kinematics.jerk(states)
 
 
 def rise(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """Whether both wrists go from below their shoulders to above them within the window: ``(sample,)`` of bool.
+    """Whether both wrists rise from below their shoulders to above them: ``(sample,)`` of bool.
 
-    A window that starts with raised arms shows it only if they come down and rise again; no start shows it by itself.
+    From raised arms, they have to come down and rise again; no initial pose suffices by itself.
     """
     joints = as_joints(states)
     above = joints[..., list(WRISTS), 2] - joints[..., list(SHOULDERS), 2]
@@ -68,7 +68,7 @@ def _nothing(states: Tensor) -> Tensor:
 def rule(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """Whether the goal's rule of :mod:`~ftl_lightning.domains.mocap.kinematics` holds: ``(sample,)`` of 0 and 1.
 
-    Of goals without a rule it says nothing: NaN.
+    NaN for goals without a rule.
     """
     return kinematics.RULES[goal](states).float() if goal in kinematics.RULES else _nothing(states)
 
@@ -78,44 +78,43 @@ def _first(states: Tensor, starts: InitialStates | None) -> Tensor:
 
 
 def level(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """:func:`rule` where somebody starts level; NaN where in a stride."""
+    """:func:`rule` for level initial poses; NaN for strides."""
     return rule(goal, states, starts).masked_fill(kinematics.strides(_first(states, starts)), torch.nan)
 
 
 def strides(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
-    """:func:`rule` where somebody starts in a stride; NaN where level."""
+    """:func:`rule` for strides as initial poses; NaN for level poses."""
     return rule(goal, states, starts).masked_fill(~kinematics.strides(_first(states, starts)), torch.nan)
 
 
-def _told(goals: tuple[str, ...], measure: Callable[[Tensor], Tensor]) -> Callable[[str, Tensor, InitialStates | None], Tensor]:
-    """A measure that says something of some goals only."""
+def _limited(goals: tuple[str, ...], measure: Callable[[Tensor], Tensor]) -> Callable[[str, Tensor, InitialStates | None], Tensor]:
+    """Restrict a measure to goals; NaN for others."""
 
-    def told(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
+    def measured(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
         return measure(states).float() if goal in goals else _nothing(states)
 
-    return told
+    return measured
 
 
-feet_in_time = _told(JACKS, kinematics.feet_in_time)
-amplitude_of_hands = _told(JACKS, kinematics.hands_amplitude)
-amplitude_of_feet = _told(JACKS, kinematics.feet_amplitude)
-degrees_turned = _told(CIRCLES, kinematics.degrees_turned)
+feet_in_time = _limited(JACKS, kinematics.feet_in_time)
+amplitude_of_hands = _limited(JACKS, kinematics.hands_amplitude)
+amplitude_of_feet = _limited(JACKS, kinematics.feet_amplitude)
+degrees_turned = _limited(CIRCLES, kinematics.degrees_turned)
 
 
 def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = None) -> dict[str, float]:
     """Frechet and kernel distance of two sets of windows in the judge's features, at equal numbers.
 
-    The Frechet distance falls with the number of windows even between equal distributions: compare rows of one number alone, beside
-    a row of real against real motion. The kernel distance has no such bias.
+    The Frechet distance falls with the number of windows even for equal distributions: compare only rows of equal number, and add a
+    row of real against real motion. The kernel distance has no such bias.
 
     Args:
-        generated, real: windows ``(sample, 32, 42)``; of the larger set, as many as the smaller has are drawn.
-        seed: of what is drawn.
-        judge: whose features; the one that ships where it is ``None``.
+        generated, real: windows ``(sample, 32, 42)``; the larger set is subsampled to the size of the smaller.
+        seed: seed of the subsample.
+        judge: source of features; ``None`` for the shipped judge.
 
     Returns:
-        ``fid``, ``kid`` (times 1,000), and ``number``, of windows on each side; below :data:`ENOUGH` the Frechet distance means
-        little.
+        ``fid``, ``kid`` (times 1,000), and ``number`` of windows per side; below :data:`ENOUGH` the Frechet distance means little.
 
     Raises:
         UserError: for a side of fewer than two windows.
@@ -127,9 +126,9 @@ def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = 
     draw = torch.Generator().manual_seed(seed)
     sides = {True: real, False: generated}
     chosen = {is_real: windows[torch.randperm(len(windows), generator=draw)[:number]] for is_real, windows in sides.items()}
-    found = {}
+    values = {}
     with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
-        warnings.simplefilter("ignore")  # of memory that features need; they are few
+        warnings.simplefilter("ignore")  # about the memory of features, which are few
         torch.manual_seed(seed)
         frechet = FrechetInceptionDistance(feature=judge)
         kernel = KernelInceptionDistance(feature=judge, subsets=50, subset_size=min(number, ENOUGH))
@@ -137,19 +136,19 @@ def distances(generated: Tensor, real: Tensor, seed: int, judge: Judge | None = 
             for is_real, windows in chosen.items():
                 metric.update(windows, real=is_real)
             value = metric.compute()
-            found[name] = float(value[0] * 1000 if isinstance(value, tuple) else value)
-    return found | {"number": float(number)}
+            values[name] = float(value[0] * 1000 if isinstance(value, tuple) else value)
+    return values | {"number": float(number)}
 
 
 def _mean_distance(features: Tensor, pairs: int, draw: torch.Generator) -> Tensor:
     """Mean distance of random pairs of different rows."""
     first = torch.randint(len(features), (pairs,), generator=draw)
-    other = (first + torch.randint(1, len(features), (pairs,), generator=draw)) % len(features)
-    return torch.linalg.vector_norm(features[first] - features[other], dim=-1).mean()
+    second = (first + torch.randint(1, len(features), (pairs,), generator=draw)) % len(features)
+    return torch.linalg.vector_norm(features[first] - features[second], dim=-1).mean()
 
 
 def diversity(states: Tensor, seed: int, pairs: int = 200, judge: Judge | None = None) -> float:
-    """How different windows ``(sample, 32, 42)`` are: mean distance of random pairs in the judge's features.
+    """Mean distance of random pairs of windows ``(sample, 32, 42)`` in the judge's features.
 
     Raises:
         UserError: for fewer than two windows.
@@ -160,20 +159,20 @@ def diversity(states: Tensor, seed: int, pairs: int = 200, judge: Judge | None =
 
 
 def multimodality(states: Mapping[str, Tensor], seed: int, pairs: int = 20, judge: Judge | None = None) -> float:
-    """The same within each goal's windows, a mean over goals; goals of fewer than two windows are left out.
+    """Mean over goals of :func:`diversity` within a goal; goals of fewer than two windows are omitted.
 
     Raises:
-        UserError: where no goal has two.
+        UserError: if no goal has two windows.
     """
     draw, judge = torch.Generator().manual_seed(seed), judge or shipped_judge()
-    found = [_mean_distance(judge(windows), pairs, draw) for windows in states.values() if len(windows) > 1]
-    if not found:
+    means = [_mean_distance(judge(windows), pairs, draw) for windows in states.values() if len(windows) > 1]
+    if not means:
         raise UserError("multimodality of motion: expected two windows or more of some goal, found none")
-    return float(torch.stack(found).mean())
+    return float(torch.stack(means).mean())
 
 
 def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor]) -> float:
-    """Balanced accuracy on real windows of a linear classifier that has learned from generated ones: a second opinion.
+    """Balanced accuracy on real windows of a linear classifier trained on generated windows.
 
     Args:
         generated, real: windows ``(sample, 32, 42)`` by class, of the same classes.
@@ -196,10 +195,10 @@ def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor
         labels = itertools.chain.from_iterable([index] * len(windows[name]) for index, name in enumerate(names))
         return extremes(torch.cat([windows[name] for name in names]), joints), torch.tensor(list(labels))
 
-    (inputs, labels), (asked, right) = numbers(generated), numbers(real)
+    (inputs, labels), (tested, right) = numbers(generated), numbers(real)
     mean, std = inputs.mean(dim=0), inputs.std(dim=0).clamp_min(0.02)
-    found = LogisticRegression(C=0.01, max_iter=500).fit(((inputs - mean) / std).clamp(-5, 5).numpy(), labels.numpy())
-    said = torch.from_numpy(found.predict(((asked - mean) / std).clamp(-5, 5).numpy()))
+    classifier = LogisticRegression(C=0.01, max_iter=500).fit(((inputs - mean) / std).clamp(-5, 5).numpy(), labels.numpy())
+    said = torch.from_numpy(classifier.predict(((tested - mean) / std).clamp(-5, 5).numpy()))
     return float(torch.stack([(said[right == index] == index).float().mean() for index in range(len(names))]).mean())
 
 
@@ -216,4 +215,4 @@ MEASURES: Mapping[str, Callable[[str, Tensor, InitialStates | None], Tensor]] = 
     "amplitude of feet": amplitude_of_feet,
     "degrees turned": degrees_turned,
 }
-"""Metrics of plans by name; of bone error and jerk, less is better. ``rise`` to ``degrees turned`` are parts of what rules ask."""
+"""Metrics of plans by name; lower is better for bone error and jerk. ``rise`` to ``degrees turned`` are parts of the rules."""

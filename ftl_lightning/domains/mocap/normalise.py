@@ -1,4 +1,4 @@
-"""From where joints were to poses: root and yaw removed, 30 frames a second."""
+"""Normalisation of joint positions to poses: root and yaw removed, 30 frames per second."""
 
 from typing import NamedTuple
 
@@ -9,11 +9,11 @@ from ftl_lightning.domains.mocap.skeleton import FPS, L_HIP, R_HIP
 
 
 class Poses(NamedTuple):
-    """Poses and what was removed from them.
+    """Poses and removed root motion.
 
     Attributes:
         positions: ``(frame, 14, 3)`` in metres, z up, the middle of the hips at the origin, hips facing +y.
-        root: ``(frame, 4)``: where the middle of the hips was in metres, and its yaw in radians.
+        root: ``(frame, 4)``: middle of the hips in metres, and yaw in radians.
     """
 
     positions: NDArray[np.float64]
@@ -21,14 +21,14 @@ class Poses(NamedTuple):
 
 
 def z_up(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points ``(..., 3)`` with y up as such with z up."""
+    """Convert points ``(..., 3)`` from y up to z up."""
     return np.stack((joints[..., 0], -joints[..., 2], joints[..., 1]), axis=-1)
 
 
 def normalised(joints: NDArray[np.float64]) -> Poses:
-    """Root and yaw removed in every frame of joints ``(frame, 14, 3)``, z up: the way from the left hip to the right is +x.
+    """Remove root and yaw in every frame of joints ``(frame, 14, 3)``, z up: the direction from left to right hip is +x.
 
-    Where hips stand on end their yaw means little and may spin; pitch and roll stay.
+    The yaw of vertical hips means little and may spin; pitch and roll stay.
     """
     middle = (joints[:, R_HIP] + joints[:, L_HIP]) / 2
     across = joints[:, R_HIP] - joints[:, L_HIP]
@@ -40,5 +40,5 @@ def normalised(joints: NDArray[np.float64]) -> Poses:
 
 
 def every(raw_fps: int) -> int:
-    """How many frames of a recording make one at :data:`FPS`."""
+    """Subsampling factor of a recording to :data:`FPS`."""
     return max(1, round(raw_fps / FPS))

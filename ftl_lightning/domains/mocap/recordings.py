@@ -1,6 +1,6 @@
-"""The file of recordings that a domain folder holds, and where the actions in them are.
+"""File of recordings in a domain folder, and segments of actions.
 
-``recordings.npz`` is what ``prepare`` writes. A folder that holds ``cmu14_trials.npz``, of the same content, will do as well.
+``recordings.npz`` is the output of ``prepare``. ``cmu14_trials.npz``, with the same content, is accepted too.
 """
 
 import zipfile
@@ -24,7 +24,7 @@ from ftl_lightning.tensor_file import atomic
 
 FILE = "recordings.npz"
 FILES = (FILE, "cmu14_trials.npz")
-"""Names that a file of recordings may have, the first one found is read."""
+"""Names of a file of recordings; the first existing file is read."""
 WHERE = (
     "get the CMU motion capture database (mocap.cs.cmu.edu, the files of allasfamc.zip) and run: "
     "python -m ftl_lightning prepare mocap --root FOLDER"
@@ -32,21 +32,21 @@ WHERE = (
 THANKS = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."
 )
-"""What the database asks those who use it to say."""
+"""Acknowledgement requested by the database."""
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Trials, one after another.
+    """Concatenated trials.
 
     Attributes:
         positions: ``(frame, 14, 3)`` float32, metres, see :mod:`ftl_lightning.domains.mocap.skeleton`.
-        root: ``(frame, 4)`` float32: where the middle of the hips was (x, y, z in metres) and its yaw in radians.
-        offsets: ``(trial + 1,)`` int64: trial i is the frames ``offsets[i]:offsets[i + 1]``.
+        root: ``(frame, 4)`` float32: middle of the hips (x, y, z in metres) and yaw in radians.
+        offsets: ``(trial + 1,)`` int64: trial i has the frames ``offsets[i]:offsets[i + 1]``.
         trial_id: such as ``13_29``.
-        label: description of each, cleaned.
-        kind: how each was made, such as ``asf_amc``.
-        subject: who moves, such as ``13``.
+        label: description of each trial, cleaned.
+        kind: source format of each trial, such as ``asf_amc``.
+        subject: subject of each trial, such as ``13``.
     """
 
     positions: NDArray[np.float32]
@@ -61,11 +61,11 @@ class Recordings:
         return len(self.trial_id)
 
     def trial(self, number: int) -> NDArray[np.float32]:
-        """States ``(frame, 42)`` of one."""
+        """States ``(frame, 42)`` of a trial."""
         return self.positions[self.offsets[number] : self.offsets[number + 1]].reshape(-1, 3 * len(JOINTS))
 
     def save(self, path: Path) -> None:
-        """Write them, whole or not at all."""
+        """Write the recordings atomically."""
         with atomic(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -80,25 +80,25 @@ class Recordings:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read them.
+        """Read recordings.
 
         Raises:
-            UserError: naming file and key, where it is damaged or of another content.
+            UserError: with path and key, for a file that is damaged or of other content.
         """
         size = expect_readable(path, "recordings")
         try:
             expect_arrays(path, size)
             with np.load(path, allow_pickle=False) as archive:
-                found = {name: archive[name] for name in archive.files if name in _KEYS}
+                arrays = {name: archive[name] for name in archive.files if name in _KEYS}
         except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise UserError(f"{path}: expected recordings, found a damaged or foreign file ({error}); {WHERE}") from error
-        found.setdefault("subject", np.array([str(trial).split("_")[0] for trial in found.get("trial_id", ())]))
-        _check(path, found)
-        texts = {key: tuple(map(str, found[key])) for key in _TEXTS}
+        arrays.setdefault("subject", np.array([str(trial).split("_")[0] for trial in arrays.get("trial_id", ())]))
+        _check(path, arrays)
+        texts = {key: tuple(map(str, arrays[key])) for key in _TEXTS}
         return cls(
-            np.ascontiguousarray(found["positions"], dtype=np.float32),
-            np.ascontiguousarray(found["root"], dtype=np.float32),
-            found["offsets"].astype(np.int64),
+            np.ascontiguousarray(arrays["positions"], dtype=np.float32),
+            np.ascontiguousarray(arrays["root"], dtype=np.float32),
+            arrays["offsets"].astype(np.int64),
             **texts | {"label": tuple(map(cleaned, texts["label"]))},
         )
 
@@ -107,35 +107,35 @@ _TEXTS = ("trial_id", "label", "kind", "subject")
 _KEYS = ("positions", "root", "offsets", *_TEXTS)
 
 
-def _check(path: Path, found: Mapping[str, Any]) -> None:
-    if missing := [key for key in _KEYS if key not in found]:
+def _check(path: Path, arrays: Mapping[str, Any]) -> None:
+    if missing := [key for key in _KEYS if key not in arrays]:
         raise UserError(f"{path}: key {missing[0]!r}: expected it in a file of recordings, found none; {WHERE}")
-    trials = len(found["trial_id"])
-    frames = len(found["positions"])
+    trials = len(arrays["trial_id"])
+    frames = len(arrays["positions"])
     shapes = {"positions": (frames, len(JOINTS), 3), "root": (frames, 4), "offsets": (trials + 1,)}
     for key, expected in (shapes | dict.fromkeys(_TEXTS, (trials,))).items():
-        if found[key].shape != expected:
-            raise UserError(f"{path}: key {key!r}: expected shape {expected}, found {found[key].shape}")
-    offsets = found["offsets"]
+        if arrays[key].shape != expected:
+            raise UserError(f"{path}: key {key!r}: expected shape {expected}, found {arrays[key].shape}")
+    offsets = arrays["offsets"]
     if not trials or offsets[0] != 0 or offsets[-1] != frames or (np.diff(offsets) < 1).any():
         raise UserError(f"{path}: key 'offsets': expected ends of one trial or more, growing from 0 to {frames}, found others")
     for key in ("positions", "root"):
-        if found[key].dtype.kind != "f" or not np.isfinite(found[key]).all():
+        if arrays[key].dtype.kind != "f" or not np.isfinite(arrays[key]).all():
             raise UserError(f"{path}: key {key!r}: expected finite numbers, found others")
 
 
 @cache
 def read_folder(root: Path) -> tuple[Recordings, tuple[Segment, ...]]:
-    """Recordings of a folder, and the segments of single actions in them: the user's own ``segments.csv``, else the shipped ones.
+    """Recordings of a folder, and the segments of single actions: the folder's ``segments.csv``, else the shipped segments.
 
     Raises:
-        UserError: where there is no folder, no recordings in it, or damaged ones.
+        UserError: for a missing folder, missing recordings, or damaged recordings.
     """
     if not root.is_dir():
-        found = f"{'a file' if root.exists() else 'nothing'} at {short(str(root))}"
-        raise UserError(f"data.root: expected a folder of recordings, found {found}; {WHERE}")
+        present = f"{'a file' if root.exists() else 'nothing'} at {short(str(root))}"
+        raise UserError(f"data.root: expected a folder of recordings, found {present}; {WHERE}")
     path = next((root / name for name in FILES if (root / name).is_file()), None)
     if path is None:
         raise UserError(f"{root}: expected {FILE}, found {'other files' if any(root.iterdir()) else 'an empty folder'}; {WHERE}")
-    own = root / SEGMENTS
-    return Recordings.load(path), read_segments(own) if own.is_file() else shipped_segments()
+    segments = root / SEGMENTS
+    return Recordings.load(path), read_segments(segments) if segments.is_file() else shipped_segments()

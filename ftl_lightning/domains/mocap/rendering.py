@@ -1,4 +1,4 @@
-"""Stick figures: strips of poses and films, limbs coloured by side, on a floor, all at the same scale."""
+"""Stick figures: strips of poses and films, limbs coloured by side, on a floor, at equal scale."""
 
 from collections.abc import Sequence
 
@@ -16,11 +16,11 @@ from ftl_lightning.domains.wireframe import Points, Wireframe, drawn, seen
 from ftl_lightning.escape import figure_text
 
 LEFT, RIGHT, TRUNK = "#0a6fb5", "#d9591c", "#3b3f45"
-"""Colours of the person's own left and right limbs and of what is between; told apart by the colour-blind too."""
+"""Colours of the person's left and right limbs and of the trunk; safe for colour blindness."""
 MAX_SAMPLES, POSES = 8, 8
-"""Rows of a picture, and poses in a row."""
+"""Maximum rows of a figure, and poses per row."""
 STEP = 1.4
-"""Metres from one pose to the next; arms may reach into the neighbour's place."""
+"""Distance in metres between poses; arms may reach into the next pose."""
 SOLE = 0.08
 """Metres from an ankle down to the floor."""
 HEAD = 0.11
@@ -34,14 +34,14 @@ def _colour(a: int, b: int) -> str:
 
 
 COLOURS = tuple(_colour(a, b) for a, b in BONES)
-"""Of each bone."""
+"""Colours of the bones."""
 
 
 def wireframe(states: Tensor) -> Wireframe:
-    """A motion that can be drawn, standing on a floor.
+    """Wireframe of a motion on a floor.
 
-    States have the middle of the hips at the origin, so that nothing tells where the floor was. In every frame it is put below the
-    lowest joint: whoever squats comes down, and whoever jumps is seen to stretch, without leaving the floor.
+    States have the middle of the hips at the origin, so that the floor is unknown. In every frame it is below the lowest joint:
+    squats come down, and jumps only stretch, without leaving the floor.
 
     Args:
         states: ``(frame, 42)`` in metres.
@@ -54,23 +54,23 @@ def wireframe(states: Tensor) -> Wireframe:
 
 
 def film(states: Tensor) -> list[NDArray[np.uint8]]:
-    """Frames ``(240, 240, 3)`` of one motion ``(frame, 42)`` in metres."""
+    """Frames ``(240, 240, 3)`` of a motion ``(frame, 42)`` in metres."""
     return drawn(wireframe(states))
 
 
 def picture(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """Strips of poses over time, the first at the left, one strip a sample.
+    """Strips of poses over time from left to right, a strip per sample.
 
     Args:
         states: ``(sample, frame, 42)`` in metres; at most :data:`MAX_SAMPLES` samples are shown.
-        right: whether the task holds, one entry a sample (green and red frames); ``None`` for grey frames.
-        title: above the strips.
-        starts: the first poses, which are not drawn apart: the plans begin with them.
+        right: success per sample (green and red frames); ``None`` for grey frames.
+        title: title of the figure.
+        starts: initial poses, not drawn separately: plans start with them.
     """
     shown = states[:MAX_SAMPLES]
     figure = Figure(figsize=(8.2, 1.65 * len(shown) + 0.5), layout="constrained")
-    told = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
-    figure.suptitle(figure_text(told), fontsize=9)
+    heading = title if len(shown) == len(states) else f"{title} ({len(shown)} of {len(states)} shown)"
+    figure.suptitle(figure_text(heading), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     for axes, plan, frame in zip(figure.subplots(len(shown), 1, squeeze=False).flat, shown, frames, strict=False):
         _strip(axes, wireframe(plan), frame)
@@ -94,7 +94,7 @@ def _strip(axes: Axes, motion: Wireframe, frame: str) -> None:
 
 def _pose(axes: Axes, points: Points, motion: Wireframe, across: float) -> None:
     depth = [float(points[a, 2] + points[b, 2]) for a, b in motion.lines]
-    order = np.argsort(depth).tolist()  # what is nearer hides what is behind it
+    order = np.argsort(depth).tolist()  # nearer lines last
     at = points[:, :2] + (across, 0)
     lines = LineCollection(
         [at[list(motion.lines[index])] for index in order],

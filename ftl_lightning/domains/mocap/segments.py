@@ -1,7 +1,7 @@
-"""Where single actions are in trials that show several: boundaries that people set by hand.
+"""Segments of single actions in trials with several, annotated by hand.
 
-The shipped ones are those of M. C. Hughes (mocap6dataset, ``truelabels``: one label a tenth of a second; subjects 13 and 14) and of
-F. Zhou (aca, ``moc``: the middle value; subject 86), in frames at 30 a second. A folder's own ``segments.csv`` takes their place.
+Shipped segments are from M. C. Hughes (mocap6dataset, ``truelabels``: a label per tenth of a second; subjects 13 and 14) and
+F. Zhou (aca, ``moc``: the middle value; subject 86), in frames at 30 per second. ``segments.csv`` in a folder replaces them.
 """
 
 import csv
@@ -17,12 +17,12 @@ HEADER = ("trial_id", "label", "start30", "stop30")
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of a trial that shows one action.
+    """Part of a trial with a single action.
 
     Attributes:
         trial_id: such as ``13_29``.
         label: the action.
-        start, stop: frames at 30 a second, the last one excluded; ``stop`` is ``None`` for the trial's end.
+        start, stop: frames at 30 per second, the last excluded; ``stop`` is ``None`` for the end of the trial.
     """
 
     trial_id: str
@@ -36,19 +36,19 @@ WHOLE = tuple(
     for label, trials in (("chop wood", ("79_01", "80_71")), ("breaststroke", ("126_03", "126_04", "126_05")))
     for trial in trials
 )
-"""Trials that show one of the new actions from start to end."""
+"""Trials that show a new action from start to end."""
 
 
 def shipped_segments() -> tuple[Segment, ...]:
-    """Those of the package."""
+    """Segments of the package."""
     return read_segments(Path(__file__).parent / SEGMENTS)
 
 
 def read_segments(path: Path) -> tuple[Segment, ...]:
-    """Those of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE`.
+    """Segments of a file with the columns ``trial_id,label,start30,stop30``, and :data:`WHOLE`.
 
     Raises:
-        UserError: naming file and line.
+        UserError: with path and line.
     """
     try:
         lines = list(csv.reader(read_text(path, "table of segments").splitlines()))
@@ -56,7 +56,7 @@ def read_segments(path: Path) -> tuple[Segment, ...]:
         raise UserError(f"{path}: expected a table of segments (CSV), found a file that cannot be read ({error})") from error
     if not lines or tuple(lines[0]) != HEADER:
         raise UserError(f"{path}: line 1: expected {','.join(HEADER)}, found {','.join(lines[0]) if lines else 'nothing'}")
-    found = []
+    segments = []
     for number, fields in enumerate(lines[1:], start=2):
         if not fields:
             continue
@@ -65,8 +65,8 @@ def read_segments(path: Path) -> tuple[Segment, ...]:
             or not all(field.strip().isdigit() for field in fields[2:])
             or int(fields[2]) >= int(fields[3])
         ):
-            told = ",".join(fields)
-            raise UserError(f"{path}: line {number}: expected a trial, a label, a first frame and a later one, found {told!r}")
-        found.append(Segment(fields[0].strip(), fields[1].strip(), int(fields[2]), int(fields[3])))
-    own = {segment.label for segment in found}
-    return (*found, *(segment for segment in WHOLE if segment.label not in own))
+            line = ",".join(fields)
+            raise UserError(f"{path}: line {number}: expected a trial, a label, a first frame and a later one, found {line!r}")
+        segments.append(Segment(fields[0].strip(), fields[1].strip(), int(fields[2]), int(fields[3])))
+    labels = {segment.label for segment in segments}
+    return (*segments, *(segment for segment in WHOLE if segment.label not in labels))

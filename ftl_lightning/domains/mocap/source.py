@@ -25,24 +25,24 @@ from ftl_lightning.seeding import generator, task_key
 
 NAME = "mocap"
 POSE = "pose"
-"""The observed feature: where the joints are when a plan starts, which is the plan's first state."""
+"""Observed feature: the joints at the start of a plan, which are the plan's first state."""
 OBSERVED = {POSE: Feature((len(COLUMNS),), state=tuple(range(len(COLUMNS))))}
 MAX_SPEED = 12.0
-"""Metres a second. A joint that is faster is a glitch, or the hips stand on end and have no yaw; a trial is cut there."""
+"""Maximum joint speed in metres per second. Faster frames are glitches, or hips without defined yaw; trials are cut there."""
 LONGEST = 128
-"""Frames in a piece of a trial; longer ones are cut, and their parts overlap by a window less a frame, so that none is lost."""
+"""Maximum frames of a piece; parts of longer pieces overlap by a window less a frame, so that no window is lost."""
 OTHER_FIGURES = ("bvh_daz",)
-"""Kinds of recordings that are left out: all subjects moved onto one figure that is not theirs."""
+"""Excluded kinds of recordings: all subjects retargeted to the same figure."""
 CYCLE = 8
-"""Frames: what is repeated takes at least twice as many."""
+"""Frames; periodic motion has at least twice as many per period."""
 ARMS_DOWN = 0.4
-"""Metres at most from a wrist to its hip, sideways and in height, where arms hang down."""
+"""Maximum distance in metres from wrist to hip, sideways and vertical, of hanging arms."""
 UPRIGHT = 0.35
-"""Metres at least from the hips up to the shoulders, and from the ankles up to the hips twice as many, where someone stands."""
+"""Minimum height in metres of shoulders above hips; half the minimum height of hips above ankles."""
 
 
 def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mapping[str, object]) -> Demonstrations:
-    """Motions ``(frame, 42)`` in metres as demonstrations, with a text each."""
+    """Demonstrations from motions ``(frame, 42)`` in metres, with a text each."""
     states, lengths = padded(motions)
     return Demonstrations(
         states=states,
@@ -59,11 +59,11 @@ def moving(motions: Sequence[Tensor], concepts: Sequence[str], provenance: Mappi
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a trial without glitches, of at least one window.
+    """Part of a trial without glitches, at least as long as a window.
 
     Attributes:
-        trial: which one, by its number.
-        concept: what it shows.
+        trial: number of the trial.
+        concept: concept of the motion.
         states: ``(frame, 42)`` float32.
     """
 
@@ -72,16 +72,16 @@ class Piece:
     states: Tensor
 
     def window(self, start: int) -> "Piece":
-        """As long as a plan."""
+        """Window of the length of a plan."""
         return Piece(self.trial, self.concept, self.states[start : start + HORIZON])
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recordings of a folder, which is read when it is needed first.
+    """Recordings of a folder, read lazily.
 
     Attributes:
-        root: the folder; ``None`` where there is none, and then only poses made by rule to start from.
+        root: the folder; ``None`` for rule-based initial poses only.
     """
 
     root: Path | None
@@ -93,7 +93,7 @@ class Recorded:
 
     @property
     def segments(self) -> tuple[Segment, ...]:
-        """Where single actions are in them."""
+        """Segments of single actions."""
         return self._folder[1]
 
     @property
@@ -105,12 +105,12 @@ class Recorded:
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
         """All pieces of trials of the training concepts, and in ``'train'`` their mirror images.
 
-        How many there are is the recordings' matter, and so ``count`` and ``seed`` do not matter. Of a concept with three trials
-        or more, the last one, the eleventh last and so on are for validation, whole. A mirror image is of the description with left
-        and right exchanged; where that is no training concept there is none.
+        The recordings determine the number; ``count`` and ``seed`` are ignored. Concepts with three trials or more hold out whole
+        trials for validation: the last, the eleventh last and so on. A mirror image has the description with left and right
+        exchanged, and is omitted if this is no training concept.
 
         Raises:
-            UserError: if the folder has no trial for it.
+            UserError: if the folder has no trial for the split.
         """
         wanted = [piece for piece in self._pieces if (piece.trial in self._validation) == (name == "validation")]
         if not wanted:
@@ -123,14 +123,14 @@ class Recorded:
         return self._demonstrations(wanted, {"split": name})
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        """Demonstrations of a concept, without replacement where there are enough.
+        """Demonstrations of a concept, without replacement if there are enough.
 
-        Those of a new concept are windows as long as a plan, each from where its subject is nearest to standing at rest
-        (:func:`at_rest`): what varies over a plan is told at the same times in all of them. Where more are asked for than there
-        are, each further one is a window from a random place. Those of a training concept are pieces of its trials.
+        For a new concept, windows as long as a plan, each from the pose nearest to standing at rest (:func:`at_rest`), which aligns
+        variation over a plan in time. If there are too few, windows from random frames follow. For a training concept, pieces of
+        its trials.
 
         Raises:
-            UserError: if no trial of the folder shows it.
+            UserError: if no trial of the folder shows the concept.
         """
         new = task in NEW_CONCEPTS
         shown = self._shown(task) if new else [piece for piece in self._pieces if piece.concept == task]
@@ -139,18 +139,18 @@ class Recorded:
         draw = generator("cpu", seed, task_key(task))
         every = [piece.window(start) for piece in shown for start in at_rest(piece.states)] if new else shown
         order = torch.randperm(len(every), generator=draw).tolist()
-        found = [every[row] for row in order[:count]]
-        while len(found) < count:
+        windows = [every[row] for row in order[:count]]
+        while len(windows) < count:
             piece = shown[int(torch.randint(len(shown), (1,), generator=draw))]
-            found.append(piece.window(int(torch.randint(len(piece.states) - HORIZON + 1, (1,), generator=draw))))
-        return self._demonstrations(found, {"task": task, "seed": seed})
+            windows.append(piece.window(int(torch.randint(len(piece.states) - HORIZON + 1, (1,), generator=draw))))
+        return self._demonstrations(windows, {"task": task, "seed": seed})
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
-        """Poses to start from, of trials that are drawn alike.
+        """Initial poses, with equal probability of trials.
 
-        Of a training concept those that its own trials pass through: held-out ones, where it has any. Of anything else those of
-        people who stand or walk with their arms down, in trials that are in no training split; nobody who demonstrates a new
-        concept is among them. Without a folder they are made by rule, see :mod:`ftl_lightning.domains.mocap.standing`.
+        For a training concept, poses of its trials, held out if possible. Otherwise poses of people who stand or walk with arms
+        down, in validation trials without demonstrators of new concepts. Without a folder, rule-based poses, see
+        :mod:`ftl_lightning.domains.mocap.standing`.
 
         Raises:
             UserError: if the folder has neither.
@@ -161,12 +161,12 @@ class Recorded:
         trials = self._passed(task) or self.arms_down
         which = torch.randint(len(trials), (count,), generator=draw).tolist()
         share = torch.rand(count, generator=draw).tolist()
-        found = [trials[trial][int(part * len(trials[trial]))] for trial, part in zip(which, share, strict=True)]
-        return InitialStates({POSE: torch.stack(found)})
+        poses = [trials[trial][int(part * len(trials[trial]))] for trial, part in zip(which, share, strict=True)]
+        return InitialStates({POSE: torch.stack(poses)})
 
     @cached_property
     def arms_down(self) -> tuple[Tensor, ...]:
-        """What :meth:`starts` draws from: of each trial with such poses, all of them ``(pose, 42)``.
+        """Poses with arms down ``(pose, 42)`` of each validation trial that has any, for :meth:`starts`.
 
         Raises:
             UserError: if there is none.
@@ -174,57 +174,57 @@ class Recorded:
         subjects = self.recordings.subject
         trials = {trial: self.recordings.trial(trial) for trial in sorted(self._validation)}
         poses = [torch.from_numpy(trials[trial]) for trial in trials if subjects[trial] not in DEMONSTRATORS]
-        found = tuple(down for one in poses if len(down := one[hang_down(one)]))
-        if not found:
+        hanging = tuple(down for states in poses if len(down := states[hang_down(states)]))
+        if not hanging:
             raise UserError(f"{self.root}: expected held-out trials in which someone stands with arms down, found none")
-        return found
+        return hanging
 
     def training_poses(self) -> tuple[Tensor, ...]:
-        """Of each trial used for training in which someone stands or walks with arms down, all such poses ``(pose, 42)``.
+        """Poses with arms down ``(pose, 42)`` of each training trial that has any.
 
-        Mirror images are among them.
+        Mirror images are included.
         """
         trials = sorted({piece.trial for piece in self._pieces} - self._validation)
         down = [poses[hang_down(poses)] for poses in (torch.from_numpy(self.recordings.trial(trial)) for trial in trials)]
         return tuple(torch.cat((poses, mirrored(poses))) for poses in down if len(poses))
 
     def _passed(self, concept: str) -> tuple[Tensor, ...]:
-        """Poses ``(pose, 42)`` of each piece of a training concept's trials that a window starts from; none where there is none."""
-        own = [piece for piece in self._pieces if piece.concept == concept]
-        held_out = [piece for piece in own if piece.trial in self._validation]
-        return tuple(piece.states[: len(piece.states) - HORIZON + 1] for piece in held_out or own)
+        """Poses ``(pose, 42)`` that start a window, per piece of a training concept's trials; empty if it has no trial."""
+        shown = [piece for piece in self._pieces if piece.concept == concept]
+        held_out = [piece for piece in shown if piece.trial in self._validation]
+        return tuple(piece.states[: len(piece.states) - HORIZON + 1] for piece in held_out or shown)
 
     @cached_property
     def _pieces(self) -> list[Piece]:
-        """Those of training concepts, in the order of the trials."""
+        """Pieces of training concepts, in the order of the trials."""
         return _training_pieces(self.recordings)
 
     @cached_property
     def _validation(self) -> frozenset[int]:
-        """Trials that are held out for validation."""
+        """Validation trials."""
         return _validation_trials(self._pieces)
 
     def _shown(self, task: str) -> list[Piece]:
-        """What subjects show of a new concept."""
+        """Pieces of a new concept by its demonstrators."""
         every = self.recordings
-        found = []
+        shown = []
         for segment in self.segments:
             if segment.label != task or segment.trial_id not in every.trial_id:
                 continue
             trial = every.trial_id.index(segment.trial_id)
             if every.subject[trial] in DEMONSTRATORS:
                 parts = pieces(every.trial(trial)[segment.start : segment.stop], longest=None)
-                found += [Piece(trial, task, states) for states in parts]
-        return found
+                shown += [Piece(trial, task, states) for states in parts]
+        return shown
 
-    def _demonstrations(self, found: Sequence[Piece], provenance: dict[str, object]) -> Demonstrations:
-        trials = [self.recordings.trial_id[piece.trial] for piece in found]
-        told = {"generator": NAME, "trials": trials, **provenance}
-        return moving([piece.states for piece in found], [piece.concept for piece in found], told)
+    def _demonstrations(self, chosen: Sequence[Piece], provenance: dict[str, object]) -> Demonstrations:
+        trials = [self.recordings.trial_id[piece.trial] for piece in chosen]
+        record = {"generator": NAME, "trials": trials, **provenance}
+        return moving([piece.states for piece in chosen], [piece.concept for piece in chosen], record)
 
 
 def _no_training(every: Recordings, trial: int) -> str:
-    """Why a trial is none of those that training and validation take; empty for one of them."""
+    """Reason why a trial is in neither training nor validation; empty if it is in either."""
     if every.trial_id[trial] in HELD_OUT:
         return "held out whole, as it shows a new concept"
     if every.label[trial] not in TRAINING_CONCEPTS:
@@ -235,24 +235,24 @@ def _no_training(every: Recordings, trial: int) -> str:
 
 
 def _training_pieces(every: Recordings) -> list[Piece]:
-    """Pieces of trials that training and validation take, in the order of the trials."""
+    """Pieces of training and validation trials, in the order of the trials."""
     wanted = [trial for trial in range(len(every)) if not _no_training(every, trial)]
     return [Piece(trial, every.label[trial], states) for trial in wanted for states in pieces(every.trial(trial))]
 
 
-def _validation_trials(found: Sequence[Piece]) -> frozenset[int]:
-    """Of the trials of each concept with three or more, the last one, the eleventh last and so on."""
+def _validation_trials(training: Sequence[Piece]) -> frozenset[int]:
+    """The last, eleventh last ... trial of each concept with three or more trials."""
     trials: dict[str, list[int]] = {}
-    for piece in found:
+    for piece in training:
         if piece.trial not in (known := trials.setdefault(piece.concept, [])):
             known.append(piece.trial)
     return frozenset(trial for known in trials.values() if len(known) > 2 for trial in known[::-10])
 
 
 def left_out(every: Recordings) -> dict[int, str]:
-    """Trials that pretraining sees nothing of, by their numbers, and why."""
-    found = _training_pieces(every)
-    validation, used = _validation_trials(found), {piece.trial for piece in found}
+    """Trials without use in pretraining, by number, and reasons."""
+    training = _training_pieces(every)
+    validation, used = _validation_trials(training), {piece.trial for piece in training}
     reasons = {}
     for trial in range(len(every)):
         short = "" if trial in used else f"no piece of {HORIZON} frames without glitches"
@@ -263,22 +263,22 @@ def left_out(every: Recordings) -> dict[int, str]:
 
 
 def too_short(states: NDArray[np.float32]) -> int:
-    """Frames of a trial ``(frame, 42)`` in pieces that are shorter than a window."""
+    """Number of frames of a trial ``(frame, 42)`` in pieces shorter than a window."""
     ends = pairwise((0, *glitches(states), len(states)))
     return sum(stop - start for start, stop in ends if stop - start < HORIZON)
 
 
 def pieces(states: NDArray[np.float32], longest: int | None = LONGEST) -> list[Tensor]:
-    """Stretches of a trial ``(frame, 42)`` without glitches, of at least a window each; longer ones in parts that overlap."""
-    found = []
+    """Parts of a trial ``(frame, 42)`` without glitches, each at least a window; longer ones in overlapping parts."""
+    parts = []
     for start, stop in pairwise((0, *glitches(states), len(states))):
         if stop - start < HORIZON:
             continue
         step = stop - start if longest is None else longest - HORIZON + 1
         for first in range(start, stop - HORIZON + 1, step):
             last = stop if longest is None else min(first + longest, stop)
-            found.append(torch.from_numpy(states[first:last].copy()))
-    return found
+            parts.append(torch.from_numpy(states[first:last].copy()))
+    return parts
 
 
 def glitches(states: NDArray[np.float32]) -> list[int]:
@@ -289,7 +289,7 @@ def glitches(states: NDArray[np.float32]) -> list[int]:
 
 
 def at_rest(states: Tensor) -> list[int]:
-    """Frames of ``(frame, 42)`` where windows as long as a plan start: nearest to standing among :data:`CYCLE` on both sides."""
+    """Start frames of windows of ``(frame, 42)``: nearest to standing within :data:`CYCLE` frames on both sides."""
     (standing,) = standing_poses(1, generator("cpu", 0))
     far = torch.linalg.vector_norm(states - standing, dim=1)
     frames = range(len(states) - HORIZON + 1)
@@ -297,7 +297,7 @@ def at_rest(states: Tensor) -> list[int]:
 
 
 def hang_down(poses: Tensor) -> Tensor:
-    """Whether someone stands upright with both arms hanging down ``(pose,)``, of poses ``(pose, 42)``."""
+    """Whether poses ``(pose, 42)`` are upright with both arms hanging down: ``(pose,)``."""
     joints = as_joints(poses)
     wrists, hips = joints[:, list(skeleton.WRISTS)], joints[:, list(skeleton.HIPS)]
     shoulders, ankles = joints[:, list(skeleton.SHOULDERS)], joints[:, list(skeleton.ANKLES)]

@@ -1,7 +1,7 @@
-"""Poses of people who stand or walk with their arms down, without recordings: made by rule, or drawn from a distribution.
+"""Poses of standing or walking people with arms down, without recordings: rule-based, or from a distribution.
 
-Those made by rule are where a shipped model's behaviour starts for those who have no recordings. The distribution is a Gaussian
-fitted to such poses of recordings used for training (``benchmarks/mocap_beginnings.py``); learning starts from draws of it.
+Rule-based poses are the initial states of a shipped model without recordings. The distribution is a Gaussian fitted to such poses
+of training recordings (``benchmarks/experiments/mocap_beginnings.py``); learning starts from its samples.
 """
 
 from functools import cache
@@ -22,12 +22,12 @@ _RIGHT_SIDE = (
     (0.21, -0.04, 0.22),
     (0.22, 0.03, 0.05),
 )
-"""Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of middle size."""
+"""Hip, knee, ankle, shoulder, elbow, wrist in metres, of an adult of medium size."""
 _MIDDLE = ((0.0, 0.02, 0.55), (0.0, 0.07, 0.73))
 STRIDE = 0.4
-"""Radians at most that a leg is swung forwards or back."""
+"""Maximum angle in radians of a leg forwards or back."""
 SWING = 0.8
-"""How far the arm of the same side is swung the other way, compared to the leg."""
+"""Swing of the arm relative to the leg of the same side, in the opposite direction."""
 BEND = 0.15
 """Radians by which thighs point further forwards, and shanks further back."""
 
@@ -36,7 +36,7 @@ _FILE = Path(__file__).parent / "beginnings.safetensors"
 
 
 def standing_poses(count: int, draw: torch.Generator) -> Tensor:
-    """Poses ``(count, 42)`` of people of different sizes who stand with their arms down."""
+    """Standing poses ``(count, 42)`` of people of different sizes, with arms down."""
     right = torch.tensor(_RIGHT_SIDE)
     left = right * torch.tensor((-1.0, 1.0, 1.0))
     body = torch.cat((right[:3], left[:3], right[3:], left[3:], torch.tensor(_MIDDLE)))
@@ -45,11 +45,11 @@ def standing_poses(count: int, draw: torch.Generator) -> Tensor:
 
 
 def walking_poses(count: int, draw: torch.Generator) -> Tensor:
-    """Poses ``(count, 42)`` of the same people within a step, of any length down to none."""
+    """Walking poses ``(count, 42)`` of the same people, with strides from zero to the maximum."""
     joints = as_joints(standing_poses(count, draw)).clone()
     stride = STRIDE * (2 * torch.rand(count, generator=draw) - 1)
     sides = ((skeleton.R_HIP, skeleton.R_SHOULDER, stride), (skeleton.L_HIP, skeleton.L_SHOULDER, -stride))
-    for hip, shoulder, angle in sides:  # joints of a limb follow one another
+    for hip, shoulder, angle in sides:  # joints of a limb are consecutive
         _turned(joints, (hip, hip + 1, hip + 2), angle + BEND)
         _turned(joints, (hip + 1, hip + 2), -torch.full_like(angle, 2 * BEND))
         _turned(joints, (shoulder, shoulder + 1, shoulder + 2), -SWING * angle)
@@ -57,7 +57,7 @@ def walking_poses(count: int, draw: torch.Generator) -> Tensor:
 
 
 def _turned(joints: Tensor, limb: tuple[int, ...], angle: Tensor) -> None:
-    """Turn what hangs on a limb's first joint forwards by an angle ``(pose,)`` in radians, in place."""
+    """Rotate a limb about its first joint forwards by angles ``(pose,)`` in radians, in place."""
     first, *others = limb
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]
     hanging = joints[:, others] - joints[:, first : first + 1]
@@ -67,11 +67,11 @@ def _turned(joints: Tensor, limb: tuple[int, ...], angle: Tensor) -> None:
 
 
 def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
-    """Write a Gaussian of few principal directions for :func:`drawn_poses`.
+    """Write the Gaussian of :func:`drawn_poses`, with few principal directions.
 
     Args:
         poses: ``(pose, 42)`` in metres.
-        directions: of greatest variance that are kept.
+        directions: number of directions of greatest variance.
         path: the file.
     """
     mean = poses.double().mean(dim=0)
@@ -81,7 +81,7 @@ def fit_poses(poses: Tensor, directions: int, path: Path) -> None:
 
 
 def drawn_poses(count: int, draw: torch.Generator) -> Tensor:
-    """Poses ``(count, 42)`` of the shipped Gaussian, in metres, on the generator's device."""
+    """Samples ``(count, 42)`` of the shipped Gaussian, in metres, on the generator's device."""
     mean, directions = _distribution()
     return mean.to(draw.device) + torch.randn((count, len(directions)), generator=draw, device=draw.device) @ directions.to(
         draw.device

@@ -1,7 +1,7 @@
-"""Descriptions: what is pretrained on, what is learned from a few demonstrations, what is held out.
+"""Descriptions: training concepts, new concepts learned from few demonstrations, and held-out trials.
 
 Training concepts are descriptions of trials by the database (``cmu-mocap-index.csv``, compiled by B. Hahne from mocap.cs.cmu.edu),
-as :func:`cleaned`. Of the others no trial is pretrained on.
+as :func:`cleaned`. Pretraining excludes trials of other concepts.
 """
 
 import re
@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from ftl_lightning.domains.tasks import EvaluationTask, Suite
 
 HELD_OUT = ("13_29", "13_30", "13_31", "14_14", "14_20", "79_01", "80_71", "126_03", "126_04", "126_05")
-"""Trials that pretraining never sees: those that show a new concept, whole."""
+"""Trials excluded from pretraining as a whole, since they show a new concept."""
 DEMONSTRATORS = ("13", "79", "80", "126")
-"""Subjects who demonstrate new concepts. A judge is trained on others."""
+"""Subjects who demonstrate new concepts, excluded from the training of the judge."""
 ACTION_OF: Mapping[str, str | None] = {
     "acrobatics - spin/twirl, hang on ropes": None,
     "backflip": None,
@@ -97,43 +97,43 @@ ACTION_OF: Mapping[str, str | None] = {
     "wash windows": None,
     "zombie walk": "walk",
 }
-"""Training concepts, and the action that each shows (:mod:`ftl_lightning.domains.mocap.actions`); ``None`` where it shows none of
-these, or several one after the other. Dances are no action together: each kind was danced by one subject alone."""
+"""Training concepts and their actions (:mod:`ftl_lightning.domains.mocap.actions`); ``None`` for other actions, or several in
+sequence. Dances are separate actions: each kind was danced by a single subject."""
 TRAINING_CONCEPTS = tuple(ACTION_OF)
 PAPER_CONCEPTS = ("jumping jacks",)
-"""New concepts of the paper whose trials most copies of the database hold."""
+"""New concepts of the paper in most copies of the database."""
 STAND_INS = ("arm circle",)
-"""New concepts of ours, in place of the paper's two others."""
+"""Replacements of the paper's two other new concepts."""
 DATABASE_CONCEPTS = ("chop wood", "breaststroke")
-"""New concepts of the paper whose trials few copies of the database hold."""
+"""New concepts of the paper in few copies of the database."""
 TEST_CONCEPTS = (*PAPER_CONCEPTS, *STAND_INS)
 VALIDATION_CONCEPTS = ("knee raise", "squat")
 NEW_CONCEPTS = (*TEST_CONCEPTS, *VALIDATION_CONCEPTS, *DATABASE_CONCEPTS)
 AND = " + "
-"""Between the parts of a goal that asks for several concepts at once."""
+"""Separator of the concepts of a goal."""
 COMPOSED_WITH = ("walk", "jump")
 _RENAMED = {"zombiewalk": "zombie walk", "heiansyodan": "heian shodan"}
 _SIDES = {"left": "right", "right": "left"}
 
 
 def cleaned(description: str) -> str:
-    """A description of the database in lower case, with spaces for underscores and one at a time."""
+    """Description in lower case, with single spaces for underscores."""
     text = " ".join(description.lower().replace("_", " ").split())
     return _RENAMED.get(text, text)
 
 
 def mirrored_text(text: str) -> str:
-    """The description of the mirror image: left and right exchanged."""
+    """Description of the mirror image: left and right exchanged."""
     return re.sub(r"\b(left|right)\b", lambda side: _SIDES[side[0]], text)
 
 
 def goal_parts(goal: str) -> tuple[str, ...]:
-    """The concepts of a goal, mostly one."""
+    """Concepts of a goal, mostly a single concept."""
     return tuple(goal.split(AND))
 
 
 def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
-    """From new poses, and from those that the demonstrations start in."""
+    """New concepts from new poses, and from initial poses of the demonstrations."""
     return (
         *(EvaluationTask("new concept", text, (text,)) for text in concepts),
         *(EvaluationTask("new concept, demonstrated poses", text, (text,), initial="demonstrated") for text in concepts),
@@ -141,16 +141,16 @@ def _new(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
 
 
 def _pairs(concepts: tuple[str, ...]) -> list[tuple[str, str]]:
-    return [(text, other) for text in concepts for other in COMPOSED_WITH]
+    return [(text, second) for text in concepts for second in COMPOSED_WITH]
 
 
 def _composed(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
-    """With the same weights on the whole body."""
+    """Compositions with uniform weights on the whole body."""
     return tuple(EvaluationTask("new + training", AND.join(pair), pair[:1], pair[1:]) for pair in _pairs(concepts))
 
 
 def _by_parts(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
-    """With each concept on its own parts of the body."""
+    """Compositions of concepts on separate parts of the body."""
     return tuple(
         EvaluationTask(
             "new + training, by parts of the body",
@@ -164,7 +164,7 @@ def _by_parts(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
 
 
 def _protocol(concepts: tuple[str, ...]) -> tuple[EvaluationTask, ...]:
-    """As the paper evaluates: from the demonstrations' last states, alone and composed with training concepts."""
+    """Protocol of the paper: from the demonstrations' last states, alone and composed with training concepts."""
     pairs = _pairs(concepts)
     return (
         *(EvaluationTask("new concept, last states", text, (text,), initial="last") for text in concepts),
@@ -180,7 +180,7 @@ SUITES = {
     "database": Suite(_new(DATABASE_CONCEPTS)),
     "validation": Suite(_new(VALIDATION_CONCEPTS)),
 }
-"""``'paper'`` is for final evaluation alone, and ``'protocol'``, which starts where the paper does; ``'validation'`` is for tuning.
+"""``'paper'`` and ``'protocol'``, with the initial states of the paper, are for final evaluation; ``'validation'`` is for tuning.
 
 ``'database'`` needs the trials of :data:`DATABASE_CONCEPTS` in the user's copy. ``'whole'`` is the part of ``'composition'`` for
 methods that cannot compose by parts of the body."""

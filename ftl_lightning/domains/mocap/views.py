@@ -1,4 +1,4 @@
-"""How a model may see motion: as it stands in files, or with bones that keep their lengths; begun from other poses."""
+"""Views of motion for models: states as in files, or with rigid bones; initial poses augmented."""
 
 import itertools
 from dataclasses import replace
@@ -14,29 +14,29 @@ from ftl_lightning.domains.mocap.standing import drawn_poses
 from ftl_lightning.processes import drawn
 
 SHORTEST = 1e-3
-"""Metres: a generated bone shorter than this has no direction and is not changed."""
+"""Minimum length in metres of a generated bone with a direction; shorter bones are not changed."""
 
 
 def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
-    """Motion whose rigid bones are as long as those of the pose it starts from.
+    """Scale rigid bones to their lengths in the initial pose.
 
-    The middle of the hips is the origin, and outwards each joint is moved along its bone; all joints behind it move as much.
-    Directions of bones stay.
+    From the origin, the middle of the hips, outwards, each joint moves along its bone with all its descendants. Directions of bones
+    are constant.
 
     Args:
         states: ``(sample, horizon, 42)`` in metres.
         observed: with :data:`POSE`, ``(sample, 42)``.
 
     Returns:
-        ``(sample, horizon, 42)``; of recordings, themselves.
+        ``(sample, horizon, 42)``; recordings are unchanged.
     """
     joints, start = as_joints(states), as_joints(observed[POSE])
     moved = list(joints.unbind(dim=-2))
     for inner, outer in sorted(RIGID, key=lambda bone: bone != (R_HIP, L_HIP)):
         length = torch.linalg.vector_norm(start[:, outer] - start[:, inner], dim=-1)[:, None, None]
         bone = joints[..., outer, :] - joints[..., inner, :]
-        found = torch.linalg.vector_norm(bone, dim=-1, keepdim=True)
-        bone = torch.where(found > SHORTEST, bone * (length / found.clamp_min(SHORTEST)), bone)
+        norm = torch.linalg.vector_norm(bone, dim=-1, keepdim=True)
+        bone = torch.where(norm > SHORTEST, bone * (length / norm.clamp_min(SHORTEST)), bone)
         if (inner, outer) == (R_HIP, L_HIP):
             moved[inner] = -bone / 2
         moved[outer] = moved[inner] + bone
@@ -44,9 +44,9 @@ def with_rigid_bones(states: Tensor, observed: Observed) -> Tensor:
 
 
 def smoothed(states: Tensor, observed: Observed) -> Tensor:
-    """Motion as a running mean over three frames of such a mean, with rigid bones; first and last frame stay.
+    """Apply a running mean of three frames twice, then rigid bones; first and last frame are constant.
 
-    Errors of a network are independent between frames, motion is not: the weighted mean of five frames keeps a quarter of their
+    Network errors are independent between frames, motion is not: the weighted mean of five frames keeps a quarter of their
     variance.
 
     Args:
@@ -63,21 +63,21 @@ def smoothed(states: Tensor, observed: Observed) -> Tensor:
 
 
 SHARE = 0.5
-"""Of the windows that begin elsewhere."""
+"""Share of windows with another initial pose."""
 BLENDED = (8, 12)
-"""Frames at least and at most until such a window is as recorded."""
+"""Minimum and maximum frames of the transition to the recorded window."""
 
 
 def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    """Half of the windows from a pose in which somebody stands or walks with arms down, and from there into what was recorded.
+    """Start half of the windows in a pose of standing or walking with arms down, with a transition to the recording.
 
-    Demonstrations begin at rest; without this, nothing shows how to leave a stride. The first frames are a weighted mean of the
-    pose and of the recorded frame, whose weight grows as half a cosine, with the bones of the one who moves.
+    Demonstrations start at rest; without this augmentation, no window leaves a stride. Frames of the transition are weighted
+    means of pose and recording with cosine weights, and with the bone lengths of the recording.
 
     Args:
         states: ``(sample, frame, 42)`` in metres.
         observed: with :data:`POSE`, ``(sample, 42)``.
-        draw: of poses and lengths; ``None`` changes nothing.
+        draw: generator of poses and lengths; ``None`` for no change.
     """
     if draw is None:
         return states, observed
@@ -94,12 +94,12 @@ def begun_elsewhere(states: Tensor, observed: Observed, draw: torch.Generator | 
 
 
 def _encode_steps(states: Tensor, observed: Observed) -> Tensor:
-    """How each pose differs from the one before; the first, from the present."""
+    """Differences of consecutive poses; the first relative to the initial pose."""
     return torch.diff(states, dim=1, prepend=observed[POSE][:, None])
 
 
 def _decode_steps(steps: Tensor, observed: Observed) -> Tensor:
-    """The inverse, with rigid bones."""
+    """Invert :func:`_encode_steps`, with rigid bones."""
     # Not cumsum, which has no deterministic form on GPUs.
     states = itertools.accumulate(steps.unbind(dim=1), initial=observed[POSE])
     return with_rigid_bones(torch.stack(list(states)[1:], dim=1), observed)
@@ -118,5 +118,5 @@ VIEWS = {
     "smooth": replace(_RIGID, decode=smoothed),
     "steps": View(OBSERVED, observe=lambda observed: observed, encode=_encode_steps, decode=_decode_steps),
 }
-"""Seen as ``rigid``, what is learned from is as it stands in files, and what is generated has rigid bones; ``smooth`` is the same
-with a running mean of what is generated. In ``steps`` the same for methods that go from one pose to the next."""
+"""``rigid`` has training states as in files, and generated states with rigid bones; ``smooth`` adds a running mean of generated
+states. ``steps`` has differences of poses, for autoregressive methods."""

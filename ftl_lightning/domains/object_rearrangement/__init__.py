@@ -1,4 +1,4 @@
-"""Object rearrangement: three shapes on a table whose spatial relations are the concepts (paper, section 4.1)."""
+"""Object rearrangement: concepts are spatial relations of three shapes on a table (paper, section 4.1)."""
 
 from ftl_lightning.domains.object_rearrangement.domain import DOMAIN
 

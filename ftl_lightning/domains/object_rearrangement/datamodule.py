@@ -4,12 +4,12 @@ from ftl_lightning.domains.data import PretrainingData
 
 
 class ObjectRearrangementData(PretrainingData):
-    """Scenes of the twelve training concepts, drawn from the seed for each run (half a second).
+    """Scenes of the twelve training concepts, generated from the seed in each run (half a second).
 
     920 samples of each concept give the paper's ~11,000 scenes.
 
-    Its settings name no domain. Those of ``PretrainingData(domain=...)`` do, so that the results file would know the same run by
-    another hash: configurations and committed rows go by this class.
+    Configurations and committed results use this class: ``PretrainingData(domain=...)`` would change the configuration hash, as its
+    settings name the domain.
     """
 
     own_domain = "object_rearrangement"

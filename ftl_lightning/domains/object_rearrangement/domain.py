@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows about object rearrangement."""
+"""Domain object of object rearrangement."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from ftl_lightning.errors import UserError
 
 NAME = "object_rearrangement"
 STATE_NAMES = tuple(
-    f"{shape}.{column}" for shape in SHAPES for column in ("x", "y", "radius", "angle", *(f"is_{other}" for other in SHAPES))
+    f"{shape}.{column}" for shape in SHAPES for column in ("x", "y", "radius", "angle", *(f"is_{kind}" for kind in SHAPES))
 )
 STATE_UNITS = ("length", "length", "length", "rad", "1", "1", "1") * len(SHAPES)
 CENTRES = tuple(shape * PER_SHAPE + axis for shape in range(len(SHAPES)) for axis in range(2))
@@ -42,7 +42,7 @@ def succeeded(goal: str, states: Tensor, starts: InitialStates | None = None) ->
     Args:
         goal: relations in words.
         states: ``(sample, 1, 21)`` in the domain's units.
-        starts: there are none.
+        starts: unused.
 
     Returns:
         ``(sample,)`` of bool.
@@ -51,7 +51,7 @@ def succeeded(goal: str, states: Tensor, starts: InitialStates | None = None) ->
 
 
 def distance(states: Tensor, others: Tensor) -> Tensor:
-    """Euclidean distance ``(a, b)`` over the centres of the three shapes, in length units; no task is about sizes or angles."""
+    """Euclidean distance ``(a, b)`` between the shapes' centres in length units; tasks do not concern sizes or angles."""
     return path_distance(states[..., CENTRES], others[..., CENTRES])
 
 

@@ -1,4 +1,4 @@
-"""Scenes drawn by vectorised rejection sampling: propose many, keep those that show the task and nothing else."""
+"""Vectorised rejection sampling of scenes that show only their task."""
 
 import numpy as np
 import torch
@@ -21,29 +21,29 @@ from ftl_lightning.seeding import task_key
 SIZE = (0.3, 1.0)
 """Range of a shape's radius (paper)."""
 PROPOSALS = 32_768
-"""Scenes proposed at a time."""
+"""Scenes per proposal round."""
 PATIENCE = 200
-"""Rounds without reaching the count after which a task is declared infeasible."""
+"""Maximum number of rounds before a task counts as infeasible."""
 PLAIN = 256
-"""Scenes proposed at a time where one is wanted that shows nothing."""
+"""Scenes per proposal round of :func:`plain_scene`."""
 _ALONG = {"diagonal to": (1 + 1j) / abs(1 + 1j), "antidiagonal to": (-1 + 1j) / abs(-1 + 1j)}
-"""The way from B to A on the line of a relation, as a complex number x + iy."""
+"""Unit direction from B to A on a relation's line, as a complex number x + iy."""
 
 
 def generate(task: str, count: int, seed: int) -> Tensor:
-    """Draw scenes in which a task holds exactly, no shapes overlap and no training relation that it does not name holds.
+    """Draw scenes in which a task holds exactly, no shapes overlap and no unrelated training relation holds.
 
     Args:
         task: relations in words, see :func:`~ftl_lightning.domains.object_rearrangement.relations.parse`.
         count: number of scenes.
-        seed: the same task and seed give the same bytes, whatever else is drawn.
+        seed: seed; the same task and seed give the same bytes.
 
     Returns:
-        ``(count, 21)`` float32: for circle, triangle and square: x, y in [0, 5], radius in [0.3, 1], angle in [0, 2 pi],
+        ``(count, 21)`` float32; for circle, triangle and square: x, y in [0, 5], radius in [0.3, 1], angle in [0, 2 pi],
         one-hot type.
 
     Raises:
-        UserError: if the task cannot be read, or hardly any scene shows it.
+        UserError: if the task cannot be parsed, or hardly any scene shows it.
     """
     relations = parse(task)
     related = {named for relation in relations for named in _related(relation)}
@@ -67,7 +67,7 @@ def generate(task: str, count: int, seed: int) -> Tensor:
 
 
 def _related(relation: Relation) -> tuple[Relation, ...]:
-    """A relation and the training relations that it speaks of by its definition."""
+    """A relation and the training relations implied by its definition."""
     if relation.kind == "diagonal to":
         return (relation, Relation("right of", relation.shapes), Relation("above", relation.shapes))
     if relation.kind == "antidiagonal to":
@@ -79,11 +79,11 @@ def _related(relation: Relation) -> tuple[Relation, ...]:
 
 
 def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tensor:
-    """Uniform scenes ``(PROPOSALS, 21)``, with centres put where a relation of measure zero wants them: rings first, which are
-    then moved as they are.
+    """Uniform scenes, at most ``(PROPOSALS, 21)``; centres are placed to satisfy relations of measure zero, rings first and
+    then moved rigidly.
     """
     scenes = _uniform_scenes(rng, PROPOSALS)
-    wanted = sorted((one for one in relations if not one.negated), key=lambda one: one.kind != "ring")
+    wanted = sorted((relation for relation in relations if not relation.negated), key=lambda relation: relation.kind != "ring")
     on_ring = bool(wanted) and wanted[0].kind == "ring"
     for relation in wanted:
         which = [SHAPES.index(shape) for shape in relation.shapes]
@@ -104,12 +104,12 @@ def _propose(relations: tuple[Relation, ...], rng: np.random.Generator) -> Tenso
 
 
 def _moved_onto(along: complex, centres: NDArray[np.float32], a: int, b: int) -> NDArray[np.float32]:
-    """Centres ``(scene, shape, 2)`` turned and shifted, their distances kept, until A and B lie on a line, A further along it.
+    """Rotate and shift centres ``(scene, shape, 2)`` until A and B lie on a line, A further along it.
 
     Args:
-        along: way of the line, of length 1; it goes through the middle of the square.
-        centres: of the shapes.
-        a, b: which shapes are A and B.
+        along: unit direction of the line, which passes through the middle of the square.
+        centres: centres of the shapes.
+        a, b: indices of A and B.
     """
     points = centres[..., 0] + 1j * centres[..., 1]
     way, middle = points[:, [a]] - points[:, [b]], (1 + 1j) * EXTENT / 2
@@ -129,12 +129,12 @@ def _uniform_scenes(rng: np.random.Generator, count: int) -> NDArray[np.float32]
 
 
 def random_scenes(count: int, seed: int) -> Tensor:
-    """The same as states ``(count, 21)``: a reference line, the result of a policy that does not use the task."""
+    """Uniform scenes ``(count, 21)``: baseline of a policy that ignores the task."""
     return _flat(_uniform_scenes(np.random.default_rng(seed), count))
 
 
 def plain_scene(seed: int) -> Tensor:
-    """One scene ``(21,)`` in which no shapes overlap and no training relation holds: it shows nothing yet."""
+    """Scene ``(21,)`` without overlapping shapes or training relations."""
     rng = np.random.default_rng(seed)
     while True:
         scenes = _flat(_uniform_scenes(rng, PLAIN))

@@ -1,4 +1,4 @@
-"""The numbers that the paper reports for object rearrangement, as rows."""
+"""The paper's numbers for object rearrangement."""
 
 from ftl_lightning.domains.paper import Published
 
@@ -28,13 +28,13 @@ def _concept_count() -> list[Published]:
 
 
 def _omega() -> list[Published]:
-    """Table 'Classifier-free guidance weight choice effect'; 1.2 and learned stand in the tables above already."""
+    """Table 'Classifier-free guidance weight choice effect'; 1.2 and learned are in the tables above."""
     rows = (("1.4", 0.80, 0.10), ("1.6", 0.66, 0.08), ("1.8", 0.61, 0.06))
     return [Published("new concept", value, error, omega=omega) for omega, value, error in rows]
 
 
 def _learned_components() -> list[Published]:
-    """Table 'Analysis of learned concepts': what each learned component generates alone."""
+    """Table 'Analysis of learned concepts': generation with each component alone."""
     rows = (
         ("triangle right of square", 0.42, 0.62, "circle above square", 0.88, 0.36),
         ("square right of triangle", 0.16, 0.64, "circle above triangle", 0.08, 0.08),
@@ -51,7 +51,7 @@ def _learned_components() -> list[Published]:
 
 
 def _baselines() -> list[Published]:
-    """The baselines' columns of the table of guidance weights, and what the text says of language."""
+    """Baselines in the table of guidance weights; language from the text."""
     rows = (
         ("BC", "new concept", 0.67, 0.15),
         ("CVAE", "new concept", 0.08, 0.05),

@@ -11,11 +11,11 @@ from ftl_lightning.domains.recorder import Numbers, Piece, Scene
 
 
 def scene(task: str, seed: int) -> Scene:
-    """Three shapes of new sizes, which show no relation of training yet.
+    """Three shapes of new sizes without any training relation.
 
     Args:
-        task: does not matter.
-        seed: of sizes, angles and places.
+        task: unused.
+        seed: seed of sizes, angles and places.
     """
     state = plain_scene(seed)
     places = state[list(CENTRES)].reshape(len(SHAPES), 2).tolist()
@@ -24,14 +24,14 @@ def scene(task: str, seed: int) -> Scene:
 
 
 def record(seen: Scene, path: Numbers, seconds: Numbers) -> Demonstrations:
-    """One scene ``(1, 1, 21)`` with the shapes where they were put, their centres kept in [0, :data:`EXTENT`].
+    """Scene ``(1, 1, 21)`` with the shapes at their final places, centres clipped to [0, :data:`EXTENT`].
 
     Args:
-        seen: the scene before.
-        path: ``(step, 3, 2)`` in length units, of which the last step counts.
-        seconds: do not matter.
+        seen: initial scene.
+        path: ``(step, 3, 2)`` in length units; only the last step counts.
+        seconds: unused.
     """
-    assert seen.state is not None  # of every scene of this domain
+    assert seen.state is not None  # set by `scene`
     state = seen.state.clone()
     state[list(CENTRES)] = torch.from_numpy(path[-1]).float().clamp(0, EXTENT).flatten()
     return Demonstrations(

@@ -1,8 +1,8 @@
-"""Spatial relations between the three shapes: their grammar, their exact form and their relaxed form.
+"""Spatial relations between the three shapes: grammar, exact form and relaxed form.
 
-A task is a conjunction of relations written in words (``'circle right of square and triangle above square'``), each of which may be
-negated (``'circle above square and not circle right of square'``).
-Each relation is defined once, in :func:`holds`; generation uses the exact margin, evaluation the relaxed one
+A task is a conjunction of relations in words (``'circle right of square and triangle above square'``), possibly negated
+(``'circle above square and not circle right of square'``).
+:func:`holds` defines each relation; generation uses exact margins, evaluation relaxed margins
 (Netanyahu et al., 2024, appendix 'Object Rearrangement').
 """
 
@@ -19,31 +19,31 @@ SHAPES = ("circle", "triangle", "square")
 EXTENT = 5.0
 """Centres lie in ``[0, EXTENT]^2`` (length units of the paper)."""
 PER_SHAPE = 4 + len(SHAPES)
-"""Columns of one shape: x, y, size, angle, one-hot type."""
+"""Columns per shape: x, y, size, angle, one-hot type."""
 
 ORDERED_PAIRS = tuple(itertools.permutations(SHAPES, 2))
 AND = " and "
-"""Joins the relations of a task."""
+"""Conjunction of relations in a task."""
 NOT = "not "
-"""Negates the relation that follows."""
+"""Prefix of a negated relation."""
 PAIRWISE = ("right of", "above", "diagonal to", "antidiagonal to", "next to")
 RADIUS_TOLERANCE = 0.3
-"""A ring's circumradius may differ from its nominal value by this much in evaluation."""
+"""Tolerance of a ring's circumradius in evaluation."""
 EXACT_TOLERANCE = 1e-3
-"""The same for generated scenes and for centres that must lie on a line: rounding only."""
+"""Tolerance of rings and lines in generated scenes, for rounding only."""
 NEXT_TO_GAP = (0.3, 0.8)
 """Largest gap between two outlines that are 'next to' each other: exact, relaxed. A relation of the validation suite."""
 
 
 @dataclass(frozen=True)
 class Relation:
-    """One relation.
+    """Relation between shapes.
 
     Attributes:
         kind: one of :data:`PAIRWISE`, or ``'ring'`` (all three shapes on the circumference of a circle).
-        shapes: the ordered pair (A, B), or all three shapes for a ring.
+        shapes: ordered pair (A, B), or all three shapes for a ring.
         radius: circumradius of a ring, 0 otherwise.
-        negated: whether it must not hold.
+        negated: whether the relation must not hold.
     """
 
     kind: str
@@ -60,18 +60,18 @@ class Relation:
 
     @property
     def plain(self) -> "Relation":
-        """The relation itself, without a negation."""
+        """The relation without negation."""
         return replace(self, negated=False)
 
 
 def sentence(task: str) -> str:
-    """A task as the paper tells it to a language model (appendix, 'Language')."""
-    return AND.join(_told(relation) for relation in parse(task))
+    """Wording of a task for a language model (paper, appendix, 'Language')."""
+    return AND.join(_worded(relation) for relation in parse(task))
 
 
-def _told(relation: Relation) -> str:
+def _worded(relation: Relation) -> str:
     if relation.negated:
-        return f"{NOT}{_told(relation.plain)}"
+        return f"{NOT}{_worded(relation.plain)}"
     if relation.kind == "ring":
         return f"circle triangle and square in a circle of radius {relation.radius:g}"
     if relation.kind == "diagonal to":
@@ -88,44 +88,44 @@ _RELATION = re.compile(f"(?P<negated>{NOT})?(?:{_PAIR}|{_RING})")
 
 
 def parse(task: str) -> tuple[Relation, ...]:
-    """Read a task in words.
+    """Parse a task in words.
 
     Args:
         task: relations joined by ``' and '``.
 
     Returns:
-        The relations in the order they were written.
+        The relations in order.
 
     Raises:
-        UserError: where a part is not a relation.
+        UserError: if a part is not a relation.
     """
     relations = []
     end = -len(AND)
     while end < len(task):
-        found = _RELATION.match(task, end + len(AND)) if end < 0 or task.startswith(AND, end) else None
-        if found is None:
+        part = _RELATION.match(task, end + len(AND)) if end < 0 or task.startswith(AND, end) else None
+        if part is None:
             raise UserError(
                 f"object_rearrangement task {task!r}: found {task[max(end, 0) :]!r}, expected 'A <relation> B' with A, B different "
                 f"among {', '.join(SHAPES)} and <relation> among {', '.join(PAIRWISE)}, or "
                 f"'{Relation('ring', SHAPES, 1.67)}', after '{NOT}' or not, joined by '{AND}'"
             )
-        negated = bool(found["negated"])
-        if found["radius"]:
-            relations.append(Relation("ring", SHAPES, float(found["radius"]), negated))
+        negated = bool(part["negated"])
+        if part["radius"]:
+            relations.append(Relation("ring", SHAPES, float(part["radius"]), negated))
         else:
-            relations.append(Relation(found["kind"], (found["a"], found["b"]), negated=negated))
-        end = found.end()
+            relations.append(Relation(part["kind"], (part["a"], part["b"]), negated=negated))
+        end = part.end()
     return tuple(relations)
 
 
 def columns(states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres and sizes of the shapes: three tensors ``(scene, shape)``: x, y and radius, from ``(scene, 21)``."""
+    """x, y and radius of the shapes, each ``(scene, shape)``, from ``(scene, 21)``."""
     shapes = states.unflatten(-1, (len(SHAPES), PER_SHAPE))
     return shapes[..., 0], shapes[..., 1], shapes[..., 2]
 
 
 def circumradius(x: Tensor, y: Tensor) -> Tensor:
-    """Radius ``(scene,)`` of the circle through three centres ``(scene, 3)``; infinite where they are collinear."""
+    """Radius ``(scene,)`` of the circle through three centres ``(scene, 3)``; infinite if collinear."""
     points = torch.stack((x, y), dim=-1)
     a, b, c = ((points[:, i] - points[:, j]).norm(dim=-1) for i, j in ((0, 1), (1, 2), (2, 0)))
     twice_area = ((x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])).abs()
@@ -138,7 +138,7 @@ def holds(relation: Relation, states: Tensor, relaxed: bool) -> Tensor:
     Args:
         relation: the relation.
         states: ``(scene, 21)`` in the domain's units.
-        relaxed: the margins of evaluation instead of those of generation. A negated relation must not even hold relaxed, always.
+        relaxed: use margins of evaluation instead of generation. Negated relations always use the relaxed form.
 
     Returns:
         ``(scene,)`` of bool.
@@ -171,7 +171,7 @@ def holds(relation: Relation, states: Tensor, relaxed: bool) -> Tensor:
 
 
 def overlap(states: Tensor) -> Tensor:
-    """Whether any two shapes' circumscribed circles meet: ``(scene,)`` of bool from ``(scene, 21)``."""
+    """Whether circumscribed circles of any two shapes intersect: ``(scene,)`` of bool from ``(scene, 21)``."""
     x, y, radius = columns(states)
     touching = [
         torch.hypot(x[:, i] - x[:, j], y[:, i] - y[:, j]) <= radius[:, i] + radius[:, j]

@@ -1,4 +1,4 @@
-"""Pictures of scenes, framed green where the task holds and red where it does not (as in the paper's figures)."""
+"""Pictures of scenes with a green frame if the task holds, else red (as in the paper's figures)."""
 
 import math
 from collections.abc import Sequence
@@ -18,17 +18,17 @@ COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}
 CORNERS = {"triangle": 3, "square": 4}
 MAX_COLUMNS = 8
 MARGIN = 1.0
-"""The largest radius."""
+"""Margin: the largest radius."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None = None) -> Figure:
-    """A grid of scenes.
+    """Draw a grid of scenes.
 
     Args:
         states: ``(scene, 1, 21)`` in the domain's units.
-        right: whether the task holds, one entry a scene (green and red frames); ``None`` for grey frames.
-        title: above the grid.
-        starts: there are none.
+        right: whether the task holds in each scene (green and red frames); ``None`` for grey frames.
+        title: title above the grid.
+        starts: unused.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
@@ -56,12 +56,12 @@ def _scene(axes: Axes, state: Tensor, frame: str) -> None:
 
 
 def vector_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """A scene ``(1, 21)``, which does not move."""
+    """Still film of a scene ``(1, 21)``."""
     shapes = []
     for shape, (x, y, radius, angle, *_) in zip(SHAPES, states[0].unflatten(0, (len(SHAPES), PER_SHAPE)).tolist(), strict=True):
         size = max(radius, 0.0)
         if shape in CORNERS:
-            turned = math.pi / 2 + angle  # as matplotlib, whose polygons begin at the top
+            turned = math.pi / 2 + angle  # like matplotlib, whose polygons begin at the top
             shapes.append(still("area", regular(CORNERS[shape], size, turned) + np.array((x, y)), COLOURS[shape]))
         else:
             shapes.append(still("dots", [(x, y)], COLOURS[shape], size))

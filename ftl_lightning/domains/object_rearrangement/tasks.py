@@ -1,4 +1,4 @@
-"""The paper's settings for object rearrangement, as data, and the validation suite on which everything is tuned."""
+"""Tasks of object rearrangement: the paper's settings, and the validation suite for tuning."""
 
 from ftl_lightning.domains.object_rearrangement.relations import AND, NOT, SHAPES, TRAINING_RELATIONS, Relation
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
@@ -83,7 +83,7 @@ COMPONENTS = Suite(
         for component in (1, 2)
     )
 )
-"""What each of two learned components generates alone (paper, table 'Analysis of learned concepts')."""
+"""Generation with each of two learned components alone (paper, table 'Analysis of learned concepts')."""
 
 
 def _ring(radius: float) -> str:
@@ -123,8 +123,8 @@ COMPOSITIONS = Suite(
         )
     )
     + tuple(
-        EvaluationTask("not", f"{text}{AND}{NOT}{other}", texts=(text,), without=(other,))
-        for text, other in (
+        EvaluationTask("not", f"{text}{AND}{NOT}{excluded}", texts=(text,), without=(excluded,))
+        for text, excluded in (
             ("circle above square", "triangle right of square"),
             ("triangle right of circle", "square above triangle"),
             ("square above triangle", "circle right of triangle"),
@@ -134,13 +134,13 @@ COMPOSITIONS = Suite(
         )
     )
 )
-"""Compositions that the validation suite has none of: of two of its learned concepts, of one of its rings with a training concept,
-of three training concepts (never two that are a task of the paper), and of one without another that would often hold by chance (of
-the same two shapes none would). For tuning, like the validation suite, whose learned concepts they share."""
+"""Compositions beyond the validation suite: two of its learned concepts, a ring and a training concept, three training concepts (no
+two form a task of the paper), and a training concept without another that would often hold by chance (for the same two shapes none
+would). For tuning; learned concepts are shared with the validation suite."""
 
 SUITES = {"training": TRAINING, "paper": PAPER, "components": COMPONENTS, "validation": VALIDATION, "compositions": COMPOSITIONS}
 
 DESCRIBED = tuple(
     dict.fromkeys((*TRAINING_CONCEPTS, *(goal for suite in (TRAINING, PAPER, COMPONENTS, VALIDATION) for goal in suite.goals)))
 )
-"""The texts of the table of embeddings; compositions are not among them, since their parts are."""
+"""Texts in the table of embeddings; compositions are left out, as their parts are included."""

@@ -1,8 +1,7 @@
-"""Pictures of an episode in which what its task does not need lies elsewhere each time.
+"""Images of an episode with random distractor positions in each image.
 
-Few demonstrations show few layouts, and where the distractors lie tells these apart: a network learns them by heart. Distractors
-that lie elsewhere in every picture tell nothing (domain randomisation, Tobin et al., 2017). The triangle also lies on book and
-block, where it looks larger.
+Few demonstrations have few layouts, and a network memorises demonstrations by their distractors. Random distractors carry no
+information (domain randomisation, Tobin et al., 2017). The triangle also lies on book and block, where it looks larger.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,29 +33,29 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
 SURFACES = (BOOK, WHITE)
-"""On which the triangle may lie."""
+"""Objects that can carry the triangle."""
 RAISED = 0.5
-"""How often it does, where one of them is seen."""
+"""Probability of a triangle on a surface, if one is visible."""
 
 Pose = tuple[float, float, float]
 """x, y and yaw."""
 HIDDEN: Pose = (-5.0, 0.0, 0.0)
-"""Where what a picture does not show is."""
+"""Position of objects that an image does not show."""
 
 
 def scattered(
     env: "TableTopEnvironment", task: str, trace: Sequence[NDArray[np.float64]], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Pictures ``(time, 3, 64, 64)`` of the overhead camera of an episode that is over, and what is where in them.
+    """Images ``(time, 3, 64, 64)`` of the overhead camera of a finished episode, and object positions.
 
     Args:
-        env: in which it took place; its objects are moved about.
-        task: known.
-        trace: what the environment told of it.
-        rng: draws places, and whether a distractor is seen.
+        env: environment of the episode; its objects are moved.
+        task: known task.
+        trace: ``trace`` of the episode's last info.
+        rng: random generator of positions and visibility.
 
     Returns:
-        Pictures, and places ``(time, 5, 4)``, see :meth:`~ftl_lightning.domains.tabletop.environment.TableTopEnvironment.seen`.
+        Images, and positions ``(time, 5, 4)``, see :meth:`~ftl_lightning.domains.tabletop.environment.TableTopEnvironment.seen`.
     """
     needed = NEEDED[task](np.random.default_rng(0))
     objects = env.bodies.objects
@@ -78,25 +77,25 @@ def scattered(
 
 
 def _free(rng: np.random.Generator, name: str, taken: Mapping[str, Points]) -> tuple[float, Pose]:
-    """A height and a place where an object overlaps nothing, or out of sight if none is found."""
-    below = [one for one in SURFACES if one in taken] if name == TRIANGLE else []
+    """Draw a height and a pose without overlap; hidden if none fits."""
+    below = [surface for surface in SURFACES if surface in taken] if name == TRIANGLE else []
     if below and rng.uniform() < RAISED:
         under = below[rng.integers(len(below))]
         low, high = taken[under].min(axis=0), taken[under].max(axis=0)
         for _ in range(TRIES):
             x, y = map(float, rng.uniform(low, high))
-            found = (x, y, random_yaw(rng, name))
-            points = outline(name, *found)
-            if within(points, taken[under]) and _clear(points, {key: one for key, one in taken.items() if key != under}):
-                return HEIGHT[under], found
+            pose = (x, y, random_yaw(rng, name))
+            points = outline(name, *pose)
+            if within(points, taken[under]) and _clear(points, {key: shape for key, shape in taken.items() if key != under}):
+                return HEIGHT[under], pose
     low, high = np.transpose(SIGHT)
     for _ in range(TRIES):
-        found = (*anywhere(rng), random_yaw(rng, name))
-        points = outline(name, *found)
+        pose = (*anywhere(rng), random_yaw(rng, name))
+        points = outline(name, *pose)
         if (points > low).all() and (points < high).all() and _clear(points, taken):
-            return 0.0, found
+            return 0.0, pose
     return 0.0, HIDDEN
 
 
 def _clear(points: Points, taken: Mapping[str, Points]) -> bool:
-    return all(gap(points, other) >= APART for other in taken.values())
+    return all(gap(points, shape) >= APART for shape in taken.values())

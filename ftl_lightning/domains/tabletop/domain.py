@@ -1,4 +1,4 @@
-"""The domain object: what the rest of the package knows of the table-top."""
+"""Domain object of the table-top."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from ftl_lightning.domains.tabletop.source import Expert
 
 HORIZON = 32
-"""States in a plan; the paper's number."""
+"""States per plan, as in the paper."""
 RENDERING = "ftl_lightning.domains.tabletop.rendering"
 
 
 def source(root: Path | None) -> "Expert":
-    """The scripted experts.
+    """Scripted experts.
 
     Raises:
         UserError: without the simulator.
@@ -50,7 +50,7 @@ def source(root: Path | None) -> "Expert":
 
 
 def wide_source(root: Path | None) -> "Expert":
-    """The scripted experts of the wide domain's concepts, of which all are also shown from where one went wrong.
+    """Scripted experts of the wide domain, with recoveries for all concepts.
 
     Raises:
         UserError: without the simulator.
@@ -62,7 +62,7 @@ def wide_source(root: Path | None) -> "Expert":
 
 
 def environment() -> "TableTopEnvironment":
-    """The domain's environment.
+    """Environment of the domain.
 
     Raises:
         UserError: without the simulator, or if it does not start.
@@ -74,7 +74,7 @@ def environment() -> "TableTopEnvironment":
 
 
 def wide_environment() -> "TableTopEnvironment":
-    """The same, in which an episode ends where the circle touches anything.
+    """Environment in which an episode ends when the circle touches any object.
 
     Raises:
         UserError: as :func:`environment`.
@@ -86,19 +86,19 @@ def wide_environment() -> "TableTopEnvironment":
 
 
 def act(plans: Tensor, step: int, observed: Observed) -> Tensor:
-    """Where the hand should be next ``(episode, 4)``: the plan's next state. Its first is where the hand was told to be last.
+    """Next command ``(episode, 4)``: the next state of the plan, whose first state is the last command.
 
     Args:
         plans: ``(episode, horizon, 4)``.
         step: steps since the plan was made.
-        observed: not needed: the environment moves the hand from where it was told to be last.
+        observed: ignored: the environment moves the hand from the last command.
     """
     return plans[:, min(step + 1, plans.shape[1] - 1)]
 
 
 _ON_ROBOT = ("new concept", 0.55, ""), ("training representation", 0.15, ""), ("training concept", 0.90, PUSH)
 PUBLISHED = tuple(Published(setting, value, task=task, metric=EXECUTED) for setting, value, task in _ON_ROBOT)
-"""The paper's numbers, on a real robot, 20 episodes each (section 4.5)."""
+"""Results of the paper on a real robot, 20 episodes each (section 4.5)."""
 
 _LOOP = ClosedLoop(
     environment=environment,
@@ -128,7 +128,7 @@ DOMAIN = Domain(
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
     closed_loop=_LOOP,
     paper=Paper(PUBLISHED, omega="learned", ours="learned", comparable=False),
-    fresh=False,  # an expert takes about half a second for an episode
+    fresh=False,  # an episode of an expert takes about half a second
 )
 WIDE = replace(
     DOMAIN,
@@ -138,4 +138,4 @@ WIDE = replace(
     closed_loop=replace(_LOOP, environment=wide_environment),
     paper=None,
 )
-"""The same table with more things to push and pick to, which the paper does not have."""
+"""Table-top with more pushes and picks than the paper."""

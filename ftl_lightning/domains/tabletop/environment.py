@@ -1,4 +1,4 @@
-"""A Panda at a table, in pybullet, as a gymnasium environment."""
+"""Gymnasium environment of a Panda arm at a table, simulated by pybullet."""
 
 from collections.abc import Collection
 from typing import Any
@@ -27,42 +27,41 @@ from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, O
 from ftl_lightning.errors import UserError
 
 TARGETS, SUBSTEPS = 3, 8
-"""In a step the arm is given so many targets in a row, for so many steps of the simulation each."""
+"""Arm targets per step, and simulation steps per target."""
 ITERATIONS = 20
-"""Of the search for the joint angles of a target."""
+"""Maximum iterations of inverse kinematics per target."""
 GAIN = 0.1
 FORCE = 20.0
-"""Newtons of a finger."""
+"""Force of a finger in newtons."""
 REACH = ((0.25, 0.78), (-0.36, 0.36), (0.008, 0.4))
-"""Metres in which the hand is moved."""
+"""Ranges of the hand position in metres."""
 TOUCH = 0.003
-"""Metres between circle and triangle at which they touch."""
+"""Maximum gap in metres between circle and triangle that counts as contact."""
 LIFTED, AWAY, STILL = 0.02, 0.05, 0.001
-"""Metres: the circle is lifted when it is so much higher than before, put down when the hand is open and so far above, and it has
-moved by less in a step."""
+"""Thresholds in metres: rise of a lifted circle; height of the open hand above a released circle, and the circle's maximum movement
+per step."""
 RECYCLE = 200
-"""A simulator is started anew after so many scenes: it does not give back all memory."""
+"""Scenes after which the simulator is restarted, since it leaks memory."""
 
 Seen = dict[str, NDArray[Any]]
 """Observed features by name."""
 
 
 class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
-    """An arm, a table and what lies on it.
+    """An arm, a table and objects.
 
-    Observed are :data:`FEATURES`. An action is where the hand should be 0.1 s later, and the opening of its gripper; the hand
-    points down and keeps its yaw. An episode is a function of scene and actions alone. It ends when the circle touches the
-    triangle or has been put down, and after :data:`MAX_STEPS` steps; the simulation can be stepped on. Every instance has a
-    simulator of its own, without a display.
+    Observations are :data:`FEATURES`. An action is the target position of the hand in 0.1 s and the gripper opening; the hand
+    points down with constant yaw. An episode is a function of scene and actions alone. It ends when the circle touches the
+    triangle or is released, and after :data:`MAX_STEPS` steps; the simulation can continue. Every instance has a separate
+    simulator, without display.
 
-    What ``step`` tells: places of ``circle``, ``triangle`` and book (``book place``), or ``None`` of what is not there; metres by
-    which the ``book`` has moved; whether the circle ``touched`` the triangle, and the names of all that it has touched
-    (``touches``); whether it was ``lifted`` and is ``released``; the ``trace``, joint angles and poses of all objects at each step,
-    for films.
+    Keys of the info: positions of ``circle``, ``triangle`` and book (``book place``), ``None`` for absent objects; displacement of
+    the ``book`` in metres; whether the circle ``touched`` the triangle, and names of all touched objects (``touches``); whether
+    the circle was ``lifted`` and is ``released``; the ``trace``, joint angles and object poses at each step, for films.
 
     Args:
-        arm_drawn: whether pictures show the arm, which hides much of the table from above.
-        ends_at: what ends an episode when the circle touches it.
+        arm_drawn: whether images show the arm, which hides much of the table from above.
+        ends_at: objects whose contact with the circle ends an episode.
 
     Raises:
         UserError: if the simulator does not start.
@@ -101,11 +100,11 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Build a scene.
 
         Args:
-            seed: of the scene that is drawn if none is given.
+            seed: seed of a drawn scene.
             options: ``scene``, 24 numbers; or ``task``, whose scene is drawn (default 'push green circle to orange triangle').
 
         Raises:
-            UserError: for a scene that cannot be built, see :func:`~ftl_lightning.domains.tabletop.scenes.check`.
+            UserError: for an invalid scene, see :func:`~ftl_lightning.domains.tabletop.scenes.check`.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -121,38 +120,38 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self.begun(), self._told()
 
     def _place(self, hand: NDArray[np.float64], opening: float) -> None:
-        """Put the hand somewhere at once."""
+        """Set the hand position without simulation."""
         robot = self.bodies.robot
         for joint, angle in zip(ARM, REST, strict=True):
             self.client.resetJointState(robot, joint, angle)
         for finger in FINGERS:
             self.client.resetJointState(robot, finger, opening / 2)
         self.command = np.array([*map(float, hand), opening])
-        for _ in range(10):  # each search starts from where the last one ended
+        for _ in range(10):  # each search starts from the previous solution
             for joint, angle in zip(ARM, self._angles(self.command[:3]), strict=True):
                 self.client.resetJointState(robot, joint, angle)
 
     def _angles(self, place: NDArray[np.float64]) -> list[float]:
-        """Joint angles that bring the hand there."""
+        """Joint angles of a hand position, by inverse kinematics."""
         robot, turn = self.bodies.robot, downward(float(self.scene[HAND][3]))
-        found = self.client.calculateInverseKinematics(
+        solution = self.client.calculateInverseKinematics(
             robot, TIP, place.tolist(), turn, maxNumIterations=ITERATIONS, residualThreshold=1e-5
         )
-        return list(found[: len(ARM)])
+        return list(solution[: len(ARM)])
 
     def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Move for 0.1 s. The reward is 0: what is right depends on the task, which physics does not know.
+        """Move for 0.1 s. The reward is 0: success depends on the task, which the environment does not know.
 
         Raises:
-            UserError: for an action of another size, or with numbers that are not finite.
+            UserError: for an action of wrong size, or with numbers that are not finite.
         """
-        told = np.asarray(action, dtype=np.float64)
-        if told.shape != (ACTION,) or not np.isfinite(told).all():
-            raise UserError(f"table-top action: expected {ACTION} finite numbers, found {told.tolist()}")
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != (ACTION,) or not np.isfinite(values).all():
+            raise UserError(f"table-top action: expected {ACTION} finite numbers, found {values.tolist()}")
         before = self.command[:3]
-        way = np.clip(told[:3], *np.transpose(REACH)) - before
+        way = np.clip(values[:3], *np.transpose(REACH)) - before
         way *= min(1.0, FASTEST / max(float(np.linalg.norm(way)), 1e-9))
-        opening = OPEN if told[3] > THRESHOLD else 0.0
+        opening = OPEN if values[3] > THRESHOLD else 0.0
         self.command = np.array([*(before + way), opening])
         robot = self.bodies.robot
         self.client.setJointMotorControlArray(
@@ -174,31 +173,31 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._touched |= {name for name in places if name != CIRCLE and self._touches(name, places)}
         self._lifted |= bool(places[CIRCLE][2] > self._first[CIRCLE][2] + LIFTED)
         self._trace.append(self._now())
-        seen, found = self._observation(), self._told()
+        seen, info = self._observation(), self._told()
         self._before = places[CIRCLE]
         return (
             seen,
             0.0,
-            bool(self.ends_at & self._touched) or (self._lifted and found["released"]),
+            bool(self.ends_at & self._touched) or (self._lifted and info["released"]),
             self._steps >= MAX_STEPS,
-            found,
+            info,
         )
 
     def places(self) -> dict[str, NDArray[np.float64]]:
         """Centres ``(3,)`` of the objects, by name."""
-        found = {name: self.client.getBasePositionAndOrientation(body)[0] for name, body in self.bodies.objects.items()}
-        return {name: np.array(place) for name, place in found.items()}
+        positions = {name: self.client.getBasePositionAndOrientation(body)[0] for name, body in self.bodies.objects.items()}
+        return {name: np.array(place) for name, place in positions.items()}
 
     def seen(self) -> NDArray[np.float32]:
-        """Of each of the five objects whether the camera sees it, and its centre: ``(5, 4)``."""
-        found = np.zeros((len(OBJECTS), 4), dtype=np.float32)
+        """Visibility and centre of each of the five objects: ``(5, 4)``."""
+        rows = np.zeros((len(OBJECTS), 4), dtype=np.float32)
         for name, place in self.places().items():
             if all(low <= value <= high for value, (low, high) in zip(place, REACH, strict=False)):
-                found[OBJECTS.index(name)] = (1.0, *place)
-        return found
+                rows[OBJECTS.index(name)] = (1.0, *place)
+        return rows
 
     def put(self, hand: NDArray[np.float64], circle: NDArray[np.float64], opening: float = 0.0) -> Seen:
-        """What is seen where an episode begins with the hand at ``(3,)`` and so far open, and the circle's centre at ``(2,)``."""
+        """Start an episode with given hand position ``(3,)``, opening, and circle centre ``(2,)``; return the observation."""
         self.client.resetBasePositionAndOrientation(
             self.bodies.objects[CIRCLE], [*map(float, circle), self._first[CIRCLE][2]], turned(0.0)
         )
@@ -206,7 +205,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self.begun()
 
     def begun(self) -> Seen:
-        """What is seen if an episode begins as things are now."""
+        """Start an episode in the current state and return the observation."""
         self._steps, self._lifted = 0, False
         self._touched: set[str] = set()
         self._first = self.places()
@@ -215,18 +214,18 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self._observation()
 
     def _touches(self, name: str, places: dict[str, NDArray[np.float64]]) -> bool:
-        """Whether the circle is beside an object, at its height, and touches it as seen from above."""
+        """Whether the circle touches an object from above, and is at the object's height."""
         circle, place = places[CIRCLE], places[name]
         level = abs(circle[2] - place[2]) < LIFTED if name == TRIANGLE else circle[2] < place[2] + HEIGHT[name] / 2
         return level and touching(self.outline(name), circle)
 
     def outline(self, name: str) -> NDArray[np.float64]:
-        """An object from above, as it lies, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""
+        """Current outline of an object, see :func:`~ftl_lightning.domains.tabletop.scenes.outline`."""
         place, turn = self.client.getBasePositionAndOrientation(self.bodies.objects[name])
         return outline(name, place[0], place[1], pybullet().getEulerFromQuaternion(turn)[2])
 
     def hand(self) -> NDArray[np.float64]:
-        """Measured place, quaternion and opening ``(8,)``."""
+        """Measured position, quaternion and opening ``(8,)``."""
         link = self.client.getLinkState(self.bodies.robot, TIP, computeForwardKinematics=1)
         opening = sum(state[0] for state in self.client.getJointStates(self.bodies.robot, FINGERS))
         return np.array([*link[4], *link[5], opening])
@@ -261,7 +260,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         return np.array([*joints, *(value for place, turn in poses for value in (*place, *turn))])
 
     def show(self, moment: NDArray[np.float64]) -> None:
-        """Put arm and objects where they were at a moment of a trace of this scene, for a picture."""
+        """Set arm and objects to a state of a trace of this scene, for rendering."""
         joints, poses = np.split(moment, [len(ARM) + len(FINGERS)])
         for joint, angle in zip((*ARM, *FINGERS), joints, strict=True):
             self.client.resetJointState(self.bodies.robot, joint, angle)
@@ -269,7 +268,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
             self.client.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
 
     def render(self) -> NDArray[np.uint8]:
-        """A picture ``(240, 320, 3)`` from the front, with the arm if this instance draws it."""
+        """Front view ``(240, 320, 3)``, with the arm if ``arm_drawn``."""
         return FRONT.picture(self.client, shadow=True)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Scripted experts: each says where the hand should go next, from where the objects are."""
+"""Scripted experts: policies that command the next hand position from the object positions."""
 
 import math
 from collections.abc import Callable, Generator
@@ -33,51 +33,51 @@ if TYPE_CHECKING:
 
 CLOSED = 0.0
 PUSH_HEIGHT = 0.014
-"""Metres of the hand above what the circle stands on while it pushes."""
+"""Hand height in metres above the surface under the circle during a push."""
 GRASP_HEIGHT = 0.016
 ASIDE = 0.006
-"""Metres beside the line at which a push begins at most."""
+"""Maximum lateral offset in metres at the start of a push."""
 SPEED = 0.008
-"""Metres a step of a push."""
+"""Push speed in metres per step."""
 SLOWER = 1.4
-"""On the book pushes are slower by this factor, which gives more moments to learn from."""
+"""Speed divisor of pushes on the book, which adds time steps to learn from."""
 STRAIGHT_SPEED = 0.009
 TREMBLE = 0.0003
-"""Metres, standard deviation of what each step of the hand is off."""
+"""Standard deviation of the hand noise per step, in metres."""
 SLIPS, SLIP = 0.04, (0.006, 0.018)
-"""How often the hand slips in a step of a push, and by how many metres: only demonstrations that leave the way show how to come
-back to it (Laskey et al., 2017). A hand that always wanders shows it too, but hides the way under its noise."""
+"""Slip probability per step of a push, and range of slip sizes in metres. Recovery is learned only from demonstrations that leave
+the path (Laskey et al., 2017); constant noise would hide the path."""
 RETURN = 0.8
-"""Share of what the hand is off its way that is left a step later."""
+"""Share of the hand's deviation from its path that remains a step later."""
 MISLAID = 0.6
-"""How often the circle lies elsewhere where a push begins anew."""
+"""Recoveries: probability that the circle is moved."""
 LYING, RISING, OVER = 0.5, 0.4, 0.03
-"""How often the hand is low there, how often else it is beside the circle, and metres above the height of pushing from which on it
-may be over it."""
+"""Recoveries: probability of a low hand, probability of a hand beside the circle otherwise, and height in metres above push height
+from which the hand may be over the circle."""
 ASTRAY, REACHED = ((0.32, 0.70), (-0.28, 0.28)), ((0.26, 0.77), (-0.35, 0.35))
-"""x and y of circle and hand there."""
+"""Recoveries: x and y ranges of circle and hand."""
 OPENED = 0.5
-"""How often a hand that picks is open there."""
+"""Recoveries of picks: probability of an open hand."""
 HIGHEST = 0.16
-"""Metres above the height of pushing at which a hand that picks is at most there."""
+"""Recoveries of picks: maximum hand height in metres above push height."""
 AROUND, ROOM, FARTHEST_PUSH = (0.034, 0.08), 0.012, 0.33
-"""Metres from circle to hand, from the circle to other things at least, and to the triangle at most, there."""
+"""Recoveries, in metres: range from circle to hand, minimum gap from circle to other objects, maximum distance to the target."""
 APART_FROM = 0.12
-"""Metres between a thing and the circle that is put down beside it, centre to centre: the fingers, which open, need room."""
+"""Centre distance in metres between an object and the circle placed beside it; leaves room for open fingers."""
 
 Moves = Generator[Place, None, None]
-"""Places ``(4,)`` to go to, one a step: x, y, z and opening."""
+"""Commands ``(4,)`` per step: x, y, z and gripper opening."""
 
 
 @dataclass(frozen=True)
 class Style:
-    """What varies between two demonstrations, drawn once for each.
+    """Variation between demonstrations, drawn once per demonstration.
 
     Attributes:
         speed: factor of all speeds.
-        behind, aside: metres behind the circle, and to the left of the line to where it goes, at which a push begins.
-        hover: height in metres at which the hand travels.
-        grasp, place: metres, beside the circle's centre and beside where it is put.
+        behind, aside: start of a push in metres, behind the circle and left of the line to its goal.
+        hover: travel height in metres.
+        grasp, place: offsets from the circle's centre in metres, and from its goal as a share (-1..1) of the allowed spread.
     """
 
     speed: float
@@ -89,7 +89,7 @@ class Style:
 
 
 def style(rng: np.random.Generator) -> Style:
-    """At random."""
+    """Draw a style."""
     return Style(
         speed=float(rng.uniform(0.8, 1.2)),
         behind=float(rng.uniform(0.06, 0.07)),
@@ -101,7 +101,7 @@ def style(rng: np.random.Generator) -> Style:
 
 
 class _Expert:
-    """What an expert knows: the world as it is, its style, and where it went last."""
+    """State of an expert: environment, style and last command."""
 
     def __init__(self, env: "TableTopEnvironment", task: str, how: Style) -> None:
         self.env, self.task, self.how = env, task, how
@@ -111,7 +111,7 @@ class _Expert:
         return self.env.places()[CIRCLE]
 
     def go(self, place: Place, speed: float, opening: float) -> Moves:
-        """Straight there, with a soft start and end; metres a step at most. A hand that is off this way comes back to it."""
+        """Move straight, with smooth start and end, at most ``speed`` metres per step. Deviations from the line decay."""
         start, goal = self.at[:3].copy(), np.asarray(place, dtype=np.float64)
         before = start
         steps = max(2, math.ceil(1.3 * float(np.linalg.norm(goal - start)) / (speed * self.how.speed)))
@@ -129,14 +129,14 @@ class _Expert:
 
 
 def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | None = None, feedback: bool = True) -> Moves:
-    """What the expert of a task does in the scene in which the environment is.
+    """Generate the commands of a task's expert in the current scene.
 
     Args:
-        env: reset; it is looked at, not stepped.
-        task: known.
-        how: the demonstration's style.
-        height: of pushes, in metres above the table; by default above what the circle stands on.
-        feedback: whether pushes look where the circle is; else they go straight to where the triangle is in the beginning.
+        env: environment after reset; it is not stepped.
+        task: known task.
+        how: style of the demonstration.
+        height: push height in metres above the table; by default above the surface under the circle.
+        feedback: whether pushes observe the circle; otherwise they go straight to the triangle's initial position.
     """
     expert = _Expert(env, task, how)
     if task not in PUSHES:
@@ -147,7 +147,7 @@ def moves(env: "TableTopEnvironment", task: str, how: Style, height: float | Non
 
 def _pick(expert: _Expert) -> Moves:
     scene, how = expert.env.scene, expert.how
-    if expert.at[2] < expert.circle()[2] + CLEAR:  # a grasp has missed; fingers that open here might move the circle
+    if expert.at[2] < expert.circle()[2] + CLEAR:  # missed grasp: opening fingers might move the circle
         yield from expert.go(np.array([*expert.at[:2], expert.circle()[2] + CLEAR]), 0.014, float(expert.at[3]))
     circle = expert.circle()
     target, surface = _target(expert)
@@ -165,12 +165,12 @@ def _pick(expert: _Expert) -> Moves:
 
 
 def _target(expert: _Expert) -> tuple[Place, float]:
-    """Where the circle is put, and how high that is."""
+    """Return the goal of the circle and its surface height."""
     scene, how = expert.env.scene, expert.how
     if expert.task in (TO_BOOK, TO_WHITE):
         name, spread = (BOOK, 0.02) if expert.task == TO_BOOK else (WHITE, 0.012)
         return scene[COLUMNS[name]][1:3].astype(np.float64) + spread * how.place, HEIGHT[name]
-    # On the side of the thing where it lay: which one that is does not change when the scene is turned.
+    # The side of the object where the circle lay, which is invariant to rotations of the scene.
     thing = scene[COLUMNS[TARGET[expert.task]]][1:3].astype(np.float64)
     along = expert.circle()[:2] - thing
     along /= np.linalg.norm(along)
@@ -178,7 +178,7 @@ def _target(expert: _Expert) -> tuple[Place, float]:
 
 
 def _behind(expert: _Expert, goal: Place) -> Place:
-    """Where a push of the circle towards a goal begins that is made without looking."""
+    """Return the start of an open-loop push of the circle to a goal."""
     circle = expert.circle()[:2]
     return circle - expert.how.behind * (goal - circle) / np.linalg.norm(goal - circle)
 
@@ -188,7 +188,7 @@ def _goal(expert: _Expert) -> Place:
 
 
 def _push(expert: _Expert, height: float) -> Moves:
-    """Bring the circle to what the task names, looking where it goes."""
+    """Push the circle to the task's target, with feedback."""
     how = expert.how
     speed = SPEED * how.speed / (SLOWER if expert.task == PUSH_ON_BOOK else 1.0)
     manner = Manner(height, speed, how.speed, how.behind, how.aside)
@@ -202,7 +202,7 @@ def _push(expert: _Expert, height: float) -> Moves:
 
 
 def _straight(expert: _Expert, height: float) -> Moves:
-    """Push on the line from the circle to what the task names as they lie in the beginning."""
+    """Push along the initial line from the circle to the task's target."""
     goal = _goal(expert).copy()
     begin = _behind(expert, goal)
     yield from expert.go(np.array([*begin, height + 0.06]), 0.016, CLOSED)
@@ -215,15 +215,15 @@ def _straight(expert: _Expert, height: float) -> Moves:
 
 @dataclass(frozen=True)
 class Episode:
-    """What an expert did.
+    """Episode of an expert.
 
     Attributes:
-        commands: ``(time, 4)``, where the hand was told to be; the first is where it starts.
-        actions: ``(steps, 4)``, what the environment was given; of an action that is too far away it goes the first part alone.
+        commands: ``(time, 4)``, executed commands; the first is the initial state.
+        actions: ``(steps, 4)``, actions passed to the environment, which shortens moves that are too far.
         images: ``(time, 3, 64, 64)`` uint8.
-        poses: ``(time, 8)``, as measured.
-        success: whether it did the task.
-        places: ``(time, 5, 4)``, what is where in the pictures; known where distractors are scattered.
+        poses: ``(time, 8)``, measured.
+        success: whether the task is done.
+        places: ``(time, 5, 4)``, object positions in the images; only with scattered distractors.
     """
 
     commands: NDArray[np.float32]
@@ -235,11 +235,11 @@ class Episode:
 
 
 Begin = Callable[["TableTopEnvironment", str, np.random.Generator], dict[str, NDArray[Any]]]
-"""``(environment, task, what is random) -> what is seen where a demonstration begins``."""
+"""``(environment, task, rng) -> first observation of the demonstration``."""
 PAST = 8
-"""Steps that a push goes on after it has succeeded: who sees distances a little wrong would stop before the triangle."""
+"""Steps that a push continues after success: small position errors must not stop a policy before the triangle."""
 STAY = 4
-"""Steps that the hand stays after a task is done, so that plans end at rest."""
+"""Steps of rest after a task, so that plans end at rest."""
 
 
 def perform(
@@ -252,21 +252,21 @@ def perform(
     scatter: bool = False,
     begin: Begin | None = None,
 ) -> Episode:
-    """One episode of the expert of a task.
+    """Run an episode of a task's expert.
 
     Args:
-        env: any; it is reset.
-        task: known.
-        scene: of it.
-        rng: draws its style and its noise.
+        env: environment, which is reset.
+        task: known task.
+        scene: scene of the task.
+        rng: random generator of style and noise.
         height, feedback: see :func:`moves`.
-        scatter: whether distractors lie elsewhere in each picture, see :mod:`ftl_lightning.domains.tabletop.distractors`.
-        begin: what happens in the scene before the demonstration begins, such as :func:`led_astray`; nothing for ``None``.
+        scatter: whether to move distractors in each image, see :mod:`ftl_lightning.domains.tabletop.distractors`.
+        begin: change of the scene before the demonstration, such as :func:`led_astray`; ``None`` for no change.
 
     Raises:
-        UserError: for a scene that cannot be built.
+        UserError: for an invalid scene.
     """
-    seen, told = env.reset(options={"scene": scene})
+    seen, info = env.reset(options={"scene": scene})
     if begin is not None:
         seen = begin(env, task, rng)
     how = style(rng)
@@ -276,21 +276,21 @@ def perform(
     for command in moves(env, task, how, height, feedback):
         off = TREMBLE * rng.standard_normal(3)
         angle, size, slips = rng.uniform(-math.pi, math.pi), rng.uniform(*SLIP), rng.random() < SLIPS
-        if slips and task in PUSHES and feedback:  # who does not look cannot come back
+        if slips and task in PUSHES and feedback:  # no recovery without feedback
             off[:2] += size * np.array([math.cos(angle), math.sin(angle)])
         actions.append((command + np.array([*off, 0.0])).astype(np.float32))
-        seen, _, terminated, truncated, told = env.step(actions[-1])
+        seen, _, terminated, truncated, info = env.step(actions[-1])
         commands.append(env.command.copy())
         images.append(seen[IMAGE])
         poses.append(seen[POSE])
-        done = judged(task, env.scene, told)
+        done = judged(task, env.scene, info)
         if ended is None and (terminated or truncated or (done and task in PUSHES)):
             ended, success = len(actions), done
         if ended is not None and len(actions) >= ended + (PAST if success and task in PUSHES else 0):
             break
     places = None
     if scatter:
-        pictures, places = scattered(env, task, told["trace"], rng)
+        pictures, places = scattered(env, task, info["trace"], rng)
         images, places = list(pictures), _stayed(list(places))
     return Episode(
         _stayed(commands).astype(np.float32),
@@ -307,14 +307,14 @@ def _stayed(values: list[Any]) -> NDArray[Any]:
 
 
 def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
-    """What is seen where a task begins anew after it went wrong: the hand at any side of the circle, low or above it, and the
-    circle, in :data:`MISLAID` of the episodes, elsewhere on the table, also beyond where it begins else. A hand that picks may
-    be open above the circle, or closed and empty anywhere.
+    """Start a recovery from a failure: the hand on any side of the circle, low or above it, open or closed and empty in picks.
+
+    With probability :data:`MISLAID` the circle lies elsewhere, also outside its initial range. Open hands are above it.
 
     Args:
-        env: reset to a scene of the task, which is changed.
-        task: known.
-        rng: draws both.
+        env: environment reset to a scene of the task, which is changed.
+        task: known task.
+        rng: random generator.
     """
     circle, others = env.places()[CIRCLE], {name: env.outline(name) for name in env.bodies.objects if name != CIRCLE}
     below, picks = support(env.scene, CIRCLE), task not in PUSHES
@@ -334,7 +334,7 @@ def led_astray(env: "TableTopEnvironment", task: str, rng: np.random.Generator) 
         hand = place + distance * np.array([math.cos(angle), math.sin(angle)])
         height = below + PUSH_HEIGHT + (0.0 if low else rng.uniform(0, OVER) if rising else rng.uniform(OVER, highest))
         finger = outline(CIRCLE, float(hand[0]), float(hand[1]), 0.0)
-        free = all(gap(shape, other) >= ROOM and gap(finger, other) >= APART for other in others.values())
+        free = all(gap(shape, obstacle) >= ROOM and gap(finger, obstacle) >= APART for obstacle in others.values())
         far = not picks and np.linalg.norm(place - env.places()[TARGET[task]][:2]) > FARTHEST_PUSH
         if free and not far and all(low < value < high for value, (low, high) in zip(hand, REACHED, strict=True)):
             return env.put(np.array([*hand, height]), place, OPEN if opened else CLOSED)

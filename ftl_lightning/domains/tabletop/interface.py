@@ -1,4 +1,4 @@
-"""What is seen of the table-top and what is commanded, which need no simulator."""
+"""Observations and actions of the table-top, without the simulator."""
 
 from ftl_lightning.demonstrations.features import Feature
 from ftl_lightning.domains.tabletop.world import OVERHEAD
@@ -9,24 +9,24 @@ STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
 STATE_UNITS = ("m",) * 4
 IMAGE, POSE, PLACES = "image", "pose", "places"
 FEATURES = {IMAGE: Feature((3, *OVERHEAD.size), "image"), POSE: Feature((8,), state=(0, 1, 2, 7))}
-"""The overhead camera's picture, without the arm; measured place (m), quaternion (real part last) and opening (m) of the hand.
+"""Image of the overhead camera, without the arm; measured position (m), quaternion (real part last) and opening (m) of the hand.
 
-Place and opening are what a plan starts from, but for the millimetres by which the arm lags behind what it is told.
+Position and opening are the initial state of a plan, up to the arm's lag of millimetres behind the command.
 """
 SEEN = Feature((5, 4))
-"""Privileged: of each object whether the camera sees it, and its centre (m). Only the pictures of a training set come with it."""
+"""Privileged feature: visibility and centre (m) of each object, only for images of a training set."""
 ACTION = 4
-"""Place of the hand (m) and opening of the gripper (m): what plans consist of."""
+"""Size of an action: position of the hand (m) and opening of the gripper (m)."""
 HERTZ = 10
-"""Actions a second."""
+"""Actions per second."""
 MAX_STEPS = 160
-"""The paper's number: 16 seconds."""
+"""Maximum steps per episode, as in the paper: 16 seconds."""
 OPEN, THRESHOLD = 0.08, 0.06
-"""Metres between the fingers of an open gripper; an action with a larger opening than the threshold opens it, others close it."""
+"""Opening of an open gripper in metres, and threshold above which an action opens the gripper instead of closing it."""
 
 
 def expect_simulator() -> None:
-    """Refuse to go on without pybullet.
+    """Require pybullet.
 
     Raises:
         UserError: with the command that installs it.

@@ -1,4 +1,4 @@
-"""Reference lines of pushing: what the expert, one that ignores heights and one that does not look achieve from the same starts."""
+"""Reference policies of pushes: the expert, an expert without height, and an expert without feedback, from the same starts."""
 
 import logging
 from collections.abc import Callable
@@ -21,10 +21,10 @@ _Make = Callable[[str, InitialStates, Demonstrations | None, int], Policy | None
 
 
 def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: bool = True) -> _Make:
-    """Actions of an expert that was there before, in a simulation of its own, which comes to the same to the bit.
+    """Policy that replays actions of an expert, recorded in a separate simulation; bitwise equal to running the expert.
 
     Args:
-        tasks: of other tasks there is no such line.
+        tasks: tasks with this reference.
         height, feedback: see :func:`ftl_lightning.domains.tabletop.experts.moves`.
     """
 
@@ -43,7 +43,7 @@ def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: boo
                     actions.append(torch.from_numpy(done.actions))
                 except (UserError, MemoryError, OSError):
                     raise
-                except Exception as error:  # whatever the simulator raises: the other episodes go on
+                except Exception as error:  # any error of the simulator: other episodes continue
                     _LOG.warning("table-top %r, episode %d: %r; the reference line has no action there", goal, row, error)
                     actions.append(torch.full((1, ACTION), torch.nan))
                     env.close()
@@ -60,4 +60,4 @@ POLICIES = {
     "table-height push": _repeated((PUSH_ON_BOOK,), height=PUSH_HEIGHT),
     "straight push": _repeated((PUSH, PUSH_ON_BOOK), feedback=False),
 }
-"""``table-height push`` does on the book what pushing on the table is; ``straight push`` never looks again."""
+"""``table-height push`` pushes on the book at table height; ``straight push`` has no feedback."""

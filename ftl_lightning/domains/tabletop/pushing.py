@@ -1,7 +1,7 @@
-"""How an expert pushes: where the hand goes next, from where things are now alone.
+"""Feedback policy of a push: the next hand position as a function of the current positions alone.
 
-The hand pushes while it is low and behind the circle. Wherever else it is, it goes up, over the table, and comes down behind the
-circle. So the same rule begins a push and begins it again when the circle has slipped away, and nothing has to be remembered.
+A low hand behind the circle pushes. Any other hand rises, travels above the table, and descends behind the circle. The same rule
+thus starts a push and restarts it when the circle has slipped away, without memory.
 """
 
 import math
@@ -16,34 +16,34 @@ from ftl_lightning.domains.tabletop.scenes import RING
 Place = NDArray[np.float64]
 
 WIDEST = 0.8
-"""Radians from the line behind the circle, seen from the circle, up to which the hand pushes on."""
+"""Maximum angle in radians of a pushing hand from the line behind the circle, seen from the circle."""
 FARTHEST = 0.12
-"""Metres from the circle's centre up to which a low hand pushes on."""
+"""Maximum distance in metres of a pushing hand from the circle's centre."""
 STEERING = 3.0
-"""Radians that the hand's direction differs from the circle's for each radian that the hand is off the line behind it: 1 goes
-straight for the circle's centre, more gets back to that line."""
+"""Steering gain: deviation of the hand's direction from the circle's, per radian of the hand's angle. 1 moves straight to the
+circle's centre, larger values return to the line behind it."""
 LOW = 0.006
-"""Metres above the height of pushing below which a hand counts as low."""
+"""Height in metres above push height below which a hand is low."""
 CLEAR = 0.065
-"""Metres above the height of pushing at which the hand travels: above everything on the table."""
+"""Travel height in metres above push height, above all objects."""
 NEAR, FUNNEL = 0.015, 0.03
-"""Metres from where it comes down: nearer than the first the hand may be low, and so much farther it has to be clear. The first is
-more than demonstrations differ in where they come down, or their mean is to stay in the air."""
+"""Distances in metres from the point of descent: radius in which the hand may be low, and width of the funnel above it. The radius
+exceeds the spread of this point between demonstrations; otherwise their mean would stay in the air."""
 ACROSS, DOWN, UP = 0.016, 0.011, 0.014
-"""Metres a step at most, off the line, down and up."""
+"""Maximum metres per step sideways, down and up."""
 AHEAD = 0.05
-"""Metres on the way around the bowl, by which what the circle is pushed to is ahead of it."""
+"""Distance in metres of the circle's next goal on the path around the bowl."""
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How a push is done.
+    """Style of a push.
 
     Attributes:
-        height: metres of the hand above the table.
-        speed: metres a step, of a hand that pushes.
-        haste: factor of the speed of a hand that travels.
-        behind, aside: metres behind the circle, and to the left of the line to where it goes, at which a push begins.
+        height: hand height in metres above the table.
+        speed: metres per step while pushing.
+        haste: factor of the travel speed.
+        behind, aside: start of the push in metres, behind the circle and left of the line to its goal.
     """
 
     height: float
@@ -54,15 +54,15 @@ class Manner:
 
 
 def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
-    """Where the hand goes next ``(3,)`` to push the circle to a goal.
+    """Next hand position ``(3,)`` of a push of the circle to a goal.
 
-    The direction of a hand at an angle a behind the circle is :data:`STEERING` times a from the circle's; with 2 that is a dipole
-    field (Igarashi et al., 2010).
+    For a hand at angle a behind the circle, the hand's direction differs by :data:`STEERING` times a from the circle's; a gain of 2
+    is a dipole field (Igarashi et al., 2010).
 
     Args:
         hand: ``(3,)``.
-        circle, goal: ``(2,)``, its centre and where that should go; metres.
-        manner: of the push.
+        circle, goal: ``(2,)``, the circle's centre and its goal; metres.
+        manner: style of the push.
     """
     along, to = complex(*(goal - circle)), complex(*(circle - hand[:2]))
     distance = abs(to)
@@ -77,20 +77,20 @@ def pushed(hand: Place, circle: Place, goal: Place, manner: Manner) -> Place:
 
 
 def _travelled(hand: Place, begin: Place, manner: Manner) -> Place:
-    """Where a hand goes that has to come down at a place ``(2,)``: up first, and down only above it."""
+    """Next position of a hand that descends at ``begin`` ``(2,)``: up first, down only above it."""
     off = begin - hand[:2]
     away = float(np.linalg.norm(off))
     wanted = manner.height + CLEAR * min(1.0, max(0.0, (away - NEAR) / FUNNEL))
-    free = min(1.0, max(0.0, 1 - (wanted - hand[2]) / FUNNEL))  # a hand that is too low rises before it moves
+    free = min(1.0, max(0.0, 1 - (wanted - hand[2]) / FUNNEL))  # a low hand rises before it moves
     step = min(away, free * min(ACROSS * manner.haste, 0.35 * away + 0.0005))
     rise = float(np.clip(wanted - hand[2], -DOWN * manner.haste, UP * manner.haste))
     return np.array([*(hand[:2] + step * off / max(away, 1e-9)), hand[2] + rise])
 
 
 def around(circle: Place, goal: Place, bowl: Place) -> Place:
-    """Where the circle should go next ``(2,)`` to come to a goal around the bowl: a place :data:`AHEAD` on its way.
+    """Next goal ``(2,)`` of the circle on the way around the bowl to a goal, :data:`AHEAD` along the path.
 
-    The way goes straight to the ring around the bowl, along it on the side where it is shorter, and straight on.
+    The path leads straight to the ring around the bowl, along its shorter side, and straight on.
 
     Args:
         circle, goal, bowl: centres ``(2,)``.
@@ -110,17 +110,17 @@ def around(circle: Place, goal: Place, bowl: Place) -> Place:
 
 
 def _on(way: Place, distance: float) -> Place:
-    """The place on a way ``(n, 2)`` at a distance from its start, or its end."""
+    """Point on a path ``(n, 2)`` at a distance from its start, or its end."""
     travelled = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))))
     return np.array([np.interp(distance, travelled, column) for column in way.T])
 
 
-def _cross(one: Sequence[float] | Place, other: Sequence[float] | Place) -> float:
-    return float(one[0] * other[1] - one[1] * other[0])
+def _cross(first: Sequence[float] | Place, second: Sequence[float] | Place) -> float:
+    return float(first[0] * second[1] - first[1] * second[0])
 
 
 def _tangent(centre: Place, place: Place, turn: float) -> float:
-    """Angle on the ring around a centre where the line from a place touches it."""
+    """Angle on the ring around a centre of the tangent from a point."""
     off = place - centre
     distance = max(float(np.linalg.norm(off)), RING + 1e-6)
     return math.atan2(off[1], off[0]) - turn * math.acos(RING / distance)

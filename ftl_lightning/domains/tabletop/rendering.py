@@ -1,4 +1,4 @@
-"""Pictures: plans from above, and films of episodes with the plans in them."""
+"""Figures of plans from above, and films of episodes with their plans."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -19,19 +19,19 @@ from ftl_lightning.escape import figure_text
 
 MAX_COLUMNS = 4
 FRAMES = 60
-"""At most, of an episode."""
+"""Maximum number of frames of an episode."""
 _OPEN, _CLOSED = (0, 150, 255), (255, 0, 90)
-"""Of a plan's places in a film, by what the gripper does there."""
+"""Colours of a plan's states in a film, by gripper command."""
 
 
 def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: InitialStates | None) -> Figure:
-    """A grid of tables from above with the hand's way, as far as it is planned.
+    """Grid of tables from above with the planned paths of the hand.
 
     Args:
         states: plans ``(sample, horizon, 4)``.
-        right: whether the task holds, one entry a sample (green and red frames); ``None`` for grey frames.
-        title: above the grid.
-        starts: with scenes, whose objects are drawn; without, the ways alone.
+        right: success per sample (green and red frames); ``None`` for grey frames.
+        title: title of the figure.
+        starts: initial states, whose scenes are drawn; without scenes, paths only.
     """
     columns = min(len(states), MAX_COLUMNS)
     rows = -(-len(states) // columns)
@@ -49,7 +49,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
 
 def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | None, frame: str) -> None:
     placed = {} if scene is None else outlines(scene)
-    for name in sorted(placed, key=(BOOK, WHITE).__contains__, reverse=True):  # what lies on the book is drawn after it
+    for name in sorted(placed, key=(BOOK, WHITE).__contains__, reverse=True):  # objects on the book are drawn after it
         points = placed[name][:, ::-1]  # y to the left and x up, as the camera sees it
         axes.add_patch(Polygon(points, facecolor=COLOUR[name], edgecolor="#404040" if name != CIRCLE else "none", linewidth=0.5))
     axes.plot(plan[:, 1], plan[:, 0], color="#d0006f", linewidth=1.2)
@@ -61,11 +61,11 @@ def _table(axes: Axes, plan: NDArray[np.float32], scene: NDArray[np.float32] | N
 
 
 def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
-    """At most :data:`FRAMES` pictures ``(240, 320, 3)`` of an episode from the front, with the plan that was followed then.
+    """Front views ``(240, 320, 3)`` of an episode with the current plan, at most :data:`FRAMES`.
 
     Args:
-        rollout: of one episode.
-        plans: ``(step, horizon, 4)``; blue where the gripper is to be open, red where it is to be closed.
+        rollout: rollout of a single episode.
+        plans: ``(step, horizon, 4)``; blue for an open gripper, red for a closed gripper.
     """
     expect_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
@@ -97,32 +97,30 @@ def _with_plan(picture: NDArray[np.uint8], plan: NDArray[np.float32]) -> NDArray
 
 
 DEPTH = 0.45
-"""Of how far behind something is, so much of upwards in films of shapes."""
+"""Vertical shift per depth in vector films."""
 LAYERS = 4
-"""Outlines above one another that an object is drawn by."""
+"""Stacked outlines per object."""
 SHAPE_FRAMES, SPEED = 50, 2.0
-"""At most, of films of shapes, and how many times as fast as it was they play."""
+"""Maximum number of frames and speed factor of vector films."""
 HAND, WAY = "#5a5f66", "#d0006f"
 
 
 def vector_film(rollout: Rollout) -> VectorFilm:
-    """An episode from the front, objects as layers above one another, the gripper as its two fingers."""
+    """Vector film of an episode from the front: objects as stacked outlines, the gripper as two fingers."""
     trace = np.stack(rollout.infos[0]["trace"]) if rollout.infos[0].get("trace") else np.zeros((1, 0))
     scene = rollout.starts.require_scenes()[0].numpy()
     times = some(len(trace), SHAPE_FRAMES)
     hand = rollout.observed[POSE][0].numpy()[times]
     present = [name for name in OBJECTS if scene[COLUMNS[name]][0] > 0.5]
     poses = dict(zip(present, np.split(trace[times, len(ARM) + len(FINGERS) :], max(len(present), 1), axis=1), strict=False))
-    placed = {
-        name: np.array([(x, y, z - HEIGHT[name] / 2, _yaw(turn)) for x, y, z, *turn in found]) for name, found in poses.items()
-    }
+    placed = {name: np.array([(x, y, z - HEIGHT[name] / 2, _yaw(turn)) for x, y, z, *turn in rows]) for name, rows in poses.items()}
     return _from_front([*_objects(placed), *_hand(hand[:, :3], hand[:, 7])], len(times), len(trace))
 
 
 def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
-    """The hand's way of a plan or a demonstration ``(time, 4)`` from the front; objects, where they are known, as they lie first.
+    """Vector film of a plan or a demonstration ``(time, 4)`` from the front, with objects at their initial poses, if known.
 
-    Nothing tells of a plan what becomes of the objects: they stay.
+    A plan does not predict objects: they stay.
     """
     times = some(len(states), SHAPE_FRAMES)
     hand = states.numpy()[times]
@@ -137,7 +135,7 @@ def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
 
 
 def _from_front(shapes: Sequence[Shape], frames: int, steps: int) -> VectorFilm:
-    """Shapes on the table: frames that were chosen of so many steps."""
+    """Film of shapes on the table: ``frames`` selected of ``steps``."""
     (low, high), (left, right) = SIGHT  # y grows to the right from the front
     table = [(low, right), (low, left), (high, left), (high, right)]
     top = still("area", _front(np.array([(*corner, 0.0) for corner in table])), _hex(TABLE_COLOUR, 1.25))
@@ -146,8 +144,8 @@ def _from_front(shapes: Sequence[Shape], frames: int, steps: int) -> VectorFilm:
 
 
 def _objects(placed: Mapping[str, NDArray[np.floating]]) -> Iterator[Shape]:
-    """Objects at places ``(frame, 4)``: x, y, the height of what they stand on, and yaw."""
-    for name in sorted(placed, key=(BOOK, WHITE).__contains__, reverse=True):  # what lies on the book is drawn after it
+    """Outlines of objects at poses ``(frame, 4)``: x, y, height of the surface below, and yaw."""
+    for name in sorted(placed, key=(BOOK, WHITE).__contains__, reverse=True):  # objects on the book are drawn after it
         for layer in range(LAYERS):
             above = HEIGHT[name] * layer / (LAYERS - 1)
             edges = [(outline(name, x, y, yaw), foot + above) for x, y, foot, yaw in placed[name].tolist()]
@@ -156,7 +154,7 @@ def _objects(placed: Mapping[str, NDArray[np.floating]]) -> Iterator[Shape]:
 
 
 def _hand(places: NDArray[np.floating], opening: NDArray[np.floating]) -> Iterator[Shape]:
-    """The gripper's two fingers so far apart ``(frame,)`` around places ``(frame, 3)``, and a dot on the table below it."""
+    """Fingers with an opening ``(frame,)`` at positions ``(frame, 3)``, and a dot on the table below them."""
     yield Shape("dots", _front(places * (1, 1, 0))[:, None].astype(np.float32), _hex(TABLE_COLOUR, 0.8), 0.008)
     for side in (-0.5, 0.5):
         tip = places + np.outer(opening + 0.012, (0, side, 0))
@@ -165,11 +163,11 @@ def _hand(places: NDArray[np.floating], opening: NDArray[np.floating]) -> Iterat
 
 
 FAR = 0.78
-"""x of what is drawn at height 0."""
+"""x that is drawn at height 0."""
 
 
 def _front(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Where places ``(..., 3)`` in metres are seen from the front, obliquely: ``(..., 2)``, to the right and upwards."""
+    """Oblique front projection of points ``(..., 3)`` in metres: ``(..., 2)``, to the right and upwards."""
     return np.stack((points[..., 1], points[..., 2] + DEPTH * (FAR - points[..., 0])), axis=-1)
 
 

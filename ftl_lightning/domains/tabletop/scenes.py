@@ -1,6 +1,6 @@
-"""A scene: 24 numbers that say what stands where on the table, and where the hand starts. Metres and radians.
+"""Scenes: 24 numbers, the poses of the objects on the table and the initial pose of the hand, in metres and radians.
 
-The robot's base is at the origin, the table's top is z = 0. An object takes four numbers (present, x, y, yaw), the hand four
+The robot's base is the origin, the table's top is z = 0. An object has four numbers (present, x, y, yaw), the hand four
 (x, y, z, yaw).
 """
 
@@ -49,31 +49,31 @@ TARGET = {
     PUSH_TO_WHITE: WHITE,
     PUSH_TO_BOOK: BOOK,
 }
-"""What the circle is brought to."""
+"""Object to which a task brings the circle."""
 
 RADIUS = {CIRCLE: 0.025, BOWL: 0.05, TRIANGLE: 0.07 / math.sqrt(3)}
-"""Of the circle and the bowl, and of the corners of the triangle, whose side is 7 cm."""
+"""Radii of circle and bowl, and circumradius of the triangle with sides of 7 cm."""
 SIZE = {BOOK: (0.22, 0.16), WHITE: (0.13, 0.13)}
 HEIGHT = {CIRCLE: 0.03, TRIANGLE: 0.03, BOOK: 0.03, WHITE: 0.06, BOWL: 0.045}
 WORKSPACE = ((0.36, 0.66), (-0.24, 0.24))
-"""x and y in which the circle and the triangle have their centres."""
+"""x and y ranges of the centres of circle and triangle."""
 SIGHT = ((0.22, 0.78), (-0.34, 0.34))
-"""x and y in which every object lies as a whole: what the camera sees and the arm does not touch."""
+"""x and y ranges that contain every object: seen by the camera, not touched by the arm."""
 START = ((0.39, 0.45), (-0.03, 0.03), (0.17, 0.23), (-0.1, 0.1))
-"""Where the hand starts."""
+"""Ranges of the hand's initial pose."""
 RING = RADIUS[BOWL] + RADIUS[CIRCLE] + 0.028
-"""Radius in metres of the circle's way around the bowl."""
+"""Radius in metres of the circle's path around the bowl."""
 BOWL_BESIDE = (0.008, 0.03)
-"""Metres of the bowl's centre beside the line from circle to triangle, which decide on which side the way is shorter."""
+"""Range in metres of the bowl's offset from the line from circle to triangle; its side decides which path is shorter."""
 APART = 0.002
-"""Metres between objects, at least."""
+"""Minimum gap in metres between objects."""
 
 Points = NDArray[np.float64]
 """Corners ``(n, 2)`` of a convex outline, counter-clockwise."""
 
 
 def outline(name: str, x: float, y: float, yaw: float) -> Points:
-    """An object from above; circles are polygons of 24 corners."""
+    """Outline from above; circles are polygons of 24 corners."""
     if name in SIZE:
         length, width = SIZE[name]
         corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
@@ -90,7 +90,7 @@ def _normals(points: Points) -> Points:
 
 
 def gap(one: Points, other: Points) -> float:
-    """Metres between two outlines; less where corner faces corner, negative where they overlap."""
+    """Gap between two outlines in metres; a lower bound between corners, negative for overlap."""
     sides = []
     for a, b in ((one, other), (other, one)):
         normals = _normals(a)
@@ -99,80 +99,80 @@ def gap(one: Points, other: Points) -> float:
 
 
 def within(one: Points, other: Points) -> bool:
-    """Whether an outline lies inside another one."""
+    """Whether an outline lies inside another."""
     normals = _normals(other)
     return bool(((one @ normals.T).max(axis=0) <= (other @ normals.T).max(axis=0) + 1e-9).all())
 
 
 def outlines(scene: NDArray[np.float32]) -> dict[str, Points]:
-    """The objects that a scene has, by name."""
+    """Outlines of the objects of a scene, by name."""
     return {name: outline(name, *map(float, scene[columns][1:])) for name, columns in COLUMNS.items() if scene[columns][0] > 0.5}
 
 
 def support(scene: NDArray[np.float32], name: str) -> float:
-    """Height in metres of what an object stands on: the book's for what lies on it, else the table's."""
+    """Height in metres of the surface under an object: the book's top or the table's."""
     placed = outlines(scene)
     on_book = name in (CIRCLE, TRIANGLE) and BOOK in placed and within(placed[name], placed[BOOK])
     return HEIGHT[BOOK] if on_book else 0.0
 
 
 def check(scene: Sequence[float] | NDArray[np.float32]) -> NDArray[np.float32]:
-    """A scene as an array, checked.
+    """Validate a scene and return it as an array.
 
     Raises:
-        UserError: for another size, numbers that are not finite, no circle, objects that overlap (circle and triangle may lie on
-            the book, as a whole), that leave the workspace, or a hand that starts elsewhere.
+        UserError: for a wrong size, numbers that are not finite, no circle, objects that overlap (circle and triangle may lie on
+            the book, as a whole) or leave the workspace, or a hand outside its initial range.
     """
-    found = np.asarray(scene, dtype=np.float32)
-    if found.shape != (SCENE,):
-        raise UserError(f"table-top scene: expected {SCENE} numbers, found shape {found.shape}")
-    if not np.isfinite(found).all():
+    array = np.asarray(scene, dtype=np.float32)
+    if array.shape != (SCENE,):
+        raise UserError(f"table-top scene: expected {SCENE} numbers, found shape {array.shape}")
+    if not np.isfinite(array).all():
         raise UserError("table-top scene: expected finite numbers, found others")
     for name, columns in COLUMNS.items():
-        if found[columns][0] not in (0, 1) or (name == CIRCLE and not found[columns][0]):
+        if array[columns][0] not in (0, 1) or (name == CIRCLE and not array[columns][0]):
             expected = "1" if name == CIRCLE else "0 or 1"
-            raise UserError(f"table-top scene: {name}, present: expected {expected}, found {found[columns][0]:g}")
-    placed = outlines(found)
+            raise UserError(f"table-top scene: {name}, present: expected {expected}, found {array[columns][0]:g}")
+    placed = outlines(array)
     for name, points in placed.items():
         free = name in (CIRCLE, TRIANGLE)
-        where = found[COLUMNS[name]][None, 1:3] if free else points
+        where = array[COLUMNS[name]][None, 1:3] if free else points
         for axis, values, (low, high) in zip("xy", where.T, WORKSPACE if free else SIGHT, strict=True):
             if values.min() < low - 1e-6 or values.max() > high + 1e-6:
                 outside = values.min() if values.min() < low else values.max()
                 raise UserError(f"table-top scene: {name} leaves the workspace: expected {axis} {low}..{high}, found {outside:.3f}")
     names = list(placed)
     for number, name in enumerate(names):
-        for other in names[:number]:
-            _expect_apart(name, other, placed)
-    for axis, value, (low, high) in zip(("x", "y", "z", "yaw"), found[HAND], START, strict=True):
+        for second in names[:number]:
+            _expect_apart(name, second, placed)
+    for axis, value, (low, high) in zip(("x", "y", "z", "yaw"), array[HAND], START, strict=True):
         if not low - 1e-6 <= value <= high + 1e-6:
             raise UserError(f"table-top scene: hand: expected {axis} {low}..{high}, found {value:.3f}")
-    return found
+    return array
 
 
-def _expect_apart(name: str, other: str, placed: Mapping[str, Points]) -> None:
-    if name == BOOK and other in (CIRCLE, TRIANGLE) and within(placed[other], placed[BOOK]):
-        return  # it lies on the book
-    if (distance := gap(placed[name], placed[other])) < APART:
-        raise UserError(f"table-top scene: {other} and {name} overlap: expected {APART} m between them, found {distance:.3f}")
+def _expect_apart(name: str, second: str, placed: Mapping[str, Points]) -> None:
+    if name == BOOK and second in (CIRCLE, TRIANGLE) and within(placed[second], placed[BOOK]):
+        return  # on the book
+    if (distance := gap(placed[name], placed[second])) < APART:
+        raise UserError(f"table-top scene: {second} and {name} overlap: expected {APART} m between them, found {distance:.3f}")
 
 
 Rng = np.random.Generator
 _Placed = dict[str, tuple[float, float, float]]
-"""x, y and yaw by name."""
+"""x, y and yaw by object name."""
 PRESENT = 0.7
-"""How often an object that a task does not need is there, where it fits, so that the picture does not tell the task."""
+"""Probability of a distractor, if it fits; without distractors the image reveals the task."""
 TRIES = 30
-"""Places that are tried for it."""
+"""Maximum number of positions tried per object."""
 
 
 def anywhere(rng: Rng) -> tuple[float, float]:
-    """A place ``(x, y)`` in the workspace."""
+    """Draw a position ``(x, y)`` in the workspace."""
     return float(rng.uniform(*WORKSPACE[0])), float(rng.uniform(*WORKSPACE[1]))
 
 
 def random_yaw(rng: Rng, name: str) -> float:
-    """Radians; boxes lie about as the table does."""
+    """Draw a yaw in radians; boxes are roughly aligned with the table."""
     return float(rng.uniform(-0.4, 0.4)) if name in SIZE else float(rng.uniform(-math.pi, math.pi))
 
 
@@ -184,11 +184,11 @@ def _pick(target: str) -> Callable[[Rng], _Placed]:
 
 
 def _pair(rng: Rng, near: float, far: float) -> _Placed:
-    """Circle and triangle so far apart, in any direction."""
+    """Draw circle and triangle at a distance, in any direction."""
     x, y = anywhere(rng)
     angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(near, far)
-    other = (x + distance * math.cos(angle), y + distance * math.sin(angle))
-    return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(other[0]), float(other[1]), random_yaw(rng, TRIANGLE))}
+    end = (x + distance * math.cos(angle), y + distance * math.sin(angle))
+    return {CIRCLE: (x, y, 0.0), TRIANGLE: (float(end[0]), float(end[1]), random_yaw(rng, TRIANGLE))}
 
 
 def _push(rng: Rng) -> _Placed:
@@ -196,7 +196,7 @@ def _push(rng: Rng) -> _Placed:
 
 
 def _push_to(target: str, near: float, far: float) -> Callable[[Rng], _Placed]:
-    """Circle and another thing so far apart, centre to centre."""
+    """Draw circle and target at a centre distance."""
 
     def draw(rng: Rng) -> _Placed:
         placed = _pair(rng, near, far)
@@ -207,7 +207,7 @@ def _push_to(target: str, near: float, far: float) -> Callable[[Rng], _Placed]:
 
 
 def _around(rng: Rng) -> _Placed:
-    """The bowl between circle and triangle, with room for the circle's way on the side where it is shorter."""
+    """Draw the bowl between circle and triangle, with room for the circle's path."""
     while True:
         placed = _pair(rng, 0.23, 0.30)
         start, end = (np.array(placed[name][:2]) for name in (CIRCLE, TRIANGLE))
@@ -238,11 +238,11 @@ NEEDED: Mapping[str, Callable[[Rng], _Placed]] = {
     AROUND_BOWL: _around,
     PUSH_ON_BOOK: _on_book,
 }
-"""What a task needs, at random, whether it fits or not."""
+"""Random poses of the objects that a task needs, not yet validated."""
 
 
 def _way(placed: _Placed, target: str, half_width: float) -> Points:
-    """The stretch that the hand sweeps when it pushes the circle straight to a thing."""
+    """Area swept by the hand in a straight push of the circle to an object."""
     start, end = (np.array(placed[name][:2]) for name in (CIRCLE, target))
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
     across = np.array([-along[1], along[0]]) * half_width
@@ -251,7 +251,7 @@ def _way(placed: _Placed, target: str, half_width: float) -> Points:
 
 
 def _clear(task: str, placed: _Placed) -> bool:
-    """Whether what a task needs can be done: its own objects are where they should, and no other is in the way."""
+    """Whether a task is feasible: needed objects are in place, and no object is in the way."""
     shapes = {name: outline(name, *pose) for name, pose in placed.items()}
     needed = set(NEEDED[task](np.random.default_rng(0)))
     on_book = task == PUSH_ON_BOOK
@@ -259,16 +259,16 @@ def _clear(task: str, placed: _Placed) -> bool:
         return False
     for name, shape in shapes.items():
         room = 0.10 if name == WHITE else 0.06
-        for other, points in shapes.items():
-            if name == other or (on_book and BOOK in (name, other) and {name, other} & {CIRCLE, TRIANGLE}):
+        for second, points in shapes.items():
+            if name == second or (on_book and BOOK in (name, second) and {name, second} & {CIRCLE, TRIANGLE}):
                 continue
-            near = room if CIRCLE in (name, other) or {BOOK, WHITE, BOWL} >= {name, other} else 0.03
-            if task in PUSHES and {CIRCLE, TARGET[task]} == {name, other}:
-                near = 0.02 if TARGET[task] == TRIANGLE else 0.04  # as the task says
-            if {CIRCLE, BOWL} == {name, other} and task == AROUND_BOWL:
+            near = room if CIRCLE in (name, second) or {BOOK, WHITE, BOWL} >= {name, second} else 0.03
+            if task in PUSHES and {CIRCLE, TARGET[task]} == {name, second}:
+                near = 0.02 if TARGET[task] == TRIANGLE else 0.04  # required by the task
+            if {CIRCLE, BOWL} == {name, second} and task == AROUND_BOWL:
                 near = 0.03
-            if task in BESIDE and other == TARGET[task]:
-                near = 0.10  # the circle is put down there
+            if task in BESIDE and second == TARGET[task]:
+                near = 0.10  # goal of the circle
             if gap(shape, points) < near:
                 return False
         if task in PUSHES and name not in needed:
@@ -279,7 +279,7 @@ def _clear(task: str, placed: _Placed) -> bool:
 
 
 def draw_scene(task: str, rng: Rng) -> NDArray[np.float32]:
-    """A scene of a task: what it needs, and other objects where they fit."""
+    """Draw a scene of a task: needed objects, and distractors where they fit."""
     while True:
         placed = NEEDED[task](rng)
         hand = [float(rng.uniform(*limits)) for limits in START]
@@ -299,10 +299,10 @@ def draw_scene(task: str, rng: Rng) -> NDArray[np.float32]:
 def scene_of(
     placed: Mapping[str, tuple[float, float, float]], hand: Sequence[float] = (0.42, 0.0, 0.2, 0.0)
 ) -> NDArray[np.float32]:
-    """The numbers of a scene, which nobody has checked.
+    """Assemble the numbers of a scene, without validation.
 
     Args:
-        placed: x, y and yaw of the objects that it has.
+        placed: x, y and yaw of the present objects.
         hand: x, y, z and yaw.
     """
     scene = np.zeros(SCENE, dtype=np.float32)
@@ -321,7 +321,7 @@ def _stands(placed: _Placed, hand: Sequence[float]) -> bool:
 
 
 def scenes(task: str, count: int, seed: int) -> Tensor:
-    """Scenes of a task ``(count, 24)``; fewer of the same seed are the first of more.
+    """Draw scenes of a task ``(count, 24)``; smaller counts give the first scenes of larger ones.
 
     Raises:
         UserError: for an unknown task.

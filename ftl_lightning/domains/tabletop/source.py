@@ -1,4 +1,4 @@
-"""Demonstrations of the scripted experts."""
+"""Demonstrations of scripted experts."""
 
 import logging
 import multiprocessing
@@ -26,13 +26,13 @@ from ftl_lightning.seeding import VALIDATION_SEED, task_key
 _LOG = logging.getLogger(__name__)
 
 MOST = 4
-"""Episodes that are tried at most for each that is kept."""
+"""Maximum attempts per demonstration."""
 FORM = 5
-"""Of the experts; what is cached of another one is not used."""
+"""Version of the experts; part of the cache key."""
 TIMES = {PUSH: 4}
-"""So many times as many demonstrations of a training concept are in a split: the paper has 124 of the push, 29 to 31 of others."""
+"""Factors of the demonstrations per training concept: the paper has 124 of the push, 29 to 31 of others."""
 RECOVERY_SEED = 2_000_000
-"""Added to the seed of demonstrations that begin elsewhere."""
+"""Seed offset of recovery demonstrations."""
 _NO_SETTINGS = ("ROUND", "FEATURES", "NEEDED", "TYPE_CHECKING")
 _SETTINGS = {
     f"{module.__name__.rpartition('.')[2]}.{name}": value
@@ -40,12 +40,12 @@ _SETTINGS = {
     for name, value in sorted(vars(module).items())
     if name.isupper() and isinstance(value, int | float | str | tuple | dict | world.Camera) and name not in _NO_SETTINGS
 }
-"""What decides a demonstration besides task, count and seed."""
+"""Constants that determine a demonstration, besides task, count and seed."""
 
 Job = tuple[str, int, int, bool, bool]
-"""Task, seed, number of an episode, whether distractors lie elsewhere in each picture, and whether it begins elsewhere."""
+"""Task, seed, episode number, whether distractors are scattered in each image, and whether the episode is a recovery."""
 _ENVIRONMENT: list[TableTopEnvironment] = []
-"""The one of this process."""
+"""Environment of this process."""
 
 
 def _scene(job: Job) -> np.ndarray:
@@ -54,11 +54,11 @@ def _scene(job: Job) -> np.ndarray:
 
 
 def _episode(job: Job) -> Episode | None:
-    """What the expert did; nothing where the simulator raised an error.
+    """Run an episode of the expert; ``None`` if the simulator raised an error.
 
     Raises:
-        MemoryError, OSError: for what the machine lacks, which would cost every other episode too.
-        UserError: where the simulator does not start.
+        MemoryError, OSError: for a lack of resources, which would affect every episode.
+        UserError: if the simulator does not start.
     """
     task, seed, number, scatter, elsewhere = job
     if not _ENVIRONMENT:
@@ -68,7 +68,7 @@ def _episode(job: Job) -> Episode | None:
         return perform(_ENVIRONMENT[0], task, _scene(job), rng, scatter=scatter, begin=led_astray if elsewhere else None)
     except (MemoryError, OSError):
         raise
-    except Exception as error:  # whatever the simulator raises: the other episodes go on
+    except Exception as error:  # any error of the simulator: other episodes continue
         _LOG.warning("table-top %r, episode %d: %r; it counts as rejected", task, number, error)
         _ENVIRONMENT.pop().close()
         return None
@@ -91,16 +91,16 @@ def demonstrations(
     scatter: bool = False,
     elsewhere: bool = False,
 ) -> Demonstrations:
-    """The first ``count`` successful episodes of a task, in the order of their numbers, whatever the number of workers.
+    """The first ``count`` successful episodes of a task by number, independent of the number of workers.
 
     Args:
-        task: known.
-        count: demonstrations.
-        seed: decides scenes, and styles and noise of the expert.
-        workers: processes.
+        task: known task.
+        count: number of demonstrations.
+        seed: seed of scenes, styles and noise.
+        workers: number of processes.
         progress: called after each successful episode.
-        scatter: whether distractors lie elsewhere in each picture; then it is told what is where.
-        elsewhere: whether it begins with the hand anywhere around the circle.
+        scatter: whether to scatter distractors in each image, with object positions as a privileged feature.
+        elsewhere: whether episodes are recoveries, with the hand anywhere around the circle.
 
     Raises:
         UserError: if too few episodes succeed.
@@ -125,13 +125,13 @@ def demonstrations(
 def joined_episodes(
     task: str, episodes: Sequence[Episode], drawn: torch.Tensor | None, provenance: Mapping[str, Any]
 ) -> Demonstrations:
-    """Episodes of a task as demonstrations.
+    """Demonstrations from episodes of a task.
 
     Args:
-        task: known.
+        task: known task.
         episodes: all with places, or none.
-        drawn: their scenes ``(episode, 24)``; ``None`` where they did not begin as one.
-        provenance: for the record.
+        drawn: their scenes ``(episode, 24)``; ``None`` if they did not start from a scene.
+        provenance: record of their origin.
     """
     observed = {
         IMAGE: padded([torch.from_numpy(episode.images) for episode in episodes])[0],
@@ -155,12 +155,12 @@ def joined_episodes(
 
 
 class Expert:
-    """Episodes of the scripted experts that succeeded, from the cache if they are there.
+    """Successful episodes of the scripted experts, cached.
 
     Args:
-        concepts: the training concepts.
-        domain: whose demonstrations they are.
-        begun_anew: those that are also shown from where one went wrong; pushes alone for ``None``.
+        concepts: training concepts.
+        domain: name of the domain.
+        begun_anew: tasks that also have recoveries; ``None`` for pushes only.
     """
 
     def __init__(
@@ -170,14 +170,14 @@ class Expert:
         self.begun_anew = tuple(task for task in self.concepts if task in (PUSHES if begun_anew is None else begun_anew))
 
     def split(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` demonstrations of every training concept, and more of those in :data:`TIMES`; distractors are scattered."""
-        own = seed if name == "train" else VALIDATION_SEED + seed
-        return concatenate([self.draw(task, TIMES.get(task, 1) * count, own, scatter=True) for task in self.concepts])
+        """``count`` demonstrations of every training concept, times :data:`TIMES`; distractors are scattered."""
+        start = seed if name == "train" else VALIDATION_SEED + seed
+        return concatenate([self.draw(task, TIMES.get(task, 1) * count, start, scatter=True) for task in self.concepts])
 
     def recoveries(self, name: Split, count: int, seed: int) -> Demonstrations:
-        """``count`` more of every task that is begun anew, from where one went wrong, see :func:`.experts.led_astray`."""
-        own = RECOVERY_SEED + seed + (0 if name == "train" else VALIDATION_SEED)
-        return concatenate([self.draw(task, count, own, scatter=True, elsewhere=True) for task in self.begun_anew])
+        """``count`` recoveries of every task with recoveries, see :func:`.experts.led_astray`."""
+        start = RECOVERY_SEED + seed + (0 if name == "train" else VALIDATION_SEED)
+        return concatenate([self.draw(task, count, start, scatter=True, elsewhere=True) for task in self.begun_anew])
 
     def draw(
         self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
@@ -189,15 +189,15 @@ class Expert:
         return made if made.domain == self.domain else replace(made, domain=self.domain)
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
-        """New scenes ``(count, 24)``, and what is seen there."""
+        """New scenes ``(count, 24)`` and their observations."""
         return initial_states(scenes(task, count, seed))
 
 
 def initial_states(drawn: torch.Tensor) -> InitialStates:
-    """Scenes ``(scene, 24)`` and what is seen where they start."""
+    """Scenes ``(scene, 24)`` and their initial observations."""
     env = TableTopEnvironment()
     try:
         seen = [env.reset(options={"scene": scene.numpy()})[0] for scene in drawn]
     finally:
         env.close()
-    return InitialStates({name: torch.from_numpy(np.stack([one[name] for one in seen])) for name in FEATURES}, drawn)
+    return InitialStates({name: torch.from_numpy(np.stack([row[name] for row in seen])) for name in FEATURES}, drawn)

@@ -1,4 +1,4 @@
-"""When a task is done, from poses alone."""
+"""Success criteria of tasks, from poses alone."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,26 +13,25 @@ from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT,
 from ftl_lightning.domains.tabletop.tasks import BESIDE, PUSH_ON_BOOK, PUSHES, TO_BOOK, expect_task
 
 BOOK_MOVED = 0.02
-"""Metres beyond which the book counts as moved."""
+"""Displacement in metres above which the book counts as moved."""
 LEVEL = 0.008
-"""Metres by which the height of the circle's centre may be off, where it has to lie on something."""
+"""Tolerance in metres of the circle's height on a surface."""
 NEAR = 0.15
-"""Metres between the centres of the circle and of what it was put beside."""
+"""Maximum centre distance in metres between the circle and the object beside it."""
 
 
 def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bool:
     """Whether a task is done.
 
-    - Pushes to the triangle: circle and triangle touch (see the environment's ``TOUCH``); neither has left the surface on which it
-      stood.
-    - Pushes to something else: the circle has touched that and nothing else, and lies on the table.
-    - To the book and to the white surface: the circle was lifted and let go; it lies on the surface, its centre over it.
-    - Beside something: the circle was lifted and let go; it lies on the table, its centre within :data:`NEAR` of that.
+    - Pushes to the triangle: circle and triangle touch (see the environment's ``TOUCH``); both are still on their initial surface.
+    - Pushes to another object: the circle has touched only this object, and lies on the table.
+    - Picks to the book and to the white surface: the circle was lifted and released; it lies on the surface, its centre over it.
+    - Picks beside an object: the circle was lifted and released; it lies on the table, its centre within :data:`NEAR` of it.
 
     Args:
-        task: known.
-        scene: ``(24,)``, how it started.
-        told: by the environment's last step; empty if there was none.
+        task: known task.
+        scene: ``(24,)``, initial scene.
+        told: info of the environment's last step; empty if there was none.
     """
     expect_task(task)
     if not told:
@@ -43,7 +42,7 @@ def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bo
     if task in PUSHES:
         surface = HEIGHT[BOOK] if task == PUSH_ON_BOOK else support(scene, CIRCLE)
         both = (circle, told["triangle"])
-        return bool(told["touched"]) and all(one is not None and _lies(one, surface) for one in both)
+        return bool(told["touched"]) and all(place is not None and _lies(place, surface) for place in both)
     if not (told["lifted"] and told["released"]):
         return False
     if task in BESIDE:
@@ -58,17 +57,17 @@ def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bo
 
 
 def _lies(place: NDArray[np.float64], surface: float) -> bool:
-    """Whether the centre of circle or triangle is as high as if it lay flat on a surface."""
+    """Whether the centre of circle or triangle has the height of flat contact with a surface."""
     return abs(float(place[2]) - surface - HEIGHT[CIRCLE] / 2) <= LEVEL
 
 
 def judge(goal: str, rollout: Rollout) -> dict[str, Tensor]:
-    """What happened in episodes.
+    """Judge episodes.
 
     Returns:
         ``(episode,)`` each: ``success``; ``book moved``, by more than 2 cm.
     """
     scenes = rollout.starts.require_scenes().numpy()
-    success = [judged(goal, scene, told) for scene, told in zip(scenes, rollout.infos, strict=True)]
-    moved = [told.get("book", 0.0) > BOOK_MOVED for told in rollout.infos]
+    success = [judged(goal, scene, info) for scene, info in zip(scenes, rollout.infos, strict=True)]
+    moved = [info.get("book", 0.0) > BOOK_MOVED for info in rollout.infos]
     return {"success": torch.tensor(success) & ~rollout.failed, "book moved": torch.tensor(moved)}

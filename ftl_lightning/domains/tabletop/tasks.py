@@ -1,4 +1,4 @@
-"""The tasks of the table-top, and when one is done."""
+"""Tasks of the table-top, and their evaluation suites."""
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.errors import UserError
@@ -15,9 +15,9 @@ PUSH_TO_BOOK = "push green circle to book"
 BESIDE_TRIANGLE = "pick green circle to beside orange triangle"
 
 TRAINING_CONCEPTS = (TO_BOOK, TO_WHITE, PUSH, AROUND_BOWL)
-"""Of the paper."""
+"""Training concepts of the paper."""
 WIDE_CONCEPTS = (*TRAINING_CONCEPTS, PUSH_TO_BOWL, PUSH_TO_WHITE, BESIDE_TRIANGLE)
-"""Of the wide model: pushes and picks to several things, of which no pair of verb and thing is asked for in the end."""
+"""Training concepts of the wide model: more pushes and picks, none of which is an evaluation task."""
 TASKS = (*TRAINING_CONCEPTS, PUSH_ON_BOOK, BESIDE_BOWL, PUSH_TO_BOWL, PUSH_TO_WHITE, PUSH_TO_BOOK, BESIDE_TRIANGLE)
 PUSHES = tuple(task for task in TASKS if task.startswith("push"))
 BESIDE = (BESIDE_BOWL, BESIDE_TRIANGLE)
@@ -29,9 +29,9 @@ SUITES = {
     "representation": Suite((EvaluationTask("training representation", PUSH_ON_BOOK, texts=(PUSH,)),)),
     "validation": Suite((EvaluationTask("new concept", BESIDE_BOWL, (BESIDE_BOWL,)),)),
 }
-"""The validation task is of another kind, so that nothing is tuned on what is asked in the end.
+"""The validation task is of another kind, so that nothing is tuned on the evaluation task.
 
-``representation`` is the paper's baseline: the scenes of the new task, told to push as on the table.
+``representation`` is the paper's baseline: scenes of the new task with the text of the push on the table.
 """
 WIDE_SUITES = {
     "training": training_suite(WIDE_CONCEPTS),
@@ -39,14 +39,14 @@ WIDE_SUITES = {
     "pairs": Suite((EvaluationTask("new concept", PUSH_TO_BOOK, (PUSH_TO_BOOK,)),)),
     "validation": SUITES["validation"],
 }
-"""``pairs``: a verb and a thing that pretraining shows apart from each other."""
+"""``pairs``: a verb and an object that pretraining shows separately."""
 
 
 def expect_task(task: str) -> str:
-    """The task itself.
+    """Return a known task.
 
     Raises:
-        UserError: for one that is not known.
+        UserError: for an unknown task.
     """
     if task not in TASKS:
         raise UserError(f"table-top task: expected one of {', '.join(map(repr, TASKS))}, found {task!r}")

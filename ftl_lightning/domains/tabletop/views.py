@@ -1,4 +1,4 @@
-"""How a model sees the table-top: as it is, and in training also from other sides."""
+"""Views of the table-top for models: states and observations, with random transformations in training."""
 
 import math
 from dataclasses import replace
@@ -15,33 +15,33 @@ from ftl_lightning.processes import drawn
 
 HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
-"""Observed with the view ``hand``: column and row of the hand in the picture (-1 to 1); with ``points``: its x and y from the
-middle, where 1 is half of a picture."""
+"""Feature of the hand position in the image: column and row, -1..1, with the view ``hand``; x and y from the centre, in half
+images, with ``points``."""
 SHIFT = 0.07
-"""Metres by which a scene is shifted at most, in x and in y."""
+"""Maximum shift of a scene in metres, in x and in y."""
 RAISED = 0.05
-"""Metres by which half of the scenes without a picture are raised at most, so that pushes and picks are known on any surface."""
+"""Maximum elevation in metres of half of the scenes without image, so that pushes and picks generalise to any surface."""
 TURN = 0.5
-"""Radians by which half of the scenes are turned at most; the others are turned by any angle."""
+"""Maximum rotation in radians of half of the scenes; others are rotated by any angle."""
 BLUR = (0.004, 0.004, 0.002)
-"""Metres by which an encoder of images is wrong, in x, y and height: the standard deviation on new scenes."""
+"""Standard deviation of the errors of an image encoder on new scenes, in metres, in x, y and height."""
 SURE = 6.0
-"""Logit of being seen of an encoder that is sure."""
+"""Visibility logit of a confident encoder."""
 HALF = OVERHEAD.eye[2] * math.tan(math.radians(OVERHEAD.angle) / 2)
-"""Metres of the table from the middle of a picture to its edge."""
+"""Metres of the table from the centre of an image to its edge."""
 MIDDLE = OVERHEAD.target[:2]
-"""x and y in the middle of a picture."""
+"""x and y of the centre of an image."""
 
 
 def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, shifts: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Behaviour and picture as if the whole scene had been mirrored, turned about the middle of the picture, and shifted.
+    """Mirror a scene, rotate it about the image centre and shift it: states and observations.
 
-    The camera looks straight down, so that the picture moves as the table does, but for the few per cent by which what is high
-    looks larger. The hand's yaw, which plans do not command, stays.
+    The camera looks straight down, so that the image moves with the table, except for a few per cent of perspective of high
+    objects. The yaw of the hand, which plans do not command, is constant.
 
     Args:
         states: ``(sample, horizon, 4)``.
-        observed: ``pose``, and ``image`` and the privileged ``places`` if they are there.
+        observed: ``pose``, optionally ``image`` and the privileged ``places``.
         mirrored: ``(sample,)`` of bool, left and right exchanged.
         angles: ``(sample,)`` in radians.
         shifts: ``(sample, 2)`` in metres, x and y.
@@ -52,54 +52,53 @@ def moved(states: Tensor, observed: Observed, mirrored: Tensor, angles: Tensor, 
     middle = states.new_tensor(MIDDLE)
 
     def places(values: Tensor) -> Tensor:
-        """``(sample, ..., columns)`` whose first two columns are x and y."""
+        """Transform ``(sample, ..., columns)`` with x and y in the first two columns."""
         flat = values.flatten(1, -2) if values.dim() > 2 else values[:, None]
         xy = (flat[..., :2] - middle) @ turned.transpose(1, 2) + middle + shifts[:, None]
         return torch.cat((xy, flat[..., 2:]), dim=-1).reshape(values.shape)
 
-    # A pixel at column u and row v (-1 to 1) shows x = -HALF v, y = -HALF u, seen from the middle. Each is taken from where it was.
+    # A pixel at column u and row v (-1 to 1) shows x = -HALF v, y = -HALF u, from the centre. Each is sampled at its source.
     back = turned.transpose(1, 2)
     offset = (back @ shifts[..., None])[..., 0] / HALF
     theta = torch.cat((back.flip(1, 2), offset.flip(1)[..., None]), dim=-1)
-    found = {**observed, POSE: places(observed[POSE])}
+    result = {**observed, POSE: places(observed[POSE])}
     if IMAGE in observed:
         images = observed[IMAGE]
         grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
         drawn = functional.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
-        found[IMAGE] = drawn.round().to(torch.uint8)
+        result[IMAGE] = drawn.round().to(torch.uint8)
     if PLACES in observed:
         seen, centres = observed[PLACES].split((1, 3), dim=-1)
         centres = places(centres)
         shown = ((centres[..., :2] - middle).abs() < HALF).all(dim=-1, keepdim=True)
-        found[PLACES] = torch.cat((seen * shown, centres), dim=-1)
-    return places(states), found
+        result[PLACES] = torch.cat((seen * shown, centres), dim=-1)
+    return places(states), result
 
 
 def raised(states: Tensor, observed: Observed, heights: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Behaviour and places as if the whole table were higher. No picture from above would tell.
+    """Raise the table: states and positions. Images from above would not show it.
 
     Args:
         states: ``(sample, horizon, 4)``.
         observed: ``pose`` and the privileged ``places``.
         heights: ``(sample,)`` in metres.
     """
-    found = dict(observed)
-    found[POSE], found[PLACES] = observed[POSE].clone(), observed[PLACES].clone()
-    found[POSE][:, 2] += heights
-    found[PLACES][..., 3] += heights[:, None]
+    result = dict(observed)
+    result[POSE], result[PLACES] = observed[POSE].clone(), observed[PLACES].clone()
+    result[POSE][:, 2] += heights
+    result[PLACES][..., 3] += heights[:, None]
     states = states.clone()
     states[..., 2] += heights[:, None]
-    return states, found
+    return states, result
 
 
 def misplaced(read: Tensor, places: Tensor) -> Tensor:
-    """How wrong points that were read of pictures are ``(sample,)``.
+    """Loss of keypoints of an image encoder ``(sample,)``.
 
-    The absolute errors of the centres of what is seen, where 1 is half of a picture, and a hundredth of the cross-entropy of
-    whether it is seen.
+    Absolute errors of the centres of visible objects, in half images, plus .01 times the cross-entropy of visibility.
 
     Args:
-        read: x, y, height and logit of being seen of each object, all x first ``(sample, 20)``; see
+        read: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see
             :class:`ftl_lightning.diffusion.image_encoder.Points`.
         places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
     """
@@ -110,14 +109,14 @@ def misplaced(read: Tensor, places: Tensor) -> Tensor:
 
 
 def told(places: Tensor, draw: torch.Generator) -> Tensor:
-    """What an encoder might read of a picture: the places of what is seen, wrong by :data:`BLUR`.
+    """Simulate the keypoints of an image encoder: centres of visible objects with errors of :data:`BLUR`.
 
     Args:
         places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
-        draw: of the errors.
+        draw: generator of the errors.
 
     Returns:
-        as :func:`misplaced` takes it.
+        keypoints in the form of :func:`misplaced`.
     """
     seen, centres = places[..., :1], places[..., 1:] - places.new_tensor((*MIDDLE, 0.0))
     wrong = drawn(len(centres), lambda n: torch.randn((n, *centres.shape[1:]), generator=draw, device=centres.device))
@@ -126,7 +125,7 @@ def told(places: Tensor, draw: torch.Generator) -> Tensor:
 
 
 def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -> tuple[Tensor, Observed]:
-    if draw is None:  # a new task shows all that a model sees
+    if draw is None:  # no transformation of new tasks
         return states, observed
     count, device = len(states), states.device
     way = drawn(count, lambda n: torch.rand((n, 5), generator=draw, device=device))
@@ -139,12 +138,12 @@ def _perturb(states: Tensor, observed: Observed, draw: torch.Generator | None) -
 
 
 def _start(observed: Observed) -> Tensor:
-    """The state that a plan starts from ``(sample, 1, 4)``."""
+    """Initial state of a plan ``(sample, 1, 4)``."""
     return observed[POSE][:, None, list(FEATURES[POSE].state)]
 
 
 def _place(observed: Observed) -> Tensor:
-    """What states are told relative to with the view ``hand``: its place, and no opening, ``(sample, 1, 4)``."""
+    """Origin of states with the view ``hand``: hand position, and zero opening, ``(sample, 1, 4)``."""
     return functional.pad(_start(observed)[..., :3], (0, 1))
 
 
@@ -176,8 +175,8 @@ VIEWS = {
         same_columns=True,
     ),
 }
-"""With ``model.perturb``, scenes are mirrored, turned and shifted at random together with what is done in them.
+"""``model.perturb`` mirrors, rotates and shifts scenes at random, together with their states.
 
-``hand`` shows places from where the hand is; keypoints of pictures can be told likewise, see :data:`ORIGIN`. So does ``points``,
-for encoders that tell x and y of things. ``moved`` shows states as they are.
+``hand`` has states relative to the hand; keypoints of images can be relative too, see :data:`ORIGIN`. ``points`` is the same for
+encoders of x and y of objects. ``moved`` has absolute states.
 """

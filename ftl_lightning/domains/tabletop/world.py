@@ -1,4 +1,4 @@
-"""Bodies of the table-top in pybullet, and its two cameras."""
+"""Pybullet bodies and cameras of the table-top."""
 
 import math
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from ftl_lightning.domains.tabletop.scenes import (
 )
 
 STEP = 1 / 240
-"""Seconds of a step of the simulation."""
+"""Duration of a simulation step in seconds."""
 FASTEST = 0.02
-"""Metres that the hand is moved in a step of an episode at most; of an action farther away it goes the first part."""
+"""Maximum hand movement in metres per step of an episode; longer moves are shortened."""
 MASS = {CIRCLE: 0.06, TRIANGLE: 0.15, BOOK: 0.35, WHITE: 0.0, BOWL: 0.0}
-"""kg; what has none stays where it is."""
+"""Masses in kg; objects of zero mass are fixed."""
 FRICTION = {CIRCLE: 0.5, TRIANGLE: 0.6, BOOK: 0.5, WHITE: 0.6, BOWL: 0.6}
 TABLE_FRICTION, FINGER_FRICTION = 0.5, 0.9
 COLOUR = {
@@ -41,17 +41,17 @@ COLOUR = {
 }
 TABLE_COLOUR = (0.62, 0.55, 0.47)
 MARGIN = 0.001
-"""Metres around the triangle's hull, at which the simulator lets it touch others."""
+"""Collision margin in metres around the triangle's hull."""
 MOVING = (CIRCLE, TRIANGLE, BOOK)
 WALLS = 12
-"""Boxes of which the bowl's wall is made for collisions; it is drawn round."""
+"""Boxes that approximate the bowl's wall for collisions; the visual shape is round."""
 
 ARM = tuple(range(7))
 FINGERS = (9, 10)
 TIP = 11
-"""The link between the fingertips, 7 mm above their ends."""
+"""Link between the fingertips, 7 mm above their ends."""
 REST = (0.0, 0.1, 0.0, -2.4, 0.0, 2.5, 0.785)
-"""Joint angles from which the arm finds to where it starts."""
+"""Initial joint angles of inverse kinematics."""
 
 Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position, and quaternion with its real part last."""
@@ -59,11 +59,11 @@ Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 @dataclass(frozen=True)
 class Bodies:
-    """Numbers by which the simulator knows them.
+    """Body identifiers in the simulator.
 
     Attributes:
-        robot: the arm.
-        objects: by name, those that the scene has.
+        robot: arm.
+        objects: present objects by name.
     """
 
     robot: int
@@ -71,18 +71,18 @@ class Bodies:
 
 
 def build(client: Simulator, scene: NDArray[np.float32], arm_drawn: bool) -> Bodies:
-    """Build a scene from nothing: what the simulator did before leaves no trace.
+    """Build a scene after a full reset of the simulator.
 
     Args:
-        client: the simulator.
-        scene: checked.
-        arm_drawn: whether pictures show the arm; without it they take a twentieth of the time.
+        client: simulator.
+        scene: valid scene.
+        arm_drawn: whether images show the arm; without it they take a twentieth of the time.
     """
     client.resetSimulation()
     client.setGravity(0, 0, -9.81)
     client.setPhysicsEngineParameter(fixedTimeStep=STEP, deterministicOverlappingPairs=1)
     _box(client, (0.9, 1.0, 0.04), (0.5, 0.0, -0.02), TABLE_COLOUR, 0.0, TABLE_FRICTION)
-    # Without its own shapes those for collisions are drawn, which load quicker; these are made invisible.
+    # Collision shapes load faster than visual shapes; they are made invisible.
     flags = 0 if arm_drawn else pybullet().URDF_IGNORE_VISUAL_SHAPES
     robot: int = client.loadURDF(_panda(), [0, 0, 0], useFixedBase=True, flags=flags)
     for link in () if arm_drawn else range(-1, client.getNumJoints(robot)):
@@ -100,12 +100,12 @@ def _panda() -> str:
 
 
 def turned(yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion of an object that is turned about the vertical."""
+    """Quaternion of an object with a yaw."""
     return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
 
 
 def downward(yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion of the hand that points down."""
+    """Quaternion of the downward hand with a yaw."""
     return math.cos(yaw / 2), math.sin(yaw / 2), 0.0, 0.0
 
 
@@ -131,7 +131,7 @@ def _box(
 
 
 def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: bool) -> int:
-    """An object; ``edged`` draws circle and triangle with edges, for people: smooth shading makes a ball and a cone of them."""
+    """Build an object; ``edged`` draws circle and triangle with sharp edges for films, instead of smooth shading."""
     x, y, yaw = map(float, scene[COLUMNS[name]][1:])
     height, colour = HEIGHT[name], [*COLOUR[name], 1]
     place = (x, y, support(scene, name) + height / 2)
@@ -144,7 +144,7 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: boo
             drawn = _edged(_corners(RADIUS[name], height / 2, ROUND))
             seen = client.createVisualShape(pybullet().GEOM_MESH, **drawn, rgbaColor=colour)
     elif name == TRIANGLE:
-        vertices = _prism(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN)  # corners move by 2 when sides move by 1
+        vertices = _prism(RADIUS[name] - 2 * MARGIN, height / 2 - MARGIN)  # corners move twice as far as sides
         shape = client.createCollisionShape(pybullet().GEOM_MESH, vertices=vertices)
         smooth: dict[str, list[Any]] = {"vertices": _prism(RADIUS[name], height / 2), "indices": _PRISM_SIDES}
         drawn = _edged(_corners(RADIUS[name], height / 2, 3)) if edged else smooth
@@ -152,7 +152,7 @@ def _object(client: Simulator, scene: NDArray[np.float32], name: str, edged: boo
     else:
         shape = _bowl_shape(client)
         vertices, triangles = bowl(RADIUS[name], height / 2, 0.006)
-        upright = [[a, -c, b] for a, b, c in vertices]  # that mesh stands on y
+        upright = [[a, -c, b] for a, b, c in vertices]  # from y up to z up
         seen = client.createVisualShape(pybullet().GEOM_MESH, vertices=upright, indices=triangles, rgbaColor=colour)
     body: int = client.createMultiBody(MASS[name], shape, seen, place, turned(yaw))
     client.changeDynamics(body, -1, lateralFriction=FRICTION[name])
@@ -167,21 +167,21 @@ def _prism(radius: float, half: float) -> list[list[float]]:
 
 
 ROUND = 48
-"""Corners of a circle that is drawn with edges."""
+"""Corners of a circle drawn with edges."""
 
 
 def _corners(radius: float, half: float, count: int) -> NDArray[np.float64]:
-    """Of an upright prism ``(2 * count, 3)``, those below first."""
+    """Corners of an upright prism ``(2 * count, 3)``, lower face first."""
     angles = 2 * np.pi * np.arange(count) / count
     flat = radius * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
     return np.concatenate([np.pad(flat, ((0, 0), (0, 1)), constant_values=z) for z in (-half, half)])
 
 
 def _edged(corners: NDArray[np.float64]) -> dict[str, list[Any]]:
-    """Arguments of a visual shape of an upright prism whose faces share no corner, so that no shading runs across an edge.
+    """Arguments of a visual shape of an upright prism without shared vertices, so that no shading crosses an edge.
 
     Args:
-        corners: ``(2 * count, 3)``, those below first.
+        corners: ``(2 * count, 3)``, lower face first.
     """
     count = len(corners) // 2
     below, above = corners[:count], corners[count:]
@@ -218,12 +218,12 @@ def _bowl_shape(client: Simulator) -> int:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that stands still.
+    """Fixed camera.
 
     Attributes:
         eye, target, up: metres.
-        angle: its field of view in degrees, from bottom to top.
-        size: height and width of its pictures.
+        angle: vertical field of view in degrees.
+        size: height and width of images.
     """
 
     eye: tuple[float, float, float]
@@ -237,7 +237,7 @@ class Camera:
         return view, pybullet().computeProjectionMatrixFOV(self.angle, self.size[1] / self.size[0], 0.1, 3.0)
 
     def picture(self, client: Simulator, shadow: bool = False) -> NDArray[np.uint8]:
-        """``(height, width, 3)``, by pybullet's software renderer."""
+        """Image ``(height, width, 3)`` of pybullet's software renderer."""
         height, width = self.size
         view, lens = self._matrices()
         seen = client.getCameraImage(
@@ -247,7 +247,7 @@ class Camera:
         return np.ascontiguousarray(rgba[..., :3])
 
     def pixels(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where places ``(n, 3)`` are in a picture: column and row ``(n, 2)``."""
+        """Column and row ``(n, 2)`` of points ``(n, 3)`` in an image."""
         view, lens = (np.array(matrix).reshape(4, 4).T for matrix in self._matrices())
         clip = np.concatenate((places, np.ones((len(places), 1))), axis=-1) @ (lens @ view).T
         seen = clip[:, :2] / clip[:, 3:]
@@ -255,6 +255,6 @@ class Camera:
 
 
 OVERHEAD = Camera((0.5, 0.0, 0.85), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), 45.0, (64, 64))
-"""What a model sees."""
+"""Camera of the model."""
 FRONT = Camera((1.15, 0.0, 0.65), (0.53, 0.0, 0.05), (-1.0, 0.0, 1.0), 36.0, (240, 320))
-"""What people see in films."""
+"""Camera of films."""

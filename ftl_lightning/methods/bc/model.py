@@ -1,4 +1,4 @@
-"""Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details'): the next state from state and concept."""
+"""Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details'): next state from state and concept."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ from ftl_lightning.ranges import expect_range
 
 @dataclass(frozen=True, kw_only=True)
 class CloningConfig(StepConfig):
-    """What the cloning network needs to be built.
+    """Configuration of the cloning network.
 
     Attributes:
         hidden_dim: width of the hidden layer.
-        members: networks that differ in their initial weights. Each is deterministic; samples take turns among them (the paper
-            averages over seeds), and episodes are driven by the first.
+        members: number of networks with different initial weights. Each is deterministic; samples cycle through them (the paper
+            averages over seeds), and episodes use the first.
     """
 
     hidden_dim: int = 512
@@ -32,18 +32,18 @@ class CloningConfig(StepConfig):
 
 
 class ParallelMLP(nn.Module):
-    """Networks of one hidden layer (ReLU), side by side in one batch.
+    """Batched MLPs with a single hidden layer (ReLU).
 
     Args:
-        members: how many.
-        inputs, hidden, outputs: their sizes.
+        members: number of MLPs.
+        inputs, hidden, outputs: layer sizes.
     """
 
     def __init__(self, members: int, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
         layers = [[nn.Linear(inputs, hidden), nn.Linear(hidden, outputs)] for _ in range(members)]
-        self.weights = nn.ParameterList(torch.stack([one[depth].weight.detach().T for one in layers]) for depth in range(2))
-        self.biases = nn.ParameterList(torch.stack([one[depth].bias.detach()[None] for one in layers]) for depth in range(2))
+        self.weights = nn.ParameterList(torch.stack([mlp[depth].weight.detach().T for mlp in layers]) for depth in range(2))
+        self.biases = nn.ParameterList(torch.stack([mlp[depth].bias.detach()[None] for mlp in layers]) for depth in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
         """``(member or 1, batch, inputs)`` to ``(member, batch, outputs)``."""
@@ -52,10 +52,10 @@ class ParallelMLP(nn.Module):
 
 
 class CloningModel(AdditiveModel, TextConceptModel):
-    """A deterministic policy of the concept and, where there is one, the state; composing adds concepts.
+    """Deterministic policy of the concept and, if observed, the state; composing adds concepts.
 
     Args:
-        prepared: what it is built for.
+        prepared: configuration and domain.
     """
 
     method = METHOD
@@ -74,7 +74,7 @@ class CloningModel(AdditiveModel, TextConceptModel):
         return self.config.window
 
     def predict(self, vector: Tensor | None, concepts: Tensor) -> Tensor:
-        """Transitions ``(member, batch, moments, state)``, normalised.
+        """Predict normalised transitions ``(member, batch, moments, state)``.
 
         Args:
             vector: ``(member or 1, batch, m)`` or ``None``.
@@ -84,7 +84,7 @@ class CloningModel(AdditiveModel, TextConceptModel):
         return out.unflatten(-1, (self.config.moments, self.config.state_dim))
 
     def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
-        """Squared error of transitions ``(batch,)``, the negative log-likelihood of a normal distribution but for constants.
+        """Squared error of transitions ``(batch,)``, the Gaussian negative log-likelihood up to constants.
 
         Args:
             states: ``(batch, window, state)`` in the domain's units.
@@ -105,9 +105,9 @@ class CloningModel(AdditiveModel, TextConceptModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Deterministic but for the modes of concepts: ``sampling`` does not matter."""
-        together, own = batched(compositions, count, generators)
-        condition = added(together)[own]
+        """Sample plans, deterministic up to the concepts' modes; ``sampling`` is ignored."""
+        together, row = batched(compositions, count, generators)
+        condition = added(together)[row]
         member = torch.arange(len(condition), device=self.device) % count % self.config.members
         rows = torch.arange(len(condition), device=self.device)
 

@@ -19,8 +19,8 @@ class CloningPretraining(Pretraining[CloningModel]):
 
     Args:
         hidden_dim, members: see :class:`CloningConfig`.
-        plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is one more, or 1.
+        plan_horizon: states in an unrolled plan; ``None`` for the domain's.
+        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``, or 1.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
 
@@ -42,6 +42,6 @@ class CloningPretraining(Pretraining[CloningModel]):
         return CloningModel(policy)
 
     def losses(self, model: CloningModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Squared error of what follows."""
+        """Squared error of transitions."""
         states, seen = batch.states, batch.observed
         return model.errors(states, seen, model.training_embeddings[batch.concepts])

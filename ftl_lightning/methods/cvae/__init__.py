@@ -1,4 +1,4 @@
-"""A conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the concepts it is paired with."""
+"""Conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the paired concepts."""
 
 from ftl_lightning.domains.paper import WITH_MODES
 from ftl_lightning.learning.method import Form, Method

@@ -1,4 +1,4 @@
-"""A conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the concepts it is paired with."""
+"""Conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the paired concepts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ from ftl_lightning.methods.cvae import METHOD
 
 @dataclass(frozen=True, kw_only=True)
 class VAEConfig(ModelConfig):
-    """What the networks need to be built; ``concept_dim`` is the size of z.
+    """Configuration of the networks; ``concept_dim`` is the size of z.
 
     Attributes:
-        hidden_dim: width of the encoder's and of the decoder's hidden layer.
+        hidden_dim: width of the hidden layer in encoder and decoder.
     """
 
     hidden_dim: int = 512
 
 
 class VAEModel(AdditiveModel):
-    """Behaviour from an initial state and z, a normal variable in which a concept is a point; composing adds points.
+    """VAE of behaviour, conditioned on the initial state. A concept is a value of the latent z; composing adds concepts.
 
     Args:
-        prepared: what it is built for.
+        prepared: configuration and domain.
     """
 
     method = METHOD
@@ -40,19 +40,19 @@ class VAEModel(AdditiveModel):
     def __init__(self, prepared: Prepared[VAEConfig]) -> None:
         super().__init__(prepared)
         config = prepared.config
-        plan, beside, z = config.horizon * config.state_dim, config.vector_dim, config.concept_dim
-        self.encoder = nn.Sequential(nn.Linear(plan + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, 2 * z))
-        self.decoder = nn.Sequential(nn.Linear(z + beside, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, plan))
+        plan, condition, z = config.horizon * config.state_dim, config.vector_dim, config.concept_dim
+        self.encoder = nn.Sequential(nn.Linear(plan + condition, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, 2 * z))
+        self.decoder = nn.Sequential(nn.Linear(z + condition, config.hidden_dim), nn.ReLU(), nn.Linear(config.hidden_dim, plan))
 
     def posterior(self, states: Tensor, observed: Observed) -> tuple[Tensor, Tensor]:
-        """Mean and logarithm of the variance of z, ``(batch, z)`` each, of behaviour ``(batch, horizon, state)``."""
+        """Mean and log variance of z, ``(batch, z)`` each, given behaviour ``(batch, horizon, state)``."""
         vector = self.vector(observed)
         plan = self.encode(states, observed).flatten(1)
         mean, log_variance = self.encoder(plan if vector is None else torch.cat((plan, vector), dim=-1)).chunk(2, dim=-1)
         return mean, log_variance
 
     def plans(self, z: Tensor, observed: Observed) -> Tensor:
-        """Behaviour ``(batch, horizon, state)``, normalised, of ``z (batch, z)``."""
+        """Decode ``z (batch, z)`` to normalised behaviour ``(batch, horizon, state)``."""
         vector = self.vector(observed)
         out: Tensor = self.decoder(z if vector is None else torch.cat((z, vector), dim=-1))
         return out.unflatten(-1, (self.config.horizon, self.config.state_dim))
@@ -70,9 +70,9 @@ class VAEModel(AdditiveModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """The temperature is the variance of the noise that is added to z; sampler and steps do not matter."""
-        shape, (together, own) = (count, self.config.concept_dim), batched(compositions, count, generators)
-        noise = torch.cat([torch.randn(shape, generator=one, device=one.device) for one in generators]).to(self.device)
-        z = added(together)[own] + sampling.temperature**0.5 * noise
+        """Sample plans. The temperature is the variance of the noise added to z; sampler and steps are ignored."""
+        shape, (together, row) = (count, self.config.concept_dim), batched(compositions, count, generators)
+        noise = torch.cat([torch.randn(shape, generator=draw, device=draw.device) for draw in generators]).to(self.device)
+        z = added(together)[row] + sampling.temperature**0.5 * noise
         seen = observed or {}
         return self.decode(self.plans(z, seen), seen).unflatten(0, (len(compositions), count))

@@ -21,7 +21,7 @@ class VAEPretraining(Pretraining[VAEModel]):
     Args:
         latent_dim: size of z.
         hidden_dim: see :class:`VAEConfig`.
-        beta: weight of the divergence from the prior, per number of the behaviour, beside the squared error.
+        beta: weight of the divergence from the prior, per value of the behaviour, relative to the squared error.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
 
@@ -40,7 +40,7 @@ class VAEPretraining(Pretraining[VAEModel]):
         return VAEModel(networks.embedded(torch.zeros(len(prepared.embeddings), latent)))
 
     def losses(self, model: VAEModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        """The negative evidence lower bound, per number of the behaviour (Kingma & Welling, 2014)."""
+        """Negative evidence lower bound per value of the behaviour (Kingma & Welling, 2014)."""
         states, seen = batch.states, batch.observed
         mean, log_variance = model.posterior(states, seen)
         noise = drawn(len(mean), lambda n: torch.randn((n, *mean.shape[1:]), generator=draw, device=mean.device))

@@ -1,4 +1,4 @@
-"""Our method (the paper's FTL-IGM): a conditional diffusion model, through which concepts are learned by gradient descent."""
+"""Our method (the paper's FTL-IGM): a conditional diffusion model whose concepts are learned by gradient descent."""
 
 from ftl_lightning.domains.paper import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.learning.method import Form, Method

@@ -1,4 +1,4 @@
-"""Rough codes of behaviour, from which a denoiser learns in pretraining that concepts may vary over a plan."""
+"""Coarse codes of behaviour, used in pretraining to prepare a denoiser for concepts that vary over a plan."""
 
 import zlib
 from dataclasses import dataclass
@@ -14,19 +14,18 @@ from ftl_lightning.seeding import generator
 
 @dataclass(frozen=True)
 class Codes:
-    """Rough codes of behaviour, which are added to the texts of some samples in pretraining.
+    """Coarse codes of behaviour, added to the text embeddings of some samples in pretraining.
 
-    A code is a random linear projection of the plan's states at each of several knots, with noise. It is as long as a text's
-    embedding on average, and half of the samples with a code have no text.
+    A code is a random linear projection of the plan's states at several knots, with noise. Its average length is that of a text
+    embedding, and half of the samples with a code have no text.
 
     Attributes:
-        share: of the samples that have one; of those whose text is dropped none has, so that there is an empty concept. 0 is the
-            paper's form.
-        knots: times.
-        size: numbers of a code at a knot.
-        noise: standard deviation of what is added to the numbers, which have unit variance.
-        relative: codes tell how far a plan has come from its first state; otherwise where it is. Concepts of where it is lead to
-            the same places from any initial state.
+        share: share of samples with a code, excluding samples with dropped text, which stay unconditional. 0 is the paper's form.
+        knots: number of times.
+        size: number of values per knot.
+        noise: standard deviation of the noise added to the values, which have unit variance.
+        relative: encode displacements from the first state; otherwise positions. Concepts of positions lead to the same places
+            from any initial state.
     """
 
     share: float = 0.0
@@ -42,13 +41,13 @@ class Codes:
         expect_count("model.codes.size", self.size, 1, MOST_STEPS)
 
     def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
-        """Concepts ``(batch, knots, n)``.
+        """Add codes to text embeddings; returns concepts ``(batch, knots, n)``.
 
         Args:
-            texts: ``(batch, n)``, the empty one where it was removed.
-            removed: where it was ``(batch,)``.
+            texts: ``(batch, n)``, unconditional where removed.
+            removed: mask of removed texts ``(batch,)``.
             clean: plans ``(batch, horizon, state)``, normalised.
-            draw: of what is random.
+            draw: random generator.
         """
         count, width, device = *texts.shape, clean.device
         times = torch.linspace(0, clean.shape[1] - 1, self.knots, device=device).round().long()
@@ -59,7 +58,7 @@ class Codes:
         way = shown @ mixing  # (batch, knot, size)
         numbers = way / mean(way.square().mean()).sqrt().clamp(min=1e-6)
         numbers = numbers + self.noise * drawn(count, lambda n: torch.randn((n, *way.shape[1:]), generator=draw, device=device))
-        told = (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < self.share) & ~removed
-        alone = told & (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < 0.5)
+        coded = (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < self.share) & ~removed
+        alone = coded & (drawn(count, lambda n: torch.rand(n, generator=draw, device=device)) < 0.5)
         text = torch.where(alone[:, None], 0, texts)  # 0 is the mean of the training concepts
-        return text[:, None] + told[:, None, None] * (numbers @ directions)
+        return text[:, None] + coded[:, None, None] * (numbers @ directions)

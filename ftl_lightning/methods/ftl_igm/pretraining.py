@@ -1,4 +1,4 @@
-"""Pretraining of our model, a denoiser: Eq. 1 of the paper."""
+"""Pretraining of the denoiser: Eq. 1 of the paper."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from ftl_lightning.processes import drawn
 from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
 
 WINDOWS = 4096
-"""Of demonstrations, from which the scales of cosines are taken."""
+"""Maximum number of windows for fitting the scales of cosines."""
 PRETRAINING: Mapping[str, str] = {
     "condition_dropout": "loss.condition_dropout",
     "loss": "loss.kind",
@@ -34,20 +34,20 @@ PRETRAINING: Mapping[str, str] = {
     "code_noise": "codes.noise",
     "code_relative": "codes.relative",
 }
-"""Place of each option of a group, ``'group.option'``, by its flat name in the records of models."""
+"""Grouped option, ``'group.option'``, by its flat name in model records."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossOptions:
-    """What is minimised.
+    """Options of the pretraining loss.
 
     Attributes:
-        kind: whose squared error, ``'epsilon'``, ``'v'`` or ``'clean'``; ``'epsilon'`` is Eq. 1. The others weigh noisy timesteps,
-            at which the concept decides, by 1 / abar_t and (1 - abar_t) / abar_t.
+        kind: quantity of the squared error, ``'epsilon'`` (Eq. 1), ``'v'`` or ``'clean'``. ``'v'`` and ``'clean'`` give more weight
+            to noisy timesteps, at which the concept matters: factors 1 / abar_t and (1 - abar_t) / abar_t.
         timestep_power: see :func:`ftl_lightning.diffusion.schedule.timesteps`; 1 is the paper's.
-        discount: state k of a window weighs so much to the power of k: below 1 for plans that are replaced before they end.
-        condition_dropout: probability p with which a sample's concept is replaced by the empty one; drawn per sample
-            (the published code draws once a batch).
+        discount: state k of a window has weight ``discount ** k``; use values below 1 with replanning.
+        condition_dropout: probability p of replacing a sample's concept by the unconditional embedding; drawn per sample
+            (the published code draws per batch).
     """
 
     kind: str = "epsilon"
@@ -71,18 +71,18 @@ class PretrainingModule(Pretraining[GenerativeModel]):
 
     Args:
         denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
-        denoiser_args: its arguments other than the sizes.
-        paper_size: override them by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
+        denoiser_args: arguments of the denoiser other than the sizes.
+        paper_size: override the arguments by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
         diffusion_steps: T.
-        draws: timesteps and noises that are drawn for each window of a step; what it observes is read once for all of them.
-        prediction: what the network puts out: ``'epsilon'`` (the paper's), or ``'v'``, ``'clean'``, ``'displacement'`` or
-            ``'cosines'``, from which the noise follows (:class:`ftl_lightning.diffusion.prediction.Prediction`).
-        loss: what is minimised.
-        codes: rough codes of behaviour that some samples are told, so that the network has seen concepts that vary over a plan, and
-            concepts that no text names.
+        draws: number of timesteps and noises per window and step; the observation is encoded once for all draws.
+        prediction: parametrisation of the output: ``'epsilon'`` (the paper's), ``'v'``, ``'clean'``, ``'displacement'`` or
+            ``'cosines'`` (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+        loss: options of the loss.
+        codes: coarse codes of behaviour for some samples, which prepare the network for concepts that vary over a plan and for
+            concepts without a text.
         compile: compile the denoiser for training (worth it on GPUs).
-        learning_rate: of AdamW.
-        guidance: weight omega with which training concepts are generated in evaluation.
+        learning_rate: learning rate of AdamW.
+        guidance: guidance weight omega for training concepts in evaluation.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
     """
 
@@ -104,7 +104,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         **options: Any,
     ) -> None:
         super().__init__(learning_rate=learning_rate, guidance=guidance, **options)
-        # Configurations from before there were draws keep their hash.
+        # Omit the default of draws, which was added later, to keep hashes.
         self.save_hyperparameters(ignore=[*groups_of(PRETRAINING), *(["draws"] if draws == 1 else [])])
         self.save_hyperparameters(flat({"loss": loss, "codes": codes}, PRETRAINING))
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
@@ -119,8 +119,8 @@ class PretrainingModule(Pretraining[GenerativeModel]):
             windows = data.some_windows(WINDOWS)
             model.denoiser.spectrum.fit(model.encode(windows.states, windows.observed))
         if self.codes.share and self.codes.knots > 1 and not model.over_time:
-            told = f"whose concepts do not vary over a plan, found {self.codes.knots}"
-            raise UserError(f"model.codes.knots: expected 1 for {model.config.denoiser}, {told}")
+            reason = f"whose concepts do not vary over a plan, found {self.codes.knots}"
+            raise UserError(f"model.codes.knots: expected 1 for {model.config.denoiser}, {reason}")
         return model
 
     def configure_model(self) -> None:
@@ -129,7 +129,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
             self.raw.denoiser.compile()
 
     def losses(self, model: GenerativeModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Eq. 1; while fitting, concepts are dropped."""
+        """Loss of Eq. 1, with condition dropout in training."""
         states, seen = batch.states, batch.observed
         clean = model.encode(states, seen)
         context, concept = model.observe(seen), batch.concepts
@@ -144,7 +144,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         if self.codes.share and model.training:
             concepts, index = self.codes(concepts[index], removed, clean, draw), torch.arange(count, device=self.device)
         else:
-            concepts = concepts[:, None]  # one knot
+            concepts = concepts[:, None]  # single knot
         total, power = self.hparams["diffusion_steps"], self.loss.timestep_power
         if power == 1:
             t = drawn(count, lambda n: torch.randint(total, (n,), generator=draw, device=self.device))

@@ -1,4 +1,4 @@
-"""In-context learning (paper, 'Baselines'; Xu et al., 2022): a transformer reads demonstrations and goes on as they do."""
+"""In-context learning (paper, 'Baselines'; Xu et al., 2022): a transformer prompted with demonstrations."""
 
 from ftl_lightning.learning.method import Method
 

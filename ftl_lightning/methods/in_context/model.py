@@ -1,4 +1,4 @@
-"""In-context learning (paper, 'Baselines'; Xu et al., 2022): a transformer reads demonstrations and goes on as they do."""
+"""In-context learning (paper, 'Baselines'; Xu et al., 2022): a transformer prompted with demonstrations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ from ftl_lightning.ranges import LARGEST, expect_range
 
 @dataclass(frozen=True, kw_only=True)
 class InContextConfig(StepConfig):
-    """What the transformer needs to be built; ``concept_dim`` is the size of one demonstration as it reads it.
+    """Configuration of the transformer; ``concept_dim`` is the size of an encoded demonstration.
 
     Attributes:
-        tokens: transitions of a demonstration that are read, from its first.
-        bins: of each number of a transition.
-        width: features of a token.
-        layers, heads: of encoder and decoder.
+        tokens: number of initial transitions of a demonstration in the prompt.
+        bins: number of bins per value of a transition.
+        width: embedding size of a token.
+        layers, heads: number of layers and heads of encoder and decoder.
     """
 
     tokens: int = 16
@@ -44,16 +44,16 @@ class InContextConfig(StepConfig):
 
 
 class InContextModel(ConceptModel):
-    """What follows the present, from a few demonstrations; its 'concepts' are those demonstrations.
+    """Predicts the next state from the observation and a few demonstrations, its concepts.
 
-    The encoder reads transitions, demonstrations apart by a zero vector; the decoder is given the present (the paper's window of 1)
-    and puts out, for each number of what follows, probabilities of bins over [-1, 1].
+    The encoder reads transitions, with a zero vector between demonstrations. The decoder reads the current observation (the paper's
+    window of 1) and predicts probabilities of bins over [-1, 1] for each value of the next state.
 
     Args:
-        prepared: what it is built for.
+        prepared: configuration and domain.
 
     Raises:
-        UserError: for a width that is no multiple of the heads.
+        UserError: for a width that is not a multiple of the heads.
     """
 
     method = METHOD
@@ -79,29 +79,29 @@ class InContextModel(ConceptModel):
             nn.LayerNorm(config.width),
         )
         self.head = nn.Linear(config.width, config.state_dim * config.bins)
-        self.register_buffer("start", torch.zeros(config.state_dim))  # the present, as transitions begin with it
+        self.register_buffer("start", torch.zeros(config.state_dim))  # first state of transitions
 
     @property
     def window(self) -> int:
         return self.config.window
 
     def prompts(self, demonstrations: Demonstrations, perturbed: bool = False) -> Tensor:
-        """Each demonstration as the model reads it ``(demo, n)``.
+        """Encode demonstrations as prompts ``(demo, n)``.
 
         Args:
-            demonstrations: with features observed at every time.
-            perturbed: as the model's view perturbs them, where its configuration says so.
+            demonstrations: demonstrations with features observed at every time.
+            perturbed: apply the view's perturbation, if configured.
 
         Raises:
-            UserError: where features are observed for the first time alone.
+            UserError: if features are observed only at the first time.
         """
         if not demonstrations.per_step or not set(self.domain.observed) <= set(demonstrations.per_step):
             raise UserError("key 'per_step': expected every feature to be observed at each time, found others")
         tokens, stride = self.config.tokens, self.config.stride
         rows = torch.arange(len(demonstrations)).repeat_interleave(tokens)
         starts = (stride * torch.arange(tokens)).repeat(len(demonstrations))
-        states, own = demonstrations.windows(rows, starts.minimum(demonstrations.lengths[rows] - 1), self.window)
-        seen: Observed = moved(own, self.device)
+        states, observed = demonstrations.windows(rows, starts.minimum(demonstrations.lengths[rows] - 1), self.window)
+        seen: Observed = moved(observed, self.device)
         states = states.to(self.device)
         if perturbed and self._perturb is not None:
             states, seen = self._perturb(states, seen, None)
@@ -109,10 +109,10 @@ class InContextModel(ConceptModel):
         return read.unflatten(0, (-1, tokens)).flatten(1).cpu()
 
     def present_vector(self, observed: Observed) -> Tensor:
-        """What is observed ``(batch, m)`` as the network sees it, see :meth:`vector`.
+        """Normalised observation ``(batch, m)``, see :meth:`vector`.
 
         Raises:
-            UserError: where nothing is observed.
+            UserError: for a domain without observed features.
         """
         vector = self.vector(observed)
         if vector is None:
@@ -122,7 +122,7 @@ class InContextModel(ConceptModel):
         return vector
 
     def read(self, prompts: Tensor, given: Tensor) -> Tensor:
-        """Memory ``(group, K (tokens + 1), width)`` of the demonstrations ``prompts (group, K, n)`` where ``given (group, K)``."""
+        """Encode ``prompts (group, K, n)`` to memory ``(group, K (tokens + 1), width)``, with mask ``given (group, K)``."""
         tokens = functional.pad(prompts.unflatten(-1, (self.config.tokens, -1)), (0, 0, 0, 1))
         memory: Tensor = self.encoder((self.token(tokens) + self.place).flatten(1, 2), src_key_padding_mask=self._missing(given))
         return memory
@@ -131,13 +131,13 @@ class InContextModel(ConceptModel):
         return ~given.repeat_interleave(self.config.tokens + 1, dim=1)
 
     def follow(self, memory: Tensor, given: Tensor, observed: Tensor) -> Tensor:
-        """Logits ``(group, query, state, bin)`` of what follows ``observed (group, query, m)``; queries do not see each other."""
+        """Logits ``(group, query, state, bin)`` of the states after ``observed (group, query, m)``; queries are independent."""
         apart = ~torch.eye(observed.shape[1], dtype=torch.bool, device=observed.device)
         out = self.decoder(self.present(observed), memory, tgt_mask=apart, memory_key_padding_mask=self._missing(given))
         return self.head(out).unflatten(-1, (self.config.state_dim, self.config.bins))
 
     def bins(self, normalised: Tensor) -> Tensor:
-        """The bin of each number."""
+        """Bin of each value."""
         return ((normalised + 1) / 2 * self.config.bins).long().clamp(0, self.config.bins - 1)
 
     @torch.no_grad()
@@ -149,18 +149,18 @@ class InContextModel(ConceptModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        """Concepts are demonstrations; the temperature sharpens the bins' probabilities, 0 takes the most probable.
+        """Sample plans. The temperature scales the bins' logits; 0 selects the most probable bin.
 
-        Weights, sampler and steps do not matter.
+        Weights, sampler and steps are ignored.
 
         Raises:
-            UserError: for a concept whose weight is on some columns alone.
+            UserError: for a concept with weight on some columns only.
         """
-        if any(one.columns is not None for one in compositions):
+        if any(composition.columns is not None for composition in compositions):
             raise UserError("compose: expected concepts without '@' for a model that reads demonstrations, found groups of columns")
         prompts = batched(compositions, count, generators)[0].embeddings.flatten(2)
         temperature = sampling.temperature
-        counts = torch.tensor([len(one.weights) for one in compositions], device=self.device)
+        counts = torch.tensor([len(composition.weights) for composition in compositions], device=self.device)
         given = torch.arange(prompts.shape[1], device=self.device) < counts[:, None]
         memory = self.read(prompts, given)
         middles = (torch.arange(self.config.bins, device=self.device) + 0.5) / self.config.bins * 2 - 1
@@ -170,7 +170,7 @@ class InContextModel(ConceptModel):
             present = torch.zeros(len(compositions) * count, 0, device=self.device) if vector is None else vector
             logits = self.follow(memory, given, present.unflatten(0, (len(compositions), count)))
             if temperature:
-                drawn = [torch.rand(shape, generator=one, device=one.device) for one in generators]
+                drawn = [torch.rand(shape, generator=draw, device=draw.device) for draw in generators]
                 gumbel = -(-torch.stack(drawn).clamp(1e-9, 1 - 1e-7).log()).log()
                 logits = logits / temperature + gumbel.to(self.device)
             following = middles[logits.argmax(dim=-1)].flatten(0, 1)

@@ -18,19 +18,19 @@ from ftl_lightning.methods.in_context.model import InContextConfig, InContextMod
 
 
 class InContextPretraining(Pretraining[InContextModel]):
-    """Fits the transformer to go on as demonstrations of the same training concept do (negative log-likelihood of bins).
+    """Fits the transformer to predict transitions, prompted with demonstrations of the same concept (negative log-likelihood).
 
     Args:
         tokens, bins, width, layers, heads: see :class:`InContextConfig`.
-        prompts: most demonstrations that are given; each step and concept draws one to so many.
-        plan_horizon: states in a plan that is unrolled; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is one more.
-        images: folder of a trained model of any method, whose image encoders are used as they are, where images are observed:
-            demonstrations are read before training.
+        prompts: maximum number of demonstrations in a prompt; the number is drawn per step and concept.
+        plan_horizon: number of states in an unrolled plan; ``None`` for the domain's.
+        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``.
+        images: folder of a trained model of any method with frozen image encoders for observed images, as demonstrations are
+            encoded before training.
         options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
 
     Raises:
-        UserError: for a value out of its range, or images of a model that observes none.
+        UserError: for a value out of range, or a model without images in ``images``.
     """
 
     def __init__(
@@ -71,29 +71,29 @@ class InContextPretraining(Pretraining[InContextModel]):
         if model.images is not None:
             take_images(model.images, self._images, self.hparams["images"])
         self._prompts = model.prompts(data.training)
-        # Whole prompts are perturbed, half of the time, as a present is.
+        # Perturb whole prompts, half of the time, like observations.
         self._perturbed = model.prompts(data.training, perturbed=True) if config.perturb else self._prompts
         texts = data.training.concepts
         expect_shown(config.training_concepts, texts)
-        self._own = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
-        model.training_embeddings.copy_(self._prompts[[own[0] for own in self._own]])
+        self._rows = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
+        model.training_embeddings.copy_(self._prompts[[rows[0] for rows in self._rows]])
         windows = data.first_windows()
         model.start.copy_(model.encode(windows.states[:, :: self.stride], windows.observed)[:, 0].mean(dim=0))
         return model
 
     def losses(self, model: InContextModel, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Negative log-likelihood of the bins of what follows."""
+        """Negative log-likelihood of the next state's bins."""
         states, seen = batch.states, batch.observed
         observed = model.present_vector(seen)
         target = model.bins(model.encode(states[:, :: self.stride], seen)[:, -1])
-        most, groups = self.hparams["prompts"], len(self._own)
-        rows = [[own[int(u * len(own))] for u in torch.rand(most, generator=draw, device=draw.device)] for own in self._own]
+        most, groups = self.hparams["prompts"], len(self._rows)
+        rows = [[demos[int(u * len(demos))] for u in torch.rand(most, generator=draw, device=draw.device)] for demos in self._rows]
         counts = torch.randint(1, most + 1, (groups, 1), generator=draw, device=draw.device) if model.training else most
         given = torch.arange(most, device=draw.device).expand(groups, most) < counts
         perturbed = torch.rand((groups, 1, 1), generator=draw, device=draw.device) < 0.5
-        straight, other = (prompts[torch.tensor(rows)].to(draw.device) for prompts in (self._prompts, self._perturbed))
-        memory = model.read(torch.where(perturbed, other, straight), given)
-        # The queries of each concept are a row of one batch, padded to the longest.
+        plain, altered = (prompts[torch.tensor(rows)].to(draw.device) for prompts in (self._prompts, self._perturbed))
+        memory = model.read(torch.where(perturbed, altered, plain), given)
+        # Each row of the batch holds the queries of a concept, padded to the longest.
         queries = [(batch.concepts == group).nonzero()[:, 0] for group in range(groups)]
         index = nn.utils.rnn.pad_sequence(queries, batch_first=True, padding_value=-1)
         logits = model.follow(memory, given, observed[index])[index >= 0]
@@ -101,7 +101,7 @@ class InContextPretraining(Pretraining[InContextModel]):
 
 
 def take_images(encoders: nn.Module, weights: Mapping[str, Tensor], folder: str) -> None:
-    """Give image encoders the weights of a trained model's, which stay as they are.
+    """Load image encoders from a trained model and freeze the weights.
 
     Raises:
         UserError: for a model that observes other images.

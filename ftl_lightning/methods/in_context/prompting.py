@@ -1,4 +1,4 @@
-"""Concepts of the in-context model: demonstrations, as it reads them."""
+"""Concepts of the in-context model: encoded demonstrations."""
 
 from collections.abc import Callable
 
@@ -20,14 +20,14 @@ def prompt(
     steps: int,
     tell: Callable[[float], None] = lambda loss: None,
 ) -> dict[str, Concept]:
-    """Every concept of some demonstrations, by name; nothing is learned, and ``settings``, ``steps`` and ``tell`` do not matter.
+    """Encode demonstrations as concepts by name, without learning; ``settings``, ``steps`` and ``tell`` are ignored.
 
     Args:
-        model: an :class:`InContextModel`.
-        demonstrations: with concept texts, which name the concepts.
+        model: :class:`InContextModel`.
+        demonstrations: demonstrations with concept texts.
 
     Raises:
-        UserError: for a model of another method, or demonstrations whose features are observed for the first time alone.
+        UserError: for a model of another method, or demonstrations with features observed only at the first time.
     """
     if not isinstance(model, InContextModel):
         raise UserError(f"model: expected one of in-context learning, found one of {model.method.name}")

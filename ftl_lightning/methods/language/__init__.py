@@ -1,4 +1,4 @@
-"""Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, told in words what the new task is."""
+"""Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, conditioned on task descriptions."""
 
 from ftl_lightning.learning.method import Method
 from ftl_lightning.methods.ftl_igm import METHOD as OURS

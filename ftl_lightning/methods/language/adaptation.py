@@ -1,4 +1,4 @@
-"""Adapting our model by language: a concept is the embedding of its description."""
+"""Adaptation of our model by language: a concept is the embedding of its description."""
 
 import torch
 from torch import Tensor
@@ -15,20 +15,20 @@ from ftl_lightning.methods.language import METHOD
 
 
 class LanguageAdaptation(Adaptation):
-    """A concept is the embedding of its description; nothing is learned, and demonstrations only say which concepts there are.
+    """Uses the embedding of a description as concept, without learning; demonstrations only name the concepts.
 
-    Compositions are described in one sentence, as the domain says it.
+    A composition is described by the domain's sentence for its goal.
 
     Args:
         pretrained: folder of our pretrained model.
         omega: guidance weight of the description.
-        encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`; the one behind the pretrained
-            model. The table knows no new sentences.
+        encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`; must equal the pretrained model's.
+            The table has no new sentences.
         output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
-        seed: of the evaluation's rows.
+        seed: seed in the evaluation's rows.
 
     Raises:
-        UserError: for a model of another method or another encoder.
+        UserError: for a model of another method or encoder.
     """
 
     def __init__(
@@ -48,15 +48,15 @@ class LanguageAdaptation(Adaptation):
             )
         self._standardise = self.model.standardise
         self._encoder = load_encoder(encoder, self.model.domain.concepts.table, revision)
-        if (found := self._encoder.identity) != self.model.config.encoder:
-            raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {found!r}")
+        if (name := self._encoder.identity) != self.model.config.encoder:
+            raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {name!r}")
 
     @property
     def method(self) -> str:
         return METHOD.name
 
     def _embedding(self, goal: str) -> Tensor:
-        """``(1, 1, n)`` of a task's description."""
+        """Embed a task's description, ``(1, 1, n)``."""
         return self._standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))[None]
 
     def learned(self) -> dict[str, Concept]:
@@ -67,7 +67,7 @@ class LanguageAdaptation(Adaptation):
         }
 
     def composition(self, task: EvaluationTask) -> Composition | None:
-        """The description of the whole task, with its weight."""
+        """The description of the whole task with its weight."""
         if task.component is not None or not set(task.learned) <= set(self._found):
             return None
         return Composition(self._embedding(task.goal), torch.tensor([self._omega], device=self.device))

@@ -1,4 +1,4 @@
-"""Fine-tuning our model by a low-rank adapter of all branches (LoRA, Hu et al., 2022), which ours is compared with."""
+"""Fine-tuning our model by a low-rank adapter of all branches (LoRA, Hu et al., 2022), a baseline."""
 
 from ftl_lightning.domains.paper import FINE_TUNED
 from ftl_lightning.learning.method import Method

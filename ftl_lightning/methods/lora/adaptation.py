@@ -10,11 +10,11 @@ _WHOLE = AdapterOptions(rank=4, scope="all")
 
 
 class FineTuning(InversionModule):
-    """Learns a concept with an adapter that changes every branch of a composition, the empty concept's too.
+    """Learns a concept with an adapter of every branch of a composition, including the unconditional.
 
     Args:
         pretrained: folder of the pretrained model.
-        adapter: its rank and learning rate; its scope is ``'all'``.
+        adapter: rank and learning rate; the scope is always ``'all'``.
         options: see :class:`~ftl_lightning.learning.inversion_module.InversionModule`.
     """
 

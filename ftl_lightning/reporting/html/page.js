@@ -1,4 +1,4 @@
-// Draws everything from the page's own data, with film.js; nothing is loaded.
+// Draws the data embedded in the page, with film.js; nothing is loaded.
 const PAUSE = 1.5;
 const two = (value) => value.toFixed(2);
 const unique = (values) => [...new Set(values)];
@@ -7,7 +7,7 @@ let films = [], clock = 0, length = 1, playing = true, last = 0, alone = null;
 
 // --- films
 
-// How an episode ended: null where nothing decides.
+// Success of an episode; null if undecided.
 function decided(film) {
   const name = film.decisive in film.outcomes ? film.decisive : Object.keys(film.outcomes).find((key) => typeof film.outcomes[key] === "boolean");
   return name === undefined || typeof film.outcomes[name] !== "boolean" ? null : film.outcomes[name];
@@ -26,11 +26,11 @@ function show(entry, at) {
 }
 
 function wall() {
-  const here = data.films.filter((one) => one.domain === domain && one.setting === setting);
-  const tasks = unique(here.map((one) => one.task));
+  const here = data.films.filter((film) => film.domain === domain && film.setting === setting);
+  const tasks = unique(here.map((film) => film.task));
   if (!tasks.includes(task)) task = tasks[0] || "";
   find("task").replaceChildren(...tasks.map((name) => made("option", { textContent: name, selected: name === task })));
-  const lines = here.filter((one) => one.task === task && !hidden.has(one.method));
+  const lines = here.filter((film) => film.task === task && !hidden.has(film.method));
   const columns = [0, 1, 2, 3].map((start) => lines.flatMap((line) => line.films.filter((film) => film.start === start)));
   films = [];
   find("wall").replaceChildren(...lines.map((line) => {
@@ -120,32 +120,32 @@ function overview() {
     for (const [name, mean] of Object.entries(line.references)) {
       svg.append(named(drawn("rect", { x: x(mean) - 1.5, y: y - 10, width: 3, height: 20, fill: "#9aa4ae" }), `${name}: ${two(mean)} (reference line)`));
     }
-    line.methods.filter((one) => !hidden.has(one.method)).forEach((one, place, all) => {
-      const at = y + (place - (all.length - 1) / 2) * Math.min(4, 20 / all.length), colour = data.colours[one.method];
-      if (one.error) svg.append(drawn("line", { x1: x(Math.max(0, one.mean - one.error)), x2: x(Math.min(1, one.mean + one.error)), y1: at, y2: at, stroke: colour, "stroke-width": 2 }));
-      const told = `${one.method}: ${two(one.mean)}${one.error ? ` \u00b1 ${two(one.error)}` : ""}, ${line.setting}, ${line.metric}`;
-      svg.append(named(drawn("circle", { cx: x(one.mean), cy: at, r: 4.5, fill: colour, tabindex: 0 }), told));
-      if (one.paper !== null) svg.append(named(drawn("path", { d: `M${x(one.paper)} ${at - 5}l5 5l-5 5l-5 -5z`, fill: "none", stroke: colour, "stroke-width": 1.8 }), `${one.method}, the paper's: ${two(one.paper)}`));
+    line.methods.filter(({ method }) => !hidden.has(method)).forEach(({ method, mean, error, paper }, place, all) => {
+      const at = y + (place - (all.length - 1) / 2) * Math.min(4, 20 / all.length), colour = data.colours[method];
+      if (error) svg.append(drawn("line", { x1: x(Math.max(0, mean - error)), x2: x(Math.min(1, mean + error)), y1: at, y2: at, stroke: colour, "stroke-width": 2 }));
+      const text = `${method}: ${two(mean)}${error ? ` \u00b1 ${two(error)}` : ""}, ${line.setting}, ${line.metric}`;
+      svg.append(named(drawn("circle", { cx: x(mean), cy: at, r: 4.5, fill: colour, tabindex: 0 }), text));
+      if (paper !== null) svg.append(named(drawn("path", { d: `M${x(paper)} ${at - 5}l5 5l-5 5l-5 -5z`, fill: "none", stroke: colour, "stroke-width": 1.8 }), `${method}, the paper's: ${two(paper)}`));
     });
   });
   find("chart").replaceChildren(svg);
 }
 
 function growth() {
-  const shown = data.curves.filter((one) => domain === "" || one.domain === domain || one.domain === "");
-  find("growth").replaceChildren(...shown.map((one) => {
+  const shown = data.curves.filter((plot) => domain === "" || plot.domain === domain || plot.domain === "");
+  find("growth").replaceChildren(...shown.map((plot) => {
     const width = 340, height = 210, left = 34, bottom = 34;
-    const all = one.lines.flatMap((line) => line.points.map((point) => point[0]));
-    const seen = one.log ? Math.log10 : (value) => value;
+    const all = plot.lines.flatMap((line) => line.points.map((point) => point[0]));
+    const seen = plot.log ? Math.log10 : (value) => value;
     const x = scaled(seen(Math.min(...all)), seen(Math.max(...all)), left + 8, width - 20), y = scaled(0, 1, height - bottom, 10);
-    const svg = drawn("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${one.title}: ${one.axis}` });
+    const svg = drawn("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${plot.title}: ${plot.axis}` });
     for (const tick of [0, 0.5, 1]) {
       svg.append(drawn("line", { class: "grid", x1: left, x2: width - 6, y1: y(tick), y2: y(tick) }));
       svg.append(drawn("text", { x: left - 5, y: y(tick) + 4, "text-anchor": "end", class: "soft" }, tick));
     }
-    for (const tick of one.ticks) svg.append(drawn("text", { x: x(seen(tick)), y: height - bottom + 14, "text-anchor": "middle", class: "soft" }, tick));
-    svg.append(drawn("text", { x: (left + width) / 2, y: height - 6, "text-anchor": "middle", class: "soft" }, one.axis));
-    one.lines.forEach((line, number) => {
+    for (const tick of plot.ticks) svg.append(drawn("text", { x: x(seen(tick)), y: height - bottom + 14, "text-anchor": "middle", class: "soft" }, tick));
+    svg.append(drawn("text", { x: (left + width) / 2, y: height - 6, "text-anchor": "middle", class: "soft" }, plot.axis));
+    plot.lines.forEach((line, number) => {
       const colour = data.palette[number % data.palette.length];
       svg.append(drawn("polyline", { points: line.points.map((point) => `${x(seen(point[0]))},${y(point[1])}`).join(" "), fill: "none", stroke: colour, "stroke-width": 2 }));
       for (const [at, mean, error] of line.points) {
@@ -154,20 +154,20 @@ function growth() {
       }
     });
     const names = made("p", { className: "note" });
-    one.lines.forEach((line, number) => names.append(made("span", { textContent: `\u25cf ${line.name}  `, style: `color:${data.palette[number % data.palette.length]}` })));
-    return made("div", {}, made("h3", { textContent: one.title }), svg, names);
+    plot.lines.forEach((line, number) => names.append(made("span", { textContent: `\u25cf ${line.name}  `, style: `color:${data.palette[number % data.palette.length]}` })));
+    return made("div", {}, made("h3", { textContent: plot.title }), svg, names);
   }));
 }
 
 function maps() {
-  const shown = data.maps.filter((one) => domain === "" || one.domain === domain);
-  find("maps").replaceChildren(...shown.map((one) => {
-    const size = 340, xs = one.points.map((point) => point.x), ys = one.points.map((point) => point.y);
+  const shown = data.maps.filter((map) => domain === "" || map.domain === domain);
+  find("maps").replaceChildren(...shown.map((map) => {
+    const size = 340, xs = map.points.map((point) => point.x), ys = map.points.map((point) => point.y);
     const x = scaled(Math.min(...xs), Math.max(...xs), 14, size - 14), y = scaled(Math.min(...ys), Math.max(...ys), size - 14, 14);
-    const svg = drawn("svg", { viewBox: `0 0 ${size} ${size}`, role: "group", "aria-label": `concepts of ${one.name}` });
+    const svg = drawn("svg", { viewBox: `0 0 ${size} ${size}`, role: "group", "aria-label": `concepts of ${map.name}` });
     svg.append(drawn("rect", { x: 1, y: 1, width: size - 2, height: size - 2, rx: 6, fill: "none", class: "grid" }));
-    for (const point of one.points) {
-      const film = data.films.find((entry) => entry.domain === one.domain && entry.task === point.film && entry.ours);
+    for (const point of map.points) {
+      const film = data.films.find((entry) => entry.domain === map.domain && entry.task === point.film && entry.ours);
       const mark = point.learned
         ? drawn("path", { d: `M${x(point.x)} ${y(point.y) - 6}l6 10l-12 0z`, fill: "#d55e00", tabindex: 0 })
         : drawn("circle", { cx: x(point.x), cy: y(point.y), r: 4.5, fill: "#0072b2", "fill-opacity": film ? 1 : 0.45, tabindex: 0 });
@@ -183,7 +183,7 @@ function maps() {
       for (const event of ["mouseenter", "focus", "click"]) mark.addEventListener(event, chosen);
       svg.append(mark);
     }
-    return made("div", {}, made("h3", { textContent: one.name }), svg,
+    return made("div", {}, made("h3", { textContent: map.name }), svg,
       made("p", { className: "note", textContent: "\u25cf training concept   \u25b2 learned component" }));
   }));
 }
@@ -191,15 +191,15 @@ function maps() {
 // --- filters
 
 function settings() {
-  const here = unique(data.films.filter((one) => one.domain === domain).map((one) => one.setting));
-  const methods = (name) => unique(data.films.filter((one) => one.domain === domain && one.setting === name).map((one) => one.method)).length;
+  const here = unique(data.films.filter((film) => film.domain === domain).map((film) => film.setting));
+  const methods = (name) => unique(data.films.filter((film) => film.domain === domain && film.setting === name).map((film) => film.method)).length;
   if (!here.includes(setting)) setting = here.reduce((most, name) => methods(name) > methods(most) ? name : most, here[0] || "");
   find("setting").replaceChildren(...here.map((name) => made("option", { textContent: name, selected: name === setting })));
 }
 
 function boxes() {
-  const names = unique([...data.overview.filter((line) => line.domain === domain).flatMap((line) => line.methods.map((one) => one.method)),
-    ...data.films.filter((one) => one.domain === domain).map((one) => one.method)]);
+  const names = unique([...data.overview.filter((line) => line.domain === domain).flatMap((line) => line.methods.map((entry) => entry.method)),
+    ...data.films.filter((film) => film.domain === domain).map((film) => film.method)]);
   const legend = find("methods").querySelector("legend");
   find("methods").replaceChildren(legend, ...names.map((name) => {
     const box = made("input", { type: "checkbox", checked: !hidden.has(name), value: name });
@@ -242,13 +242,13 @@ function listen() {
   });
 }
 
-unpacked(find("data").textContent).then((found) => {
-  data = found;
+unpacked(find("data").textContent).then((content) => {
+  data = content;
   for (const task of data.films) for (const film of task.films) film.shapes = film.shapes.map((index) => data.shapes[film.file][index]);
   document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-  const moving = data.films.find((one) => one.films.some((film) => film.frames > 1));
+  const moving = data.films.find((entry) => entry.films.some((film) => film.frames > 1));
   domain = moving ? moving.domain : data.domains[0].name;
-  find("domain").replaceChildren(...data.domains.map((one) => made("option", { value: one.name, textContent: one.title, selected: one.name === domain })));
+  find("domain").replaceChildren(...data.domains.map(({ name, title }) => made("option", { value: name, textContent: title, selected: name === domain })));
   find("about").textContent = data.about;
   listen();
   redraw();

@@ -1,4 +1,4 @@
-"""``report --html``: one file that shows results and plays films, and asks nothing of a network."""
+"""``report --html``: a self-contained page that shows results and plays films."""
 
 import base64
 import gzip
@@ -34,9 +34,9 @@ from ftl_lightning.web import FILM
 
 HERE = Path(__file__).parent
 FILMS, CONCEPTS = "films", "concepts"
-"""Folders of a folder of results: files of ``evaluation.films``, and concepts by domain and seed."""
+"""Subfolders of the results: files of ``evaluation.films``, and concepts by domain and seed."""
 MOST = 15_000_000
-"""Bytes of a page, above which somebody is told."""
+"""Page size in bytes above which a note is printed."""
 
 
 def write_page(results: Path, path: Path) -> int:
@@ -44,13 +44,13 @@ def write_page(results: Path, path: Path) -> int:
 
     Args:
         results: folder of results, with films and learned concepts in :data:`FILMS` and :data:`CONCEPTS`.
-        path: of the HTML file.
+        path: the HTML file.
 
     Returns:
         Its size in bytes.
 
     Raises:
-        UserError: if there are no results, or a file of films is none.
+        UserError: if there are no results, or a file of films is invalid.
     """
     rows = read_rows(results)
     compared_rows = all_methods(read_study(results, COMPARISON), read_study(results))
@@ -67,7 +67,7 @@ def write_page(results: Path, path: Path) -> int:
         "overview": overview,
         "films": films,
         "shapes": shapes,
-        "maps": [one for domain in shown for one in _map(results, domain)],
+        "maps": [entry for domain in shown for entry in _map(results, domain)],
         "curves": [*_curves(shown, read_study(results, CURVES)), *_speed(results)],
         "colours": colours((label(*method), method) for method in measured),
         "palette": COLOURS,
@@ -85,13 +85,13 @@ def _title(domain: Domain) -> str:
 
 
 def _ordered(names: Mapping[str, None]) -> list[str]:
-    """Methods first, in the order of tables, so that each has the same colour everywhere."""
+    """Methods in the order of tables, then other names; for consistent colours."""
     order = [label(*method) for method in METHODS]
     return [*(name for name in order if name in names), *(name for name in names if name not in order)]
 
 
 def _line(domain: Domain, setting: str, metric: str, results: pd.DataFrame) -> dict[str, Any]:
-    """Means of all methods and reference lines."""
+    """Means of methods and reference lines."""
     rows = compared(domain, results)
     here, beside = (select(table, setting=setting, metric=metric) for table in (rows, reference_lines(domain, results)))
     return {
@@ -100,7 +100,7 @@ def _line(domain: Domain, setting: str, metric: str, results: pd.DataFrame) -> d
         "setting": setting,
         "metric": metric,
         "less": domain.less_is_better(metric),
-        "methods": [one for method in methods(rows) if (one := _mean(domain, here, method, setting, metric))],
+        "methods": [mean for method in methods(rows) if (mean := _mean(domain, here, method, setting, metric))],
         "references": {str(name): round(float(value), 4) for name, value in beside.groupby("method")["value"].mean().items()},
     }
 
@@ -114,15 +114,15 @@ def _mean(domain: Domain, rows: pd.DataFrame, method: Compared, setting: str, me
 
 
 def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """What each film is of, and the shapes of each file of films.
+    """Films with their subjects, and the shapes of each file of films.
 
     Raises:
-        UserError: for a file that is none of films.
+        UserError: for a file without films.
     """
     of_domain = {domain.name: select(rows, domain=domain.name) for domain in shown}
     measured = {domain.name: decisive(domain, of_domain[domain.name]) for domain in shown}
-    decided = {name: select(own, metric=measured[name]) for name, own in of_domain.items()}
-    found, shapes = [], {}
+    decided = {name: select(group, metric=measured[name]) for name, group in of_domain.items()}
+    films, shapes = [], {}
     for path in visible(results / FILMS, "*.json"):
         content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -130,16 +130,16 @@ def _films(results: Path, shown: Sequence[Domain], rows: pd.DataFrame) -> tuple[
         try:
             if (name := str(content["domain"])) in decided:
                 shapes[path.stem] = content["shapes"]
-                found += [_task(task, path.stem, name, measured[name], decided[name]) for task in content["tasks"]]
+                films += [_task(task, path.stem, name, measured[name], decided[name]) for task in content["tasks"]]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            told = f"expected films as evaluation.films writes them, found a file with other keys ({error!r}); make it again"
-            raise UserError(f"{path}: {told}") from error
-    order = {name: place for place, name in enumerate(_ordered(dict.fromkeys(film["method"] for film in found)))}
-    return sorted(found, key=lambda film: (film["domain"], film["reference"], order[film["method"]])), shapes
+            message = f"expected films as evaluation.films writes them, found a file with other keys ({error!r}); make it again"
+            raise UserError(f"{path}: {message}") from error
+    order = {name: place for place, name in enumerate(_ordered(dict.fromkeys(film["method"] for film in films)))}
+    return sorted(films, key=lambda film: (film["domain"], film["reference"], order[film["method"]])), shapes
 
 
 def _task(task: Mapping[str, Any], file: str, domain: str, metric: str, rows: pd.DataFrame) -> dict[str, Any]:
-    """The films of a method and task, and what the domain's rows of its decisive metric say of them."""
+    """The films of a method and task, with notes from the rows of the domain's decisive metric."""
     row = task["row"]
     return {
         "domain": domain,
@@ -148,26 +148,26 @@ def _task(task: Mapping[str, Any], file: str, domain: str, metric: str, rows: pd
         "method": label(row["method"], row["form"]),
         "ours": row["method"] == OURS,
         "reference": row["role"] == REFERENCE,
-        "told": _told(row, task["values"], metric, rows),
+        "told": _notes(row, task["values"], metric, rows),
         "films": [{**film, "file": file, "decisive": metric.removeprefix(f"{CLOSED} ")} for film in task["films"]],
     }
 
 
-def _told(row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
-    """The row that films belong to, in words, and the mean over its seeds."""
+def _notes(row: Mapping[str, Any], values: Mapping[str, float], metric: str, rows: pd.DataFrame) -> list[str]:
+    """The row of the films in words, and the mean over its seeds."""
     subject = {key: row[key] for key in ("setting", "task", "method", "form", "variant", "role", "K", "omega", "demonstrations")}
     same = latest(select(rows, **subject))
     if metric not in values:
         return [f"{row['n']} samples of seed {row['seed']}"]
     if same.empty:
         return [f"{metric} {values[metric]:.2f} of {row['n']}, seed {row['seed']}"]
-    own = select(same, seed=row["seed"])
-    told = [f"seed {row['seed']}: {own['value'].mean():.2f} of {own['n'].iloc[-1]}"] if not own.empty else []
-    return [f"{metric} {same['value'].mean():.2f} over {same['seed'].nunique()} seeds", *told]
+    seen = select(same, seed=row["seed"])
+    notes = [f"seed {row['seed']}: {seen['value'].mean():.2f} of {seen['n'].iloc[-1]}"] if not seen.empty else []
+    return [f"{metric} {same['value'].mean():.2f} over {same['seed'].nunique()} seeds", *notes]
 
 
 def _map(results: Path, domain: Domain) -> Iterator[dict[str, Any]]:
-    """Where the domain's concepts lie: those that its model that ships was pretrained on, and those learned with seed 0."""
+    """Positions of a domain's concepts: training concepts of its shipped model, and concepts learned with seed 0."""
     files = visible(results / CONCEPTS / domain.name / "seed0", "*.safetensors")
     folder = shipped(f"pretrained/{domain.name}")
     if not files or not folder.is_dir():
@@ -176,15 +176,15 @@ def _map(results: Path, domain: Domain) -> Iterator[dict[str, Any]]:
         model = load_model(folder)
         learned = [concept for concept in map(Concept.load, files) if concept.origin.pretrained == model.hash]
         places = concept_places(model, learned)
-    except UserError as error:  # without scikit-learn, or without the domain's package: the rest of the page is there
+    except UserError as error:  # scikit-learn or the domain's package is missing
         say(f"concepts of {domain.name} are left out: {error}", error=True)
         return
     yield {
         "domain": domain.name,
         "name": _title(domain),
         "points": [
-            {"x": round(one.x, 2), "y": round(one.y, 2), "name": one.name, "film": one.concept, "learned": bool(one.component)}
-            for one in places
+            {"x": round(mark.x, 2), "y": round(mark.y, 2), "name": mark.name, "film": mark.concept, "learned": bool(mark.component)}
+            for mark in places
         ],
     }
 
@@ -202,7 +202,7 @@ def _curves(shown: Sequence[Domain], results: pd.DataFrame) -> Iterator[dict[str
                 lines.append(
                     {
                         "name": setting,
-                        "points": [[count, round(one.mean, 4), round(one.error or 0, 4)] for count, one in numbers if one],
+                        "points": [[count, round(value.mean, 4), round(value.error or 0, 4)] for count, value in numbers if value],
                     }
                 )
             metric = " ".join(sorted(set(rows["metric"])))
@@ -213,7 +213,7 @@ def _curves(shown: Sequence[Domain], results: pd.DataFrame) -> Iterator[dict[str
 def _speed(results: Path) -> Iterator[dict[str, Any]]:
     if curves := read_speed(results):
         lines = [
-            {"name": name, "points": [[round(one.seconds, 3), one.accuracy, 0] for one in curve]} for name, curve in curves.items()
+            {"name": name, "points": [[round(row.seconds, 3), row.accuracy, 0] for row in curve]} for name, curve in curves.items()
         ]
         yield {
             "domain": "",
@@ -230,7 +230,7 @@ def _html(content: Mapping[str, Any]) -> str:
     parts = {
         "STYLE": (HERE / "page.css").read_text(encoding="utf-8"),
         "SCRIPT": FILM.read_text(encoding="utf-8") + (HERE / "page.js").read_text(encoding="utf-8"),
-        "DATA": base64.b64encode(gzip.compress(raw, mtime=0)).decode(),  # letters that end no script
+        "DATA": base64.b64encode(gzip.compress(raw, mtime=0)).decode(),  # base64 cannot end the script
     }
     template = (HERE / "page.html").read_text(encoding="utf-8")
-    return re.sub(f"%({'|'.join(parts)})%", lambda found: parts[found[1]], template)
+    return re.sub(f"%({'|'.join(parts)})%", lambda match: parts[match[1]], template)

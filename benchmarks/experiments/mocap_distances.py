@@ -1,0 +1,226 @@
+"""How far generated motion is from recordings of people, in the features of the judge, beside recordings of other people.
+
+    python benchmarks/experiments/mocap_distances.py --root FOLDER --concepts results/concepts/mocap/seed0 \
+        --out results/mocap_distances.json
+
+FOLDER holds recordings as ``prepare mocap`` leaves them. Each row compares as many windows with recordings of a concept by people
+who did not demonstrate it, and with the distance between two people's recordings of it. Walking by its text is compared with
+recordings of walking, and each person's with that of all others. ``variation`` tells how far two samples from one start are apart,
+beside two recordings of one person and of two. Last, a classifier that has learned from generated motion alone, tested on
+recordings.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.mocap.actions import TESTED, action
+from ftl_lightning.domains.mocap.kinematics import SETTLED
+from ftl_lightning.domains.mocap.measures import distances, diversity, learned_elsewhere, multimodality
+from ftl_lightning.domains.mocap.skeleton import HORIZON
+from ftl_lightning.domains.mocap.source import POSE, Recorded, at_rest, pieces
+from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
+from ftl_lightning.domains.mocap.views import begun_elsewhere
+from ftl_lightning.learning.concept_check import expect_concept
+from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.progress import bar
+from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import write_text
+
+MOST = 500
+"""Windows on each side, where there are as many."""
+SAMPLING = Sampling("dpm_solver", 10, 1.0)
+"""As conf/sampling/mocap.yaml."""
+STARTS, EACH = 20, 10
+"""Starts from which variation is measured, and samples from each."""
+FEWEST = 50
+"""Windows of a person who walks, at least."""
+GUIDANCE = 1.2
+"""Of training concepts."""
+
+
+def windows(states: Tensor, stride: int) -> list[Tensor]:
+    """All windows as long as a plan of ``(frame, 42)``."""
+    return [states[start : start + HORIZON] for start in range(0, len(states) - HORIZON + 1, stride)]
+
+
+def stretches(source: Recorded, concept: str) -> list[tuple[str, Tensor]]:
+    """Who shows a new concept, and a stretch ``(frame, 42)`` in which it is shown."""
+    every, found = source.recordings, list[tuple[str, Tensor]]()
+    for segment in source.segments:
+        if segment.label == concept and segment.trial_id in every.trial_id:
+            trial = every.trial_id.index(segment.trial_id)
+            states = every.trial(trial)[segment.start : segment.stop]
+            found += [(every.subject[trial], piece) for piece in pieces(states, longest=None)]
+    return found
+
+
+def shown_by(source: Recorded, concept: str, demonstrators: bool) -> list[Tensor]:
+    """Those of people who demonstrate it, or of others."""
+    return [states for subject, states in stretches(source, concept) if (subject in DEMONSTRATORS) == demonstrators]
+
+
+def recorded(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
+    """Windows ``(window, 32, 42)`` of a new concept by those who demonstrate it, or by others."""
+    found = [window for states in shown_by(source, concept, demonstrators) for window in windows(states, 1)]
+    return torch.stack(found) if found else torch.zeros(0, HORIZON, 42)
+
+
+def beginnings(source: Recorded, concept: str, demonstrators: bool) -> Tensor:
+    """Of these, those that start nearest to rest, as demonstrations do."""
+    parts = shown_by(source, concept, demonstrators)
+    return torch.stack([states[start : start + HORIZON] for states in parts for start in at_rest(states)])
+
+
+def actions(source: Recorded, stride: int) -> dict[str, Tensor]:
+    """Windows of the training concepts' trials by the judge's action, of those that are tested."""
+    found: dict[str, list[Tensor]] = {}
+    training = source.split("train", 0, 0)
+    half = len(training) // 2  # the others are mirror images
+    for states, length, text in zip(training.states[:half], training.lengths[:half].tolist(), training.concepts, strict=False):
+        if (name := action(text)) in TESTED:
+            found.setdefault(name, []).extend(windows(states[:length], stride))
+    return {name: torch.stack(own) for name, own in found.items()}
+
+
+def generated(model: ConceptModel, composition: Composition, starts: Tensor, seed: int) -> Tensor:
+    """A window from each start."""
+    return model.sample([composition], len(starts), SAMPLING, [generator("cpu", seed)], {POSE: starts})[0]
+
+
+def said(model: ConceptModel, *texts: str) -> Composition:
+    """Training concepts; of none, whatever the model generates."""
+    embeddings = torch.stack([model.concept(text) for text in texts])[:, None] if texts else model.empty[None, None]
+    return Composition(embeddings, torch.full((len(embeddings),), GUIDANCE if texts else 0.0))
+
+
+def variation(model: ConceptModel, composition: Composition, starts: Tensor, seed: int) -> float:
+    """How far samples from one start are from their mean: metres, root mean square over samples, joints and frames.
+
+    Of frames that no longer come from the start, see :data:`~ftl_lightning.domains.mocap.kinematics.SETTLED`.
+    """
+    each = starts[:STARTS].repeat_interleave(EACH, dim=0)
+    return spread(generated(model, composition, each, seed).unflatten(0, (-1, EACH)))
+
+
+def spread(windows: Tensor) -> float:
+    """The same of windows ``(..., sample, 32, 42)``."""
+    far = windows[..., SETTLED:, :] - windows[..., SETTLED:, :].mean(dim=-3, keepdim=True)
+    share = windows.shape[-3] / (windows.shape[-3] - 1)
+    return float((3 * share * far.square().mean()).sqrt())  # three coordinates of a joint
+
+
+def walking(source: Recorded, model: ConceptModel, seed: int) -> dict[str, object]:
+    """Distances of walking by its text to recordings of people who walk, and of each person's recordings to all others'."""
+    training = source.split("train", 0, 0)
+    half = len(training) // 2
+    subjects = [str(trial).split("_")[0] for trial in training.provenance["trials"][:half]]
+    by_subject: dict[str, list[Tensor]] = {}
+    for row, subject in enumerate(subjects):
+        if training.concepts[row] == "walk":
+            by_subject.setdefault(subject, []).extend(windows(training.states[row, : int(training.lengths[row])], 4))
+    every = {subject: torch.stack(own) for subject, own in by_subject.items() if len(own) >= FEWEST}
+    starts = source.starts("walk", MOST, seed).observed[POSE]
+    made = generated(model, said(model, "walk"), starts, seed)
+    rows: dict[str, object] = {"text: walk": distances(made, torch.cat(list(every.values())), seed)}
+    for subject, own in every.items():
+        others = torch.cat([windows for other, windows in every.items() if other != subject])
+        rows[f"recordings of {subject}, against all others"] = distances(own, others, seed)
+    return rows
+
+
+def table(
+    source: Recorded, model: ConceptModel, folders: Mapping[str, Sequence[Path]], concept: str, seed: int
+) -> tuple[dict[str, object], dict[str, float]]:
+    """Each row's distances to recordings of people who did not demonstrate a concept; each row's variation in metres."""
+    real, shown = recorded(source, concept, False), recorded(source, concept, True)
+    number = min(MOST, len(real), len(shown))
+    starts = source.starts(concept, number, seed).observed[POSE]
+    turns = torch.arange(number)
+    demonstrations = source.draw(concept, 5, seed).states
+    many = demonstrations[torch.arange(4 * number) % len(demonstrations)]
+    begun, _ = begun_elsewhere(many, {POSE: many[:, 0]}, generator("cpu", seed))
+    rows = {
+        "recordings of the demonstrators": shown,
+        "demonstrations replayed": demonstrations[turns % len(demonstrations)],
+        "demonstrations begun in other poses": begun[(begun[:, 0] != many[:, 0]).any(dim=1)][:number],
+        "frozen frame": starts[:, None].repeat(1, HORIZON, 1),
+        "unconditional": generated(model, said(model), starts, seed),
+        "text: walk": generated(model, said(model, "walk"), starts, seed),
+    }
+    own, others = (beginnings(source, concept, demonstrators) for demonstrators in (True, False))
+    varied = {"recordings of the demonstrators": spread(own), "recordings of both": spread(torch.cat([own, others]))}
+    varied["text: walk"] = variation(model, said(model, "walk"), starts, seed)
+    for name, places in folders.items():
+        for place in places:
+            path = place / f"{concept.replace(' ', '_')}.safetensors"
+            learned = Concept.load(path)
+            expect_concept(model, learned, path)
+            row = name if len(places) == 1 else f"{name}, {place.name}"
+            rows[row] = generated(model, learned.composition, starts, seed)
+            varied[row] = variation(model, learned.composition, starts, seed)
+    halves = {**distances(real[::2], real[1::2], seed), "diversity": diversity(real, seed)}
+    found: dict[str, dict[str, float]] = {
+        name: {**distances(own, real, seed), "diversity": diversity(own, seed)} for name, own in rows.items()
+    }
+    between = found["recordings of the demonstrators"]["kid"]
+    over = {name: {**row, "kid over that between people": row["kid"] / between} for name, row in found.items()}
+    return {"recordings of the others, half against half": halves, **over}, varied
+
+
+def second_opinion(source: Recorded, model: ConceptModel, seed: int, number: int = 100) -> dict[str, object]:
+    """Balanced accuracy on recordings of a classifier that has learned from generated motion of training concepts."""
+    real = actions(source, 8)
+    texts = {name: [text for text in model.config.training_concepts if action(text) == name] for name in real}
+    starts = source.starts("walk", number, seed).observed[POSE]
+    made = {}
+    for index, (name, own) in enumerate(texts.items()):
+        parts = [generated(model, said(model, text), starts[row :: len(own)], seed + index) for row, text in enumerate(own)]
+        made[name] = torch.cat(parts)
+    return {
+        "actions": sorted(real),
+        "learned from generated, tested on recordings": learned_elsewhere(made, real),
+        "multimodality": multimodality(made, seed),
+        "multimodality of recordings": multimodality(real, seed),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, required=True, help="recordings, as `prepare mocap` leaves them")
+    parser.add_argument("--pretrained", default="pretrained/mocap")
+    parser.add_argument("--concepts", type=Path, nargs="*", default=[], help="folders of learned concepts")
+    parser.add_argument("--adapters", type=Path, nargs="*", default=[], help="folders of concepts with an adapter")
+    parser.add_argument("--tasks", nargs="*", default=["jumping jacks", "arm circle"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=None)
+    chosen = parser.parse_args(arguments)
+    source, model = Recorded(chosen.root), load_model(chosen.pretrained)
+    folders = {"ours": chosen.concepts, "ours with adapter": chosen.adapters}
+    found: dict[str, object] = {"model": model.hash, "seed": chosen.seed}
+    variations: dict[str, dict[str, float]] = {}
+    with bar("concepts", len(chosen.tasks) + 1) as advance:
+        for concept in chosen.tasks:
+            found[concept], variations[concept] = table(source, model, folders, concept, chosen.seed)
+            advance()
+        found["variation"] = variations
+        found["walk"] = walking(source, model, chosen.seed)
+        found["second opinion"] = second_opinion(source, model, chosen.seed)
+        advance()
+    text = json.dumps(found, indent=1) + "\n"
+    print(text)
+    if chosen.out is not None:
+        write_text(chosen.out, text)
+
+
+if __name__ == "__main__":
+    main()

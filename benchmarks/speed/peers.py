@@ -1,0 +1,353 @@
+"""Inversion and sampling beside ``diffusers``: the same network, the same work, one run on one machine.
+
+    python benchmarks/speed/peers.py [--pretrained pretrained/object_rearrangement] [--out results/peers.json] [--threads 2]
+
+Theirs is written as a user of ``diffusers`` would write it: its schedulers, its learning-rate schedule, the loop of its textual
+inversion (a table of embeddings of which all rows but the new ones are put back after each step; AdamW), and guidance by one batch
+of all branches, in which every plan brings its own embedding. The network is ours with its weights. The loss is Eq. 2, so that both
+learn the same.
+
+As its examples do: one plan after another when a concept is looked at, and one noised demonstration at a time, accumulated, when
+one is learned. Batched by hand: all plans of a concept at once, or of all concepts, and all noised demonstrations of a step; for
+sampling also with what a concept makes computed once instead of for every plan, which takes a change of the network's interface.
+
+The same noise gives the same plans with DDPM and DDIM; learned concepts have the same loss on common noise. Both are in the file.
+CleanDiffuser is not among Python's packages (no release on PyPI), so it is not compared. With one thread, seconds are of processor
+time, which other work disturbs less.
+"""
+
+import argparse
+import functools
+import importlib.metadata
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, median
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler
+from diffusers.optimization import get_scheduler
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ftl_lightning.concepts.composition import Composition
+from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.domains.data import InversionData
+from ftl_lightning.learning.inversion import invert
+from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from ftl_lightning.progress import bar
+from ftl_lightning.seeding import generator
+from ftl_lightning.tensor_file import write_text
+from ftl_lightning.tuned import ModelSettings
+
+Batching = Literal["one by one", "batched"]
+CONCEPTS, PLANS, DENOISING, K, GUIDANCE = 10, 50, 100, 2, 1.2
+LEARNING_RATE = 0.1
+"""Of ours and of theirs."""
+SINGLES, SLICE = 3, 3
+"""Plans, and steps of learning, that are timed of what goes one by one, and scaled up."""
+JUDGED = 512
+"""Noised demonstrations on which learned concepts are compared."""
+
+
+class Conditional(nn.Module):
+    """Our network under the interface of those of ``diffusers``.
+
+    Args:
+        model: whose network it is; nothing is observed in its domain.
+    """
+
+    def __init__(self, model: GenerativeModel) -> None:
+        super().__init__()
+        self.network = model.denoiser
+
+    def forward(self, sample: Tensor, timestep: Tensor, encoder_hidden_states: Tensor) -> SimpleNamespace:
+        """``sample (batch, horizon, state)``, ``timestep`` one for all or ``(batch,)``, an embedding of each ``(batch, n)``."""
+        own = torch.arange(len(sample))
+        return SimpleNamespace(sample=self.network(sample, timestep.expand(len(sample)), encoder_hidden_states[:, None], own))
+
+
+class Shared(Conditional):
+    """The same where plans of a concept share what it makes: embeddings ``(concept, n)``, equally many plans of each in turn."""
+
+    def forward(self, sample: Tensor, timestep: Tensor, encoder_hidden_states: Tensor) -> SimpleNamespace:
+        own = torch.arange(len(encoder_hidden_states)).repeat_interleave(len(sample) // len(encoder_hidden_states))
+        return SimpleNamespace(sample=self.network(sample, timestep.expand(len(sample)), encoder_hidden_states[:, None], own))
+
+
+def ddpm_scheduler(model: GenerativeModel) -> Any:
+    """Of ``diffusers``, with the schedule of the model."""
+    return DDPMScheduler(len(model.alpha_bar), beta_schedule="squaredcos_cap_v2", clip_sample=True)
+
+
+def ddim_scheduler(model: GenerativeModel) -> Any:
+    """Likewise."""
+    return DDIMScheduler(
+        len(model.alpha_bar), beta_schedule="squaredcos_cap_v2", clip_sample=True, set_alpha_to_one=True, timestep_spacing="leading"
+    )
+
+
+def guided(estimates: Tensor, weight: float) -> Tensor:
+    """Classifier-free guidance by several concepts: ``(branch * plan, ...)`` of the empty one and K others, one after another."""
+    empty, *conditional = estimates.chunk(1 + K)
+    return empty + weight * sum((own - empty for own in conditional), torch.zeros_like(empty))
+
+
+@torch.no_grad()
+def their_plans(
+    network: Conditional, scheduler: Any, embeddings: Tensor, draw: torch.Generator, count: int, shape: tuple[int, int]
+) -> Tensor:
+    """Plans of one or several concepts in a loop of a scheduler.
+
+    Args:
+        network: under its interface.
+        scheduler: with the model's schedule.
+        embeddings: ``(branch, concept, n)``, the empty one first.
+        draw: of all noise.
+        count: of each concept's plans.
+        shape: of a plan ``(horizon, state)``.
+
+    Returns:
+        ``(concept * count, horizon, state)``, normalised.
+    """
+    scheduler.set_timesteps(DENOISING)
+    latents = torch.randn((embeddings.shape[1] * count, *shape), generator=draw) * scheduler.init_noise_sigma
+    prompts = (embeddings if isinstance(network, Shared) else embeddings.repeat_interleave(count, dim=1)).flatten(0, 1)
+    # DDIM's noise has to follow from the clean plan after it is clipped, as with us.
+    options: dict[str, Any] = {"generator": draw} if isinstance(scheduler, DDPMScheduler) else {"use_clipped_model_output": True}
+    for t in scheduler.timesteps:
+        inputs = scheduler.scale_model_input(torch.cat([latents] * len(embeddings)), t)
+        estimate = guided(network(inputs, t, encoder_hidden_states=prompts).sample, GUIDANCE)
+        latents = scheduler.step(estimate, t, latents, **options).prev_sample
+    return latents
+
+
+def their_concept(
+    model: GenerativeModel, demonstrations: Tensor, samples: int, steps: int, batching: Batching, draw: torch.Generator
+) -> Composition:
+    """Textual inversion of K new rows of the table of embeddings.
+
+    Args:
+        model: frozen.
+        demonstrations: of the concept ``(demo, horizon, state)``, normalised.
+        samples: noised demonstrations a step.
+        steps: of the optimiser.
+        batching: whether they are one batch or accumulated.
+        draw: of start, demonstrations, noise and timesteps.
+    """
+    network, scheduler = Conditional(model), ddpm_scheduler(model)
+    known = torch.cat((model.empty[None], model.training_embeddings))
+    start = 0.05 * torch.randn(K, known.shape[1], generator=draw)
+    table = nn.Embedding.from_pretrained(torch.cat((known, start)), freeze=False)
+    original = table.weight.detach().clone()
+    kept = torch.arange(len(original)) < len(known)
+    optimiser = torch.optim.AdamW(table.parameters(), lr=LEARNING_RATE, weight_decay=0.0)
+    rate = get_scheduler("cosine", optimizer=optimiser, num_warmup_steps=0, num_training_steps=steps)
+    size = samples if batching == "batched" else 1
+    for _ in range(steps):
+        for _ in range(samples // size):
+            clean = demonstrations[torch.randint(len(demonstrations), (size,), generator=draw)]
+            noise = torch.randn(clean.shape, generator=draw)
+            t = torch.randint(scheduler.config["num_train_timesteps"], (size,), generator=draw)
+            noisy = scheduler.add_noise(clean, noise, t)
+            tokens = torch.tensor([0, *range(len(known), len(original))]).repeat_interleave(size)
+            estimates = network(torch.cat([noisy] * (1 + K)), t.repeat(1 + K), encoder_hidden_states=table(tokens)).sample
+            loss = functional.mse_loss(guided(estimates, GUIDANCE), noise, reduction="mean")
+            (loss * size / samples).backward()
+        optimiser.step()
+        rate.step()
+        optimiser.zero_grad()
+        with torch.no_grad():
+            table.weight[kept] = original[kept]
+    return Composition(table.weight.detach()[-K:, None].clone(), torch.full((K,), GUIDANCE))
+
+
+@torch.no_grad()
+def loss_of(model: GenerativeModel, own: Demonstrations, learned: Composition) -> float:
+    """Eq. 2 of a concept on noise that is the same for all."""
+    rows = torch.arange(JUDGED) % len(own)
+    together = Composition(learned.embeddings[None], learned.weights[None])
+    draws = model.draws(JUDGED, 1.0, generator("cpu", 7))
+    return float(model.losses(own.states[rows], {}, together, draws, "epsilon").mean())
+
+
+@dataclass(frozen=True)
+class Work:
+    """What both do.
+
+    Attributes:
+        model: whose network it is.
+        concepts: demonstrations of each.
+        settings: of our inversion.
+        steps: of learning.
+        repeats: timed runs, of which the median is told.
+    """
+
+    model: GenerativeModel
+    concepts: Sequence[Demonstrations]
+    settings: InversionSettings
+    steps: int
+    repeats: int
+
+    def seconds(self, work: Callable[[], Any], repeats: int | None = None) -> float:
+        """The median of some runs, after one that is not timed."""
+        found, clock = [], time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+        for turn in range(1 + (repeats or self.repeats)):
+            start = clock()
+            work()
+            if turn:
+                found.append(clock() - start)
+        return median(found)
+
+    @functools.cached_property
+    def compositions(self) -> list[Composition]:
+        """What plans are made of: training concepts in pairs."""
+        known, count = self.model.training_embeddings, len(self.model.training_embeddings)
+        pairs = [known[[index % count, (index + 1 + index // count) % count]] for index in range(len(self.concepts))]
+        return [Composition(pair[:, None], torch.full((K,), GUIDANCE)) for pair in pairs]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of a plan."""
+        return self.model.config.horizon, self.model.config.state_dim
+
+    def branches(self, chosen: Sequence[Composition]) -> Tensor:
+        """Embeddings of the empty and all other branches ``(branch, concept, n)``."""
+        own = torch.stack([composition.embeddings[:, 0] for composition in chosen], dim=1)
+        return torch.cat((self.model.empty.expand(1, len(chosen), -1), own))
+
+    def ours(self, sampler: str = "ddpm", chosen: Sequence[Composition] | None = None) -> Tensor:
+        """Our plans ``(concept, plan, horizon, state)``."""
+        chosen = self.compositions if chosen is None else chosen
+        draws = [generator("cpu", 3, index) for index in range(len(chosen))]
+        return self.model.sample(chosen, PLANS, Sampling(sampler, DENOISING, 1.0), draws)
+
+
+def equality(work: Work) -> dict[str, float]:
+    """Largest difference of plans from the same noise, in units of the range that the data fill, for each sampler."""
+    found = {}
+    for name, scheduler in (("ddpm", ddpm_scheduler(work.model)), ("ddim", ddim_scheduler(work.model))):
+        chosen = work.compositions[:1]
+        theirs = their_plans(Conditional(work.model), scheduler, work.branches(chosen), generator("cpu", 3, 0), PLANS, work.shape)
+        own, theirs = (work.model.encode(plans, {}) for plans in (work.ours(name, chosen)[0], work.model.decode(theirs, {})))
+        found[name] = float((own - theirs).abs().max()) / 2
+    return found
+
+
+def sampling(work: Work) -> dict[str, float]:
+    """Seconds of all plans of all concepts."""
+    scheduler, chosen = ddpm_scheduler(work.model), work.compositions
+    plain, shared = Conditional(work.model), Shared(work.model)
+
+    def theirs(network: Conditional, some: Sequence[Composition], count: int = PLANS) -> Tensor:
+        return their_plans(network, scheduler, work.branches(some), generator("cpu", 3), count, work.shape)
+
+    return {
+        "ours": work.seconds(work.ours),
+        "theirs, as its examples do (scaled)": work.seconds(lambda: theirs(plain, chosen[:1], 1), SINGLES) * PLANS * len(chosen),
+        "theirs, batched, a concept after another": work.seconds(lambda: [theirs(plain, [one]) for one in chosen]),
+        "theirs, batched, all concepts at once": work.seconds(lambda: theirs(plain, chosen)),
+        "theirs, batched, all at once, concepts computed once": work.seconds(lambda: theirs(shared, chosen)),
+    }
+
+
+def learning(work: Work) -> tuple[dict[str, float], dict[str, Any]]:
+    """Seconds of learning all concepts and one, and the losses of what was learned."""
+    model, samples = work.model, work.settings.budget.samples
+    normalised = [model.encode(own.states, {}) for own in work.concepts]
+    every = concatenate(work.concepts)
+
+    def theirs(index: int, steps: int, batching: Batching) -> Composition:
+        return their_concept(model, normalised[index], samples, steps, batching, generator("cpu", 5, index))
+
+    def all_of_theirs() -> list[Composition]:
+        return [theirs(index, work.steps, "batched") for index in range(len(normalised))]
+
+    own = invert(model, every, work.settings, work.steps)
+    other = all_of_theirs()
+    losses = {
+        name: (loss_of(model, one, found.composition), loss_of(model, one, composition))
+        for (name, found), one, composition in zip(own.items(), work.concepts, other, strict=True)
+    }
+    seconds = {
+        "ours, together": work.seconds(lambda: invert(model, every, work.settings, work.steps)),
+        "ours, one": work.seconds(lambda: invert(model, work.concepts[0], work.settings, work.steps)),
+        "theirs, batched, a concept after another": work.seconds(all_of_theirs, 1),
+        "theirs, batched, one": work.seconds(lambda: theirs(0, work.steps, "batched")),
+        "theirs, as its examples do, one (scaled)": work.seconds(lambda: theirs(0, SLICE, "one by one"), 1) / SLICE * work.steps,
+    }
+    seconds["theirs, as its examples do (scaled)"] = len(normalised) * seconds["theirs, as its examples do, one (scaled)"]
+    told = {
+        "ours, mean": round(mean(one for one, _ in losses.values()), 5),
+        "theirs, mean": round(mean(one for _, one in losses.values()), 5),
+        "ours over theirs, largest": round(max(one / another for one, another in losses.values()), 4),
+    }
+    return seconds, told
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pretrained", default="pretrained/object_rearrangement")
+    parser.add_argument("--config", default="conf/object_rearrangement.yaml")
+    parser.add_argument("--out", default="results/peers.json")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--steps", type=int, default=100, help="of learning")
+    parser.add_argument("--concepts", type=int, default=CONCEPTS)
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    load = os.getloadavg()[0]
+    model = read_model(GenerativeModel, options.pretrained)
+    data = InversionData(model.config.domain, suite="validation", seed=0).demonstrations
+    names = list(dict.fromkeys(data.concepts))[: options.concepts]
+    tuned = ModelSettings.read(options.config).inversion
+    settings = tuned.changed(tolerance=None, omega=GUIDANCE, components=K, learning_rate=LEARNING_RATE)
+    work = Work(model, [data.select(name) for name in names], settings, options.steps, options.repeats)
+    found: dict[str, Any] = {
+        "machine": {
+            "capability": torch.backends.cpu.get_cpu_capability(),
+            "threads": options.threads,
+            "torch": torch.__version__,
+            "diffusers": importlib.metadata.version("diffusers"),
+        },
+        "work": {
+            "concepts": len(names),
+            "K": K,
+            "plans of each": PLANS,
+            "denoising steps": DENOISING,
+            "steps of learning": options.steps,
+            "noised demonstrations a step": settings.budget.samples,
+        },
+    }
+    with bar("beside diffusers", 3) as advance:
+        found["same noise, largest difference of plans"] = equality(work)
+        advance()
+        generation = sampling(work)
+        advance()
+        inversion, found["loss of learned concepts"] = learning(work)
+        advance()
+    found["sampling, seconds"] = {name: round(value, 4) for name, value in generation.items()}
+    found["learning, seconds"] = {name: round(value, 4) for name, value in inversion.items()}
+    found["ratio"] = {
+        "sampling": {name: round(value / generation["ours"], 2) for name, value in generation.items() if "theirs" in name},
+        "learning": {
+            name: round(value / inversion["ours, one" if ", one" in name else "ours, together"], 2)
+            for name, value in inversion.items()
+            if "theirs" in name
+        },
+    }
+    found["load"] = [round(load, 2), round(os.getloadavg()[0], 2)]
+    write_text(Path(options.out), json.dumps(found, indent=2) + "\n")
+    print(json.dumps(found, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""The page of ``play`` used as a person uses it, timed: five strokes of new kinds drawn in a browser, learned, sampled, and mixed.
+
+    python benchmarks/speed/play.py [--out results/play.json] [--kinds KIND ...]
+
+Chromium draws with a synthetic mouse. Each kind is one that pretraining does not show, in five strokes as a hand draws them
+(:mod:`ftl_lightning.testing.more_strokes`). Samples are told apart by a judge of nearest templates that learning knows nothing of.
+Seconds are of this machine, whatever else runs on it.
+"""
+
+import argparse
+import json
+import platform
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.few_shot import FewShot
+from ftl_lightning.tensor_file import write_text
+from ftl_lightning.testing.more_strokes import TEST, VALIDATION, Judge, drawn
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # the browser is that of the tests
+from tests.play.browser import Browser, browser
+from tests.play.served import Served, served
+
+SEED, SHOWN, SAMPLES = 11, 5, 100
+"""Of the strokes; how many are drawn; samples that are judged."""
+MOVES = 6
+"""Of a slider."""
+
+
+def learn(page: Browser, server: Served, kind: str) -> tuple[dict[str, float], bytes]:
+    """Draw five strokes of a kind; returns seconds from the end of the last one, and the concept's file."""
+    page.click("clear")
+    page.until(lambda: page.count("#slots canvas") == 0)
+    strokes = drawn(kind, SHOWN, SEED)
+    for number, stroke in enumerate(strokes):
+        page.until(lambda: page.js("recorder.scene !== null && !recorder.busy"))
+        seen = int(page.data("samples") or 0)
+        places = page.places([(float(x), float(y)) for x, y in stroke])
+        begin = time.monotonic()
+        page.drag(places)
+        drawing = time.monotonic() - begin
+        if number + 1 < SHOWN:
+            until_count(page, number + 1)
+    done = begin + drawing
+    page.until(lambda: page.data("learning") == "yes" or page.count("#slots canvas") == SHOWN)
+    if page.data("learning") != "yes" and page.js("!document.getElementById('learn').disabled && !recorder.busy"):
+        time.sleep(0.3)  # learning waits where a stroke looks different from the others
+        if page.data("learning") != "yes" and int(page.data("samples") or 0) == seen:
+            page.click("learn")
+    until_samples(page, seen)
+    first = time.monotonic() - done
+    page.until(lambda: page.data("learning") == "yes")
+    page.until(lambda: page.data("learning") == "no")
+    learned = time.monotonic() - done
+    concept = [one for one in server.get("/api/state")["concepts"] if one["kind"] == "learned"][-1]
+    content = server.ask("GET", f"/api/concept?id={concept['id']}")[1]
+    return {"first samples": first, "learned": learned, "drawing": drawing}, content
+
+
+def until_count(page: Browser, count: int) -> None:
+    """Wait until so many demonstrations are there."""
+    page.until(lambda: page.count("#slots canvas") == count)
+
+
+def until_samples(page: Browser, seen: int) -> None:
+    """Wait until there are samples after so many sets of them."""
+    page.until(lambda: int(page.data("samples") or 0) > seen)
+
+
+def slide(page: Browser) -> list[float]:
+    """Seconds from a change of a weight to new samples on the page."""
+    found = []
+    for move in range(MOVES):
+        before = int(page.data("samples"))
+        script = (
+            "(() => { const one = document.querySelector('#mix input[type=range]'); one.value = arguments[0];"
+            " one.dispatchEvent(new Event('input', {bubbles: true})); return true; })"
+        )
+        begin = time.monotonic()
+        page.js(f"{script.replace('arguments[0]', str(0.5 + 0.1 * move))}()")
+        until_samples(page, before)
+        found.append(time.monotonic() - begin)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", default="results/play.json")
+    parser.add_argument("--kinds", nargs="+", default=[*VALIDATION, *TEST])
+    options = parser.parse_args()
+    judge, model, rows = Judge.of(), FewShot.from_pretrained("strokes"), {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        begin = time.monotonic()
+        with served(folder, ["--pretrained", "strokes"]) as server, browser(folder) as page:
+            started = time.monotonic()
+            page.open(server.address)
+            page.until(lambda: int(page.data("samples") or 0) > 0)
+            opened = server.seconds + time.monotonic() - started
+            for kind in options.kinds:
+                seconds, content = learn(page, server, kind)
+                path = folder / "concept.safetensors"
+                path.write_bytes(content)
+                samples = model.sample(model.load(path), SAMPLES, seed=SEED).states.numpy()
+                told = {key: round(value, 2) for key, value in seconds.items()}
+                told |= {"recognised": judge.rate(samples, kind), "loss": round(Concept.load(path).origin.loss, 4)}
+                told["recognised, as drawn"] = judge.rate(drawn(kind, SAMPLES, SEED + 1), kind)
+                told["slider"] = round(statistics.median(slide(page)), 2)
+                rows[kind] = told
+                print(kind, told, flush=True)
+    whole: dict[str, Any] = {
+        "command": "python benchmarks/speed/play.py",
+        "model": model.model.hash,
+        "machine": {"processor": platform.machine(), "python": platform.python_version()},
+        "seconds from the command to samples on the page": round(opened, 2),
+        "kinds": rows,
+        "validation": _means([rows[kind] for kind in VALIDATION if kind in rows]),
+        "test": _means([rows[kind] for kind in TEST if kind in rows]),
+        "seconds": round(time.monotonic() - begin, 1),
+    }
+    write_text(options.out, json.dumps(whole, indent=2) + "\n")
+    write_text(Path(options.out).with_suffix(".md"), _table(whole))
+
+
+def _means(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Mean rate, least rate, and medians of seconds."""
+    if not rows:
+        return {}
+    rates = np.array([row["recognised"] for row in rows])
+    found = {"recognised": round(float(rates.mean()), 3), "least": round(float(rates.min()), 3)}
+    found["standard error"] = round(float(rates.std(ddof=1) / len(rates) ** 0.5), 3) if len(rates) > 1 else 0.0
+    for key in ("first samples", "learned", "slider"):
+        found[f"{key}, seconds"] = round(statistics.median(row[key] for row in rows), 2)
+    return found
+
+
+def _table(whole: dict[str, Any]) -> str:
+    """The same as Markdown."""
+    keys = ("first samples", "learned", "slider")
+    lines = ["| | recognised (least) | first samples | learned | slider |", "|---|---|---|---|---|"]
+    for name in ("validation", "test"):
+        if found := whole[name]:
+            rate = f"{found['recognised']:.2f} ± {found['standard error']:.2f} ({found['least']:.2f})"
+            cells = [f"{found[f'{key}, seconds']:.1f} s" for key in keys]
+            count = sum(kind in whole["kinds"] for kind in (VALIDATION if name == "validation" else TEST))
+            lines.append(f"| {count} {name} kinds | {rate} | {' | '.join(cells)} |")
+    opened = whole["seconds from the command to samples on the page"]
+    told = "Mean ± standard error over kinds. Seconds are medians: from the end of the fifth stroke, and from the move of a slider "
+    told += f"to new samples. From the command to the first samples on the page: {opened:.1f} s."
+    return "\n".join((*lines, "", told, ""))
+
+
+if __name__ == "__main__":
+    main()
