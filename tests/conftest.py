@@ -146,7 +146,7 @@ def tiny_of(once: Once) -> Callable[[str], Path]:
             few = ["--trainer.max_steps=5", "--data.steps_per_epoch=5", "--data.batch_size=8", "--evaluation.samples=1"]
             few += ["--evaluation.steps=2", "--evaluation.figures=0", "--evaluation.diversity=false"]
             with pytest.MonkeyPatch.context() as patch:
-                _draw_once(patch, once)
+                draw_once(patch, once)
                 succeed(*tiny.fit(Path(f"{domain}.yaml"), *few))
 
         return once(f"tiny_{domain}", fit) / "logs" / domain / "fit" / "pretrained"
@@ -157,10 +157,11 @@ def tiny_of(once: Once) -> Callable[[str], Path]:
 @pytest.fixture
 def drawn(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
     """Take demonstrations that other tests of this run have drawn from a common cache; make up those of the table-top."""
-    _draw_once(monkeypatch, once)
+    draw_once(monkeypatch, once)
 
 
-def _draw_once(patch: pytest.MonkeyPatch, once: Once) -> None:
+def draw_once(patch: pytest.MonkeyPatch, once: Once) -> None:
+    """Share drawn demonstrations between the tests of a run."""
     from ftl_lightning.domains.tabletop.source import Expert
     from tests.domains.tabletop_samples import made_up
 

@@ -208,7 +208,7 @@ class Composition(Shown):
         )
 
     def drawn(self, generator: torch.Generator) -> "Composition":
-        """Draw the composition ``(K, ...)`` of a single sample, without modes."""
+        """Composition ``(K, ...)`` of a single sample, without modes; the generator draws one of several modes."""
         if self.uncomposed.modes is None:
             return self.uncomposed
         rows, row = self.uncomposed.draw(1, generator)

@@ -19,7 +19,7 @@ from ftl_lightning.errors import UserError
 from ftl_lightning.processes import Dropout, drawn, rows_of
 from ftl_lightning.trainer import Trainer
 from tests import tiny as sizes
-from tests.conftest import CONF, TINY, inversion_module, refused, started, succeed
+from tests.conftest import CONF, TINY, Once, draw_once, inversion_module, refused, started, succeed
 
 STEPS = 50
 FIT = [f"--data.steps_per_epoch={STEPS // 2}", f"--trainer.max_steps={STEPS}", "--trainer.log_every_n_steps=1"]
@@ -80,12 +80,13 @@ def rank(number: int, every: Sequence[tuple[list[str], str]]) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the logs of each case in two processes: forks of this one, since an interpreter takes longer to start."""
     # Each case has a store, at a port that the system chose: a process that is ahead joins no group that the other one leaves.
     stores = [TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False) for _ in CASES]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("two"))
+        draw_once(patch, once)
         every = [([*fit(path, f"two/{path}", 4), *TWO], str(store.port)) for path, store in zip(CASES, stores, strict=True)]
         both = [multiprocessing.get_context("fork").Process(target=rank, args=(number, every)) for number in range(2)]
         for one in both:
