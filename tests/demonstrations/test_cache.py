@@ -22,8 +22,13 @@ def test_demonstrations_are_made_once_and_again_where_their_file_is_damaged(monk
     assert first.hash == second.hash
     (file,) = Path("cache/ftl-lightning").glob("made-*.safetensors")
     file.write_bytes(file.read_bytes()[:-3])
-    # Another process that reads the file at the same time removes it first.
     remove = Path.unlink
-    monkeypatch.setattr(Path, "unlink", lambda path, missing_ok=False: (remove(path), remove(path, missing_ok=missing_ok))[1])
+
+    def removed_by_another_process_first(path: Path, missing_ok: bool = False) -> None:
+        if path.name == file.name:
+            remove(path)
+        remove(path, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", removed_by_another_process_first)
     assert cached({"domain": "made"}, 2, make).hash == first.hash
     assert len(calls) == 2
