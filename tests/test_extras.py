@@ -111,7 +111,7 @@ def test_own_data_and_reports_of_all_domains_need_no_simulator(told: Callable[..
     concept = "logs/own/invert/concepts/go_between.safetensors"
     codes = told(
         ["fit", f"--config={CONF / 'own.yaml'}", f"--data.demonstrations={many}", *small, *fast],
-        ["invert", f"--config={CONF / 'invert' / 'own.yaml'}", f"--data.demonstrations={few}", "--data.steps=2", *fast],
+        ["invert", f"--config={CONF / 'own.yaml'}", f"--data.demonstrations={few}", "--data.steps=2", *fast],
         ["sample", "--pretrained=logs/own/fit/pretrained", f"--concept={concept}", "--count=2", "--figure=samples.png"],
         ["report", "--results=results", "--out=report"],
     )
@@ -126,7 +126,7 @@ def test_a_missing_simulator_is_told_in_one_line(told: Callable[..., list[str]])
     verbs, expected = [], []
     for domain, task, package, extra in SIMULATORS:
         verbs += [["generate", domain, f"--task={task}", "--count=1"]]
-        verbs += [["invert", f"--config={CONF / 'invert' / f'{domain}.yaml'}", "--trainer.accelerator=cpu"]]
+        verbs += [["invert", f"--config={CONF / f'{domain}.yaml'}", "--trainer.accelerator=cpu"]]
         expected += [NEEDED.format(domain, package, extra), "code: 2"] * 2
     assert told(*verbs) == expected
     assert not list(Path().rglob("*.safetensors"))

@@ -276,24 +276,6 @@ def test_a_run_that_is_resumed_stops_where_the_unbroken_one_does_with_the_same_e
     expect_same(resumed, unbroken)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"tolerance": 0.3, "omega": "learned"}, {"modes": "each"}], ids=str)
-def test_a_checkpoint_of_embeddings_without_an_axis_of_knots_is_resumed_to_the_same_result(
-    tiny: Path, options: dict[str, Any]
-) -> None:
-    unbroken, steps = fit(tiny, 30, every=13, **options)
-    content = torch.load("kept/step=13.ckpt", weights_only=True)
-    moments = content["optimizer_states"][0]["state"][0]
-    names = [name for name, value in content["state_dict"].items() if value.dim() == 4]
-    for tensors, flat in ((content["state_dict"], names), (moments, ["exp_avg", "exp_avg_sq"])):
-        tensors |= {name: tensors[name].flatten(-2) for name in flat}
-    assert len(names) == (3 if "tolerance" in options else 1)
-    torch.save(content, "flat.ckpt")
-    resumed, again = fit(tiny, 30, resume="flat.ckpt", **options)
-    assert again == steps
-    expect_same(resumed, unbroken)
-
-
 def test_a_run_that_had_stopped_is_resumed_to_the_same_result(tiny: Path) -> None:
     done, steps = fit(tiny, 60, every=10, tolerance=0.3)
     resumed, again = fit(tiny, 60, resume=f"kept/step={steps}.ckpt", tolerance=0.3)
