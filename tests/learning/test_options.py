@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from ftl_lightning import lightning_cli
 from ftl_lightning.errors import UserError
 from ftl_lightning.learning import PretrainingModule
 from ftl_lightning.learning.inversion_settings import (
@@ -58,6 +59,10 @@ def test_every_flat_name_is_an_option_of_a_group_and_every_option_has_one(
     assert set(places.values()) == options
     assert len(set(places.values())) == len(places)
     assert set(groups_of(places)) == set(groups)
+
+
+def test_the_command_line_knows_the_groups_of_both_verbs() -> None:
+    assert set(lightning_cli.GROUPS) == GROUPS.keys() | PRETRAINING_GROUPS.keys()
 
 
 def test_the_groups_are_those_of_the_settings() -> None:
