@@ -10,7 +10,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
-from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Metric, Plans, Show, View
 from ftl_lightning.domains.paper import Paper, Published
 from ftl_lightning.domains.tasks import EvaluationTask

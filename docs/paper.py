@@ -18,7 +18,7 @@ import yaml
 
 from docs.sources import SourceError, measured
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 ROOT = Path(__file__).parent.parent
 HEAD = """# The paper, item by item

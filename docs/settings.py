@@ -9,10 +9,10 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
-from ftl_lightning.configuration import load
-from ftl_lightning.domains.data import InversionData, PretrainingData
-from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import ModelSettings
+from ftl_lightning.few_shot.tuned import ModelSettings
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.data import InversionData, PretrainingData
 
 PAGE = Path(__file__).parent / "differences.md"
 BEGIN, END = "<!-- settings: begin, written by docs/settings.py -->\n", "<!-- settings: end -->\n"

@@ -20,15 +20,15 @@ import pandas as pd
 import yaml
 from safetensors import safe_open
 
-from ftl_lightning.configuration import load
 from ftl_lightning.domains.paper import OURS, Compared
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
+from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.reporting.paired import mcnemar, up
 from ftl_lightning.reporting.shown import lookup
 from ftl_lightning.reporting.table import Number, select, summarise
 from ftl_lightning.reporting.tables import against
-from ftl_lightning.tuned import ModelSettings
+from ftl_lightning.services.configuration import load
 
 ROOT = Path(__file__).parent.parent
 ONE_OF = ("setting", "metric", "method", "form", "variant", "K", "omega")

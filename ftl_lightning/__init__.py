@@ -4,11 +4,11 @@
 # current folder off Python's path before any module could be found in it.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from ftl_lightning.concepts.composition import Composition
-    from ftl_lightning.concepts.concept import Concept
-    from ftl_lightning.demonstrations.container import Demonstrations
-    from ftl_lightning.few_shot import FewShot
-    from ftl_lightning.shipped import list_models
+    from ftl_lightning.data.container import Demonstrations
+    from ftl_lightning.few_shot.learner import FewShot
+    from ftl_lightning.igm.composition import Composition
+    from ftl_lightning.igm.concept import Concept
+    from ftl_lightning.services.shipped import list_models
     from ftl_lightning.version import __version__
 
 __all__ = ["Composition", "Concept", "Demonstrations", "FewShot", "__version__", "list_models"]

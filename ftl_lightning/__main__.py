@@ -7,6 +7,6 @@ if __name__ == "__main__":
     # is named as a module of a library would run in its place. The folder that this package comes from stays.
     if not sys.flags.safe_path and sys.path[0] != __file__.rpartition("/ftl_lightning/")[0]:
         del sys.path[0]
-    from ftl_lightning.cli import main
+    from ftl_lightning.cli.main import main
 
     sys.exit(main(sys.argv[1:]))

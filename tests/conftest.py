@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from filelock import FileLock
 
-from ftl_lightning.cli import main
-from ftl_lightning.errors import LONGEST
+from ftl_lightning.cli.main import main
+from ftl_lightning.services.errors import LONGEST
 from tests.suites import *  # noqa: F403
 from tests.suites import of_no_test
 
 if TYPE_CHECKING:
-    from ftl_lightning.learning import InversionModule
+    from ftl_lightning.training import InversionModule
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -80,8 +80,8 @@ def files() -> dict[Path, int]:
 
 def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
     """The module of ``invert`` with some options, given by their flat names."""
-    from ftl_lightning.learning import InversionModule
-    from ftl_lightning.learning.inversion_settings import InversionSettings
+    from ftl_lightning.training import InversionModule
+    from ftl_lightning.training.inversion_settings import InversionSettings
 
     settings = InversionSettings().changed(**options)
     return InversionModule(str(pretrained), **{field.name: getattr(settings, field.name) for field in fields(settings)})
@@ -92,7 +92,7 @@ def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Import what most tests need before the first of them, whose work it would be."""
-    import ftl_lightning.lightning_cli  # noqa: F401
+    import ftl_lightning.apps.lightning_cli  # noqa: F401
 
 
 @pytest.fixture(autouse=True)

@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 import yaml
 
-from ftl_lightning.ablation import Stage
-from ftl_lightning.ablation.check import check
-from ftl_lightning.ablation.plan import part
-from ftl_lightning.cli import main
-from ftl_lightning.configuration import load
-from ftl_lightning.errors import UserError
+from ftl_lightning.apps.ablation import Stage
+from ftl_lightning.apps.ablation.check import check
+from ftl_lightning.apps.ablation.plan import part
+from ftl_lightning.cli.main import main
 from ftl_lightning.evaluation.results import read_rows
-from tests.ablation.attempts import nothing_is_run  # noqa: F401
-from tests.ablation.raylets import QUICK
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.errors import UserError
+from tests.apps.ablation.attempts import nothing_is_run  # noqa: F401
+from tests.apps.ablation.raylets import QUICK
 from tests.conftest import CONF, ROOT, refused, succeed
 
 
@@ -149,7 +149,7 @@ CANNOT: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("stage", "told"), CANNOT, ids=[told[:50] for _, told in CANNOT])
 def test_what_cannot_run_is_told(stage: dict[str, Any], told: str) -> None:
-    Path("pretraining.yaml").write_text("model: {class_path: ftl_lightning.learning.PretrainingModule}")
+    Path("pretraining.yaml").write_text("model: {class_path: ftl_lightning.training.PretrainingModule}")
     with pytest.raises(UserError, match=f"1 of 1 cells cannot run, none was started: .*{re.escape(told)}"):
         check(list(Stage(**stage).cells(0)))
 

@@ -12,17 +12,17 @@ import pytest
 import safetensors.torch
 import torch
 
-from ftl_lightning.concepts import concept
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.configuration import load
-from ftl_lightning.demonstrations import file_format
+from ftl_lightning.data import file_format
 from ftl_lightning.domains.from_file import read_demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import COLUMNS, read_rows
-from ftl_lightning.learning.concept_check import expect_concept
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.tensor_file import file_hash
+from ftl_lightning.igm import concept
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.tensor_file import file_hash
+from ftl_lightning.training.concept_check import expect_concept
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.pretrained import load_model
 
 from .conftest import CONF, ROOT, refused
 from .test_mistakes import refusal

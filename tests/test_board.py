@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.board import Board, tag
+from ftl_lightning.training.board import Board, tag
 
 
 @pytest.mark.parametrize(

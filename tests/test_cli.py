@@ -9,13 +9,13 @@ import pytest
 import torch
 import yaml
 
-from ftl_lightning.cli import COMMANDS, TRAINER_VERBS, main
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.configuration import parts
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.apps.lightning_cli import parse
+from ftl_lightning.cli.main import COMMANDS, TRAINER_VERBS, main
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.lightning_cli import parse
-from ftl_lightning.trainer import Trainer
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.services.configuration import parts
+from ftl_lightning.training.trainer import Trainer
 from tests.conftest import CONF, python, refused, succeed
 from tests.tiny import CONFIGURATIONS, OURS, QUIET, fit
 
@@ -93,7 +93,7 @@ def test_help_and_a_missing_input_file_come_before_anything_slow_is_imported() -
     ]
     slow = ("lightning", "torch", "transformers")
     code = (
-        "import sys; from ftl_lightning.cli import main\n"
+        "import sys; from ftl_lightning.cli.main import main\n"
         f"assert [main(arguments) for arguments in {mistakes!r}] == [2] * {len(mistakes)}\n"
         f"assert not {{'jsonargparse', *{slow!r}}} & sys.modules.keys()\n"
         "assert main(['generate', '--help']) == 0\n"
@@ -268,7 +268,7 @@ def test_a_run_that_stops_by_itself_says_after_how_many_steps(invert: Callable[.
 
 @pytest.mark.parametrize("arguments", [["generate", "object_rearrangement", "--count=1"], FIT], ids=lambda value: value[0])
 def test_ctrl_c_is_one_line_and_130(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Told) -> None:
-    from ftl_lightning.learning import PretrainingModule
+    from ftl_lightning.training import PretrainingModule
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

@@ -2,8 +2,8 @@
 
 import pytest
 
-from ftl_lightning.composition_text import Part, parse_composition
-from ftl_lightning.errors import UserError
+from ftl_lightning.few_shot.composition_text import Part, parse_composition
+from ftl_lightning.services.errors import UserError
 
 
 def test_compositions_in_words() -> None:

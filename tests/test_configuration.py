@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import yaml
 
-from ftl_lightning.configuration import SECTIONS, _read, expanded, find, load, parts
-from ftl_lightning.errors import UserError
-from ftl_lightning.shipped import shipped
-from ftl_lightning.tuned import settings_of
+from ftl_lightning.few_shot.tuned import settings_of
+from ftl_lightning.services.configuration import SECTIONS, _read, expanded, find, load, parts
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.shipped import shipped
 from tests.conftest import CONF, ROOT
 from tests.test_cli import CONFIGS
 
@@ -146,7 +146,7 @@ read_once = functools.cache(_read)
 def shipped_parts(path: Path, verb: str) -> list[tuple[Path, dict[str, Any]]]:
     """For several tests: reading YAML takes long."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ftl_lightning.configuration._read", lambda path: copy.deepcopy(read_once(path.resolve())))
+        patch.setattr("ftl_lightning.services.configuration._read", lambda path: copy.deepcopy(read_once(path.resolve())))
         return parts(path, verb)
 
 
@@ -186,7 +186,7 @@ def defaults_of(path: str) -> dict[str, object]:
 
 ENTRIES = [(verb, names) for verb, names in CONFIGS if verb in SECTIONS]
 OTHERWISE = {("evaluation", "replan")}
-"""Values whose default is another one where :class:`~ftl_lightning.tuned.ModelSettings` reads them."""
+"""Values whose default is another one where :class:`~ftl_lightning.few_shot.tuned.ModelSettings` reads them."""
 
 
 def repeated(verb: str, names: list[str]) -> dict[tuple[str, str, str], bool]:
@@ -196,7 +196,7 @@ def repeated(verb: str, names: list[str]) -> dict[tuple[str, str, str], bool]:
     file that is added changes a class, references to other keys go with the former one.
     """
     found = [(str(part), keys) for name in names for part, keys in shipped_parts((CONF / f"{name}.yaml").resolve(), verb)]
-    classes = {"evaluation": "ftl_lightning.evaluation.evaluator.Evaluator", "trainer": "ftl_lightning.trainer.Trainer"}
+    classes = {"evaluation": "ftl_lightning.evaluation.evaluator.Evaluator", "trainer": "ftl_lightning.training.trainer.Trainer"}
     for _, keys in found:
         classes |= {key: keys[key]["class_path"] for key in ("model", "data") if "class_path" in keys.get(key, {})}
     assert set(classes) == {"model", "data", "evaluation", "trainer"}

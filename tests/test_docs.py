@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
+from ftl_lightning.cli.main import COMMANDS, TRAINER_VERBS
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.reporting.table import paper
 

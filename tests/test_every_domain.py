@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.apps.testing.strokes import strokes
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.testing.strokes import strokes
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.training.pretrained import load_model
 from tests.conftest import CONF, Once, succeed
 from tests.tiny import QUIET
 

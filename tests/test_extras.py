@@ -12,12 +12,12 @@ import pandas as pd
 import pytest
 from packaging.requirements import Requirement
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
-from ftl_lightning.errors import UserError
-from ftl_lightning.extras import EXTRAS, expect_extra
 from ftl_lightning.reporting.figures import concept_map
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.extras import EXTRAS, expect_extra
 from tests.conftest import CONF, ROOT, environment, refused
 from tests.domains.test_from_file import walks
 from tests.tiny import QUIET
@@ -44,7 +44,7 @@ sys.meta_path[:] = [Hiding(finder) for finder in sys.meta_path]
 """Python for a process in which the packages are as if they were not installed."""
 VERBS = f"""{WITHOUT}
 import json, os
-from ftl_lightning.cli import main
+from ftl_lightning.cli.main import main
 
 for line in sys.stdin:
     folder, arguments = json.loads(line)

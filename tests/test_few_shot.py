@@ -10,23 +10,23 @@ import torch
 from PIL import Image
 
 import ftl_lightning
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.configuration import load
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.domains.from_file import own_domain
-from ftl_lightning.errors import UserError
-from ftl_lightning.few_shot import FewShot, LearnedConcept, ModelSettings
-from ftl_lightning.learning.inversion import invert
-from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.few_shot.learner import FewShot, LearnedConcept, ModelSettings
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
-from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import file_hash
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import file_hash
+from ftl_lightning.training.inversion import invert
+from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.training.prepared import Prepared
 from tests.conftest import CONF, ROOT
 
 NEW = "square diagonal to triangle"
@@ -305,7 +305,7 @@ def walks(text: str, up: float, count: int = 3) -> Demonstrations:
 
 
 def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
-    from ftl_lightning.demonstrations.container import concatenate
+    from ftl_lightning.data.container import concatenate
 
     examples = concatenate([walks("flat", 0.0), walks("steep", 2.0)])
     texts, judged = ("flat", "steep"), {"nearest_demonstration": 1.0, "dtw_to_demonstrations": 1.0}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.cli import COMMANDS
+from ftl_lightning.cli.main import COMMANDS
 from tests.conftest import python
 
 FORBIDDEN = {
@@ -56,14 +56,14 @@ for name in ("tabletop", "mocap"):
 """
 """The learner in Python."""
 PAGE = """
-from ftl_lightning.play.application import Desk, playing
-from ftl_lightning.play.server import serve
-from ftl_lightning.play.workspace import Workspace
+from ftl_lightning.apps.play.application import Desk, playing
+from ftl_lightning.apps.play.server import serve
+from ftl_lightning.apps.play.workspace import Workspace
 Workspace("strokes", None).work()
 found("play")
 """
 REPORTS = """
-import ftl_lightning.reporting.report, ftl_lightning.reporting.html.page, ftl_lightning.study.report
+import ftl_lightning.reporting.report, ftl_lightning.reporting.html.page, ftl_lightning.apps.study.report
 found("report")
 """
 PROGRAM = f"""
@@ -83,9 +83,8 @@ def imported(program: str, folder: Path) -> dict[str, list[str]]:
 
 def run(verbs: list[list[str]]) -> str:
     """A program that runs verbs one after another, and marks what was imported after each by its words."""
-    return (
-        f"from ftl_lightning.cli import main\nfor verb in {verbs}:\n    assert main(verb) == 0, verb\n    found(' '.join(verb))\n"
-    )
+    begin = "from ftl_lightning.cli.main import main"
+    return f"{begin}\nfor verb in {verbs}:\n    assert main(verb) == 0, verb\n    found(' '.join(verb))\n"
 
 
 @pytest.mark.slow
@@ -109,7 +108,7 @@ def test_what_is_imported_is_not_searched_for_garbage_and_what_is_forbidden_is_f
         (tmp_path / f"{name}.py").touch()
     program = """
 import gc
-from ftl_lightning.starting import imported
+from ftl_lightning.services.starting import imported
 before = gc.get_freeze_count()
 assert imported("colorsys") is imported("colorsys") and gc.isenabled() and gc.get_freeze_count() > before
 gc.disable()

@@ -23,22 +23,22 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.demos.boring_classes import BoringModel
 
-from ftl_lightning.cli import main
-from ftl_lightning.concepts.concept import VERSION
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.data import InversionData
-from ftl_lightning.domains.object_rearrangement.datamodule import ObjectRearrangementData
+from ftl_lightning.cli.main import main
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import LONGEST, UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.learning import InversionModule, PretrainingModule
-from ftl_lightning.learning import inversion_settings as settings
-from ftl_lightning.learning.checkpoint import WholeCheckpoints
+from ftl_lightning.igm.concept import VERSION
 from ftl_lightning.methods.bc.pretraining import CloningPretraining
 from ftl_lightning.methods.cvae.pretraining import VAEPretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions
-from ftl_lightning.trainer import Trainer
+from ftl_lightning.services.errors import LONGEST, UserError
+from ftl_lightning.training import InversionModule, PretrainingModule
+from ftl_lightning.training import inversion_settings as settings
+from ftl_lightning.training.checkpoint import WholeCheckpoints
+from ftl_lightning.training.data import InversionData
+from ftl_lightning.training.rearrangement_datamodule import ObjectRearrangementData
+from ftl_lightning.training.trainer import Trainer
 
 from .conftest import CONF, ROOT, TINY, refused
 from .test_parse_error import line_of
@@ -74,13 +74,13 @@ def refusal(*expected: str) -> Iterator[pytest.ExceptionInfo[UserError]]:
 
 CLASSES = {
     "fit": [
-        "--model=ftl_lightning.learning.PretrainingModule",
-        "--data=ftl_lightning.domains.object_rearrangement.datamodule.ObjectRearrangementData",
+        "--model=ftl_lightning.training.PretrainingModule",
+        "--data=ftl_lightning.training.rearrangement_datamodule.ObjectRearrangementData",
     ],
     "invert": [
-        "--model=ftl_lightning.learning.InversionModule",
+        "--model=ftl_lightning.training.InversionModule",
         "--model.pretrained=object_rearrangement",
-        "--data=ftl_lightning.domains.data.InversionData",
+        "--data=ftl_lightning.training.data.InversionData",
         "--data.domain=object_rearrangement",
     ],
 }

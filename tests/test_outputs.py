@@ -20,21 +20,21 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from ftl_lightning.cli import main
-from ftl_lightning.concepts.concept import Concept
+from ftl_lightning.apps.study.answers import read_key
+from ftl_lightning.cli.main import main
 from ftl_lightning.domains.line_plots import picture
-from ftl_lightning.escape import figure_text, latex, latex_row, markdown
 from ftl_lightning.evaluation.animation import captioned
 from ftl_lightning.evaluation.results import append_rows, read_rows
 from ftl_lightning.evaluation.row import Row
-from ftl_lightning.printing import line, plain, say
+from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting import report
 from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.frontier import read_frontier
 from ftl_lightning.reporting.report import write_report
 from ftl_lightning.reporting.shown import domain_of
 from ftl_lightning.reporting.speed import read_speed
-from ftl_lightning.study.answers import read_key
+from ftl_lightning.services.escape import figure_text, latex, latex_row, markdown
+from ftl_lightning.services.printing import line, plain, say
 from tests import conftest
 from tests.conftest import ROOT, Once, python, succeed
 from tests.study import simulated, write_films

@@ -7,8 +7,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.cli import main
-from ftl_lightning.few_shot import FewShot
+from ftl_lightning.cli.main import main
+from ftl_lightning.few_shot.learner import FewShot
 from tests.conftest import CONF
 
 SIZE, TIME = 24, 8

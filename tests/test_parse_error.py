@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.errors import LONGEST, UserError
-from ftl_lightning.lightning_cli import parse
-from ftl_lightning.parse_error import one_line
+from ftl_lightning.apps.lightning_cli import parse
+from ftl_lightning.services.errors import LONGEST, UserError
+from ftl_lightning.services.parse_error import one_line
 from tests.conftest import refused
 
 MISTAKES = [
@@ -43,9 +43,7 @@ def line_of(verb: str, *arguments: str) -> str:
 def test_a_mistake_in_a_file_of_one_s_own_is_told_with_its_line(
     text: str, line: int, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Path("data.yaml").write_text(
-        "data: {class_path: ftl_lightning.domains.object_rearrangement.datamodule.ObjectRearrangementData}\n"
-    )
+    Path("data.yaml").write_text("data: {class_path: ftl_lightning.training.rearrangement_datamodule.ObjectRearrangementData}\n")
     Path("own.yaml").write_text(f"defaults: [conf/method/ftl_igm.yaml, data.yaml]\n{text}\n")
     refused(capsys, ["fit", "--config=own.yaml"], f"error: own.yaml: line {line}: ", expected)
 

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from ftl_lightning import progress
-from ftl_lightning.progress import bar
+from ftl_lightning.services import progress
+from ftl_lightning.services.progress import bar
 
 
 class Terminal(io.StringIO):

@@ -12,19 +12,19 @@ import pytest
 import torch
 
 import ftl_lightning
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.concepts.explanation import explain
-from ftl_lightning.concepts.modes import Modes
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.domains.driving.shipped import SHIPPED
-from ftl_lightning.errors import LONGEST, UserError
-from ftl_lightning.few_shot import FewShot, LearnedConcept
-from ftl_lightning.learning.longer import longer_than_plans
-from ftl_lightning.seeding import generator
-from ftl_lightning.shipped import list_models
+from ftl_lightning.few_shot.learner import FewShot, LearnedConcept
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.explanation import explain
+from ftl_lightning.igm.modes import Modes
+from ftl_lightning.services.errors import LONGEST, UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.shipped import list_models
+from ftl_lightning.training.longer import longer_than_plans
 from tests.conftest import python
 from tests.test_mistakes import refusal
 

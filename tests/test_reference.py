@@ -15,17 +15,17 @@ from tests.conftest import ROOT
 PAGE = (ROOT / "docs" / "reference.md").read_text("utf-8")
 MODULES = re.findall(r"^\.\. automodule:: (\S+)$", PAGE, re.M)
 ENTRANCE = [
-    "ftl_lightning.commands",
-    "ftl_lightning.concepts.composition",
-    "ftl_lightning.concepts.concept",
-    "ftl_lightning.concepts.modes",
-    "ftl_lightning.demonstrations.container",
+    "ftl_lightning.cli.commands",
+    "ftl_lightning.igm.composition",
+    "ftl_lightning.igm.concept",
+    "ftl_lightning.igm.modes",
+    "ftl_lightning.data.container",
     "ftl_lightning.evaluation.execution",
-    "ftl_lightning.few_shot",
-    "ftl_lightning.learned_concept",
-    "ftl_lightning.learning.library",
-    "ftl_lightning.shipped",
-    "ftl_lightning.tuned",
+    "ftl_lightning.few_shot.learner",
+    "ftl_lightning.few_shot.learned_concept",
+    "ftl_lightning.training.library",
+    "ftl_lightning.services.shipped",
+    "ftl_lightning.few_shot.tuned",
 ]
 """What programs of users meet first: here every argument is named."""
 IMPORT = re.compile(r"^\s*from (ftl_lightning(?:\.\w+)*) import ", re.M)

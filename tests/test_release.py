@@ -173,7 +173,7 @@ FEWER = {
 RUN = """
 import json, sys, time
 import ftl_lightning
-from ftl_lightning.cli import main
+from ftl_lightning.cli.main import main
 for kind, content in json.load(sys.stdin):
     print(round(time.monotonic()), kind, content, file=sys.stderr)
     if kind == "program":
@@ -247,13 +247,13 @@ import numpy as np
 import torch
 
 from ftl_lightning import Composition, Concept, Demonstrations, FewShot, list_models
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.tasks import few_shot_suites
-from ftl_lightning.errors import UserError
-from ftl_lightning.learned_concept import LearnedConcept
-from ftl_lightning.learning.method import Method
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.few_shot.learned_concept import LearnedConcept
+from ftl_lightning.training.method import Method
 
 PLANS = Plans(horizon=8, columns=("x", "y"), units=("cm", "cm"))
 

@@ -14,16 +14,16 @@ import yaml
 from markdown_it import MarkdownIt
 from PIL import Image
 
-from ftl_lightning import shared_concept
-from ftl_lightning.cli import main
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.cli.main import main
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.agent.scenes import OBSERVED
-from ftl_lightning.errors import LONGEST, UserError
-from ftl_lightning.few_shot import FewShot, LearnedConcept
-from ftl_lightning.learning.library import concepts_folder
-from ftl_lightning.printing import line
+from ftl_lightning.few_shot import shared_concept
+from ftl_lightning.few_shot.learner import FewShot, LearnedConcept
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import LONGEST, UserError
+from ftl_lightning.services.printing import line
+from ftl_lightning.training.library import concepts_folder
 from tests.conftest import ROOT
 from tests.test_outputs import NAMES
 

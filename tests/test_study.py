@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from ftl_lightning.cli import main
-from ftl_lightning.errors import UserError
-from ftl_lightning.study.agreement import krippendorff_alpha
-from ftl_lightning.study.answers import Key, inattention, read_key, read_rater
-from ftl_lightning.study.films import read_films
-from ftl_lightning.study.report import Report, study_table
+from ftl_lightning.apps.study.agreement import krippendorff_alpha
+from ftl_lightning.apps.study.answers import Key, inattention, read_key, read_rater
+from ftl_lightning.apps.study.films import read_films
+from ftl_lightning.apps.study.report import Report, study_table
+from ftl_lightning.cli.main import main
+from ftl_lightning.services.errors import UserError
 from tests.conftest import refused
 from tests.study import FILMED, FRAMES, METHODS, NEW, PEOPLE, TRAINING, make, simulated, write_films
 

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import atomic, write_text
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.tensor_file import atomic, write_text
 
 
 def test_nothing_half_written_is_left_behind(tmp_path: Path) -> None:

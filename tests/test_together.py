@@ -11,11 +11,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from ftl_lightning import log_folder
-from ftl_lightning.cli import main
-from ftl_lightning.errors import UserError
+from ftl_lightning.cli.main import main
 from ftl_lightning.evaluation.results import add_rows, read_rows
-from ftl_lightning.tensor_file import atomic, write_text
+from ftl_lightning.services import log_folder
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.tensor_file import atomic, write_text
 
 from .conftest import CONF, ROOT, TINY, refused, succeed
 

@@ -12,17 +12,17 @@ import safetensors.torch
 import torch
 from nbclient import NotebookClient
 
-from ftl_lightning import trust
-from ftl_lightning.cli import main
-from ftl_lightning.concepts.concept import VERSION
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.cli.main import main
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tabletop.tasks import PUSH
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import COLUMNS
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.concept import VERSION
+from ftl_lightning.services import trust
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.pretrained import load_model
 
 from .conftest import CONF, ROOT, python
 
@@ -32,8 +32,8 @@ from pathlib import Path
 from ftl_lightning.domains.driving import DOMAIN
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import CSVLogger
-from ftl_lightning.learning import PretrainingModule
-from ftl_lightning.domains.data import PretrainingData
+from ftl_lightning.training import PretrainingModule
+from ftl_lightning.training.data import PretrainingData
 class Called(Callback): ...
 class Logger(CSVLogger): ...
 class Module(PretrainingModule): ...
@@ -273,7 +273,7 @@ def test_a_card_of_a_package_in_the_current_folder_installs_nothing(capsys: pyte
 @pytest.mark.slow
 def test_a_card_of_a_package_in_the_current_folder_installs_nothing_in_a_new_python() -> None:
     card()
-    code = f"from ftl_lightning.cli import main; assert main({SAMPLE}) == 2; "
+    code = f"from ftl_lightning.cli.main import main; assert main({SAMPLE}) == 2; "
     done = python("-c", code + "from ftl_lightning import FewShot; FewShot.from_pretrained('model')")
     assert "domain: expected one of" in done.stderr
     assert done.stderr.count("found 'evil'") >= 2

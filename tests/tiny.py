@@ -48,8 +48,8 @@ def fit(path: Path, *options: str) -> list[str]:
         path: of the configuration, relative to ``conf``.
         options: after all others.
     """
+    from ftl_lightning.apps.testing.strokes import TRAINING, strokes
     from ftl_lightning.domains.mocap.tasks import TRAINING_CONCEPTS
-    from ftl_lightning.testing.strokes import TRAINING, strokes
 
     domain, method = path.stem, path.parent.name or path.stem
     arguments = ["fit", f"--config={CONF / path}", *DATA[domain], *NETWORK[method], *QUIET]

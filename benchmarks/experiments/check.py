@@ -16,13 +16,13 @@ import torch
 from families import FAMILIES
 from forms import pretrained
 
-from ftl_lightning.demonstrations.check import check
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.apps.testing.strokes import NEW, TRAINING, strokes
+from ftl_lightning.data.check import check
+from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
-from ftl_lightning.testing.strokes import NEW, TRAINING, strokes
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
 
 FEW, POOL = 5, 12
 """Demonstrations of a set, and of each kind that sets are taken from."""

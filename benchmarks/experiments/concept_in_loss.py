@@ -14,11 +14,11 @@ import json
 import torch
 
 from ftl_lightning import FewShot
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.learning.concept_model import ConceptModel, Draws
-from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.concept_model import ConceptModel, Draws
 
 TIMESTEPS = (20, 50, 70, 80, 90, 95, 99)
 

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ftl_lightning.apps.testing.families import beats, pictures, reaches
 from ftl_lightning.domains.object_rearrangement.generation import random_scenes
 from ftl_lightning.domains.object_rearrangement.relations import columns, overlap
-from ftl_lightning.testing.families import beats, pictures, reaches
 
 TEMPLATES, TEMPLATE_SEED = 80, 990
 """Samples of each kind that a judge compares with."""

@@ -18,9 +18,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.diffusion.samplers import Sampling
 from ftl_lightning.domains.mocap.actions import TESTED, action
 from ftl_lightning.domains.mocap.kinematics import SETTLED
 from ftl_lightning.domains.mocap.measures import distances, diversity, learned_elsewhere, multimodality
@@ -28,12 +25,15 @@ from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.domains.mocap.source import POSE, Recorded, at_rest, pieces
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS
 from ftl_lightning.domains.mocap.views import begun_elsewhere
-from ftl_lightning.learning.concept_check import expect_concept
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.progress import bar
-from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.concept_check import expect_concept
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.pretrained import load_model
 
 MOST = 500
 """Windows on each side, where there are as many."""

@@ -52,7 +52,7 @@ from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import ANKLES, FPS, HORIZON, JOINTS, as_joints, mirrored
 from ftl_lightning.domains.mocap.source import POSE
 from ftl_lightning.domains.mocap.views import begun_elsewhere
-from ftl_lightning.tensor_file import file_hash, write_text
+from ftl_lightning.services.tensor_file import file_hash, write_text
 
 UNSEEN = ("13",)
 """Subjects whom the judge that ships has not seen: demonstrations of new concepts come from there."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ftl_lightning.domains.mocap.kinematics import RULES
 from ftl_lightning.domains.mocap.source import Recorded
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 STRIDE = 8
 """Frames between windows of the training concepts' trials."""

@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from ftl_lightning.configuration import load
-from ftl_lightning.diffusion import PAPER_SIZE, TemporalUNet
-from ftl_lightning.diffusion.denoiser import Sizes
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.networks import PAPER_SIZE, TemporalUNet
+from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.tensor_file import write_text
 
 DOMAIN, TEXT = "agent", {"ours": 384, "paper": 768}
 """The domain, and columns of an embedding of a text: MiniLM's and flan-t5-base's."""

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from forms import compared
 
-from ftl_lightning.cli import main as ftl_lightning
-from ftl_lightning.concepts.concept import file_name
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.tensor_file import write_text
-from ftl_lightning.testing.strokes import NEW, TRAINING, recognised, strokes
+from ftl_lightning.apps.testing.strokes import NEW, TRAINING, recognised, strokes
+from ftl_lightning.cli.main import main as ftl_lightning
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.concept import file_name
+from ftl_lightning.services.tensor_file import write_text
 
 ROOT = Path(__file__).parents[2]
 SAMPLES, FEW, PRETRAINING = 50, 5, 100

@@ -15,18 +15,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, perform
 from ftl_lightning.domains.tabletop.scenes import draw_scene
 from ftl_lightning.domains.tabletop.source import joined_episodes
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSHES
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.progress import bar
-from ftl_lightning.seeding import generator, task_key
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.seeding import generator, task_key
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.pretrained import load_model
 
 STEPS = (10, 120)
 """That the model drives."""

@@ -29,10 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.environment import TOUCH, Seen, TableTopEnvironment
@@ -42,12 +39,15 @@ from ftl_lightning.domains.tabletop.pushing import FARTHEST, LOW, WIDEST, Manner
 from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, COLUMNS, TRIANGLE, WHITE, gap, outline, outlines, support
 from ftl_lightning.domains.tabletop.source import initial_states
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK, PUSHES, TASKS
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.pretrained import load_model
 
 MODEL, PUSHED, APPROACHED, EYES = "model", "model pushes", "expert pushes", "expert through eyes"
 OUT = ((0.30, 0.73), (-0.31, 0.31))

@@ -15,15 +15,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.diffusion.image_encoder import POINT
 from ftl_lightning.domains.tabletop.scenes import COLUMNS, scenes, support
 from ftl_lightning.domains.tabletop.source import initial_states
 from ftl_lightning.domains.tabletop.tasks import TASKS
 from ftl_lightning.domains.tabletop.views import HALF, MIDDLE
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.networks.image_encoder import POINT
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.pretrained import load_model
 
 SEED = 990
 TESTED = 0.2

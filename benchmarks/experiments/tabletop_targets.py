@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
 from ftl_lightning.domains.tabletop.scenes import (
     BOOK,
     BOWL,
@@ -34,10 +33,11 @@ from ftl_lightning.domains.tabletop.scenes import (
     scene_of,
 )
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_TO_BOOK, PUSH_TO_BOWL, PUSH_TO_WHITE
-from ftl_lightning.errors import UserError
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
 
 PUSHES = {TRIANGLE: PUSH, BOWL: PUSH_TO_BOWL, WHITE: PUSH_TO_WHITE, BOOK: PUSH_TO_BOOK}
 FAR, APART = (0.20, 0.26), (math.pi / 2, 0.7 * math.pi)

@@ -15,8 +15,8 @@ import matplotlib
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import atomic, write_text
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.tensor_file import atomic, write_text
 
 TAG = "accuracy/training concept"
 

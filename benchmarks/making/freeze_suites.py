@@ -11,8 +11,8 @@ import dataclasses
 import json
 from pathlib import Path
 
-from ftl_lightning.benchmark.suite import DEMONSTRATIONS, FOLDER, SEEDS, STARTS, TRAINING, VALIDATION, load_suite, suite_names
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.apps.benchmark.suite import DEMONSTRATIONS, FOLDER, SEEDS, STARTS, TRAINING, VALIDATION, load_suite, suite_names
+from ftl_lightning.services.tensor_file import write_text
 
 PARTS = (TRAINING, VALIDATION, DEMONSTRATIONS, STARTS)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 JACKS, CIRCLE = "jumping jacks", "arm circle"
 BOTH = tuple(f"{concept} + {other}" for concept in (JACKS, CIRCLE) for other in ("walk", "jump"))

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ftl_lightning.apps.testing.more_strokes import drawn
 from ftl_lightning.evaluation.animation import gif
-from ftl_lightning.tensor_file import atomic
-from ftl_lightning.testing.more_strokes import drawn
+from ftl_lightning.services.tensor_file import atomic
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the browser is that of the tests
-from tests.play.browser import Browser, browser
-from tests.play.served import served
+from tests.apps.play.browser import Browser, browser
+from tests.apps.play.served import served
 
 KIND, SEED, OTHER = "heart", 5, "wave"
 WINDOW, WIDTH = (1180, 1130), 760

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.policies import POLICIES
@@ -23,9 +23,9 @@ from ftl_lightning.domains.tabletop.rendering import film
 from ftl_lightning.domains.tabletop.tasks import PUSH_ON_BOOK, TASKS
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
 from ftl_lightning.evaluation.closed_loop import roll_out
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
-from ftl_lightning.tensor_file import atomic
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
+from ftl_lightning.services.tensor_file import atomic
 
 DEMONSTRATIONS = 10
 SIZE = (240, 180)

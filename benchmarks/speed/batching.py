@@ -28,14 +28,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
-from ftl_lightning.learning.in_processes import learned_in_processes
-from ftl_lightning.learning.inversion import invert
-from ftl_lightning.learning.inversion_settings import FULL, PRECISIONS, REDUCED
-from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import ModelSettings, settings_of
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.in_processes import learned_in_processes
+from ftl_lightning.training.inversion import invert
+from ftl_lightning.training.inversion_settings import FULL, PRECISIONS, REDUCED
+from ftl_lightning.training.model_folder import read_model
 
 SUITES = {"object_rearrangement": "validation", "agent": "paper", "driving": "paper", "strokes": ""}
 """Of each domain; none where concepts are those of the demonstrations beside the model."""
@@ -48,7 +48,7 @@ GROUPS = 8
 
 def concepts(domain: str, examples: Demonstrations | None) -> Iterator[Demonstrations]:
     """Without end: a domain's concepts, again and again with other demonstrations, under names of their own."""
-    from ftl_lightning.domains.data import InversionData  # not for the processes, which import this file: it takes seconds
+    from ftl_lightning.training.data import InversionData  # not for the processes, which import this file: it takes seconds
 
     for seed in count():
         data = (

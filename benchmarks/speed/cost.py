@@ -31,7 +31,7 @@ from rich.progress import track
 from scipy.optimize import nnls
 from steps import DOMAINS, Kind, Made, Step, made, ours, paper
 
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 BASE = {"horizon": 128, "K": 2, "width": 32, "concepts": 5}
 GRID = {"horizon": (32, 64, 128, 256), "K": (1, 2, 3), "width": (16, 32, 64), "concepts": (1, 5, 10)}

@@ -28,8 +28,8 @@ from typing import Any
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
 
 CONF = Path(__file__).parents[2] / "conf"
 OWN = ("object_rearrangement.yaml", "agent.yaml", "driving.yaml", "mocap.yaml", "tabletop.yaml")

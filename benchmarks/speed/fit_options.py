@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from distributed import CONF, command, curve, run
 
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
 
 TIMED = {"object_rearrangement.yaml": 100, "agent.yaml": 60}
 """Steps of each configuration."""

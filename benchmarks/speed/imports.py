@@ -26,8 +26,8 @@ from typing import Any
 
 import torch
 
-from ftl_lightning.cli import COMMANDS, TRAINER_VERBS
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.cli.main import COMMANDS, TRAINER_VERBS
+from ftl_lightning.services.tensor_file import write_text
 
 ROOT = Path(__file__).parents[2]
 MODEL, GOAL = "object_rearrangement", "square diagonal to triangle"
@@ -64,17 +64,17 @@ def stopping(kind, name):
     setattr(kind, name, functools.wraps(getattr(kind, name))(step))
 
 arguments = {arguments!r}
-from ftl_lightning import cli
+from ftl_lightning.cli import main as cli
 if arguments[0] == "fit":
-    from ftl_lightning.starting import imported
-    imported("ftl_lightning.lightning_cli")
-    from ftl_lightning.learning.pretraining import Pretraining
+    from ftl_lightning.services.starting import imported
+    imported("ftl_lightning.apps.lightning_cli")
+    from ftl_lightning.training.pretraining import Pretraining
     stopping(Pretraining, "training_step")
 elif arguments[0] == "invert":
     if arguments[1].startswith("-"):
-        from ftl_lightning.starting import imported
-        imported("ftl_lightning.lightning_cli")
-    from ftl_lightning.learning.inversion import Inversion
+        from ftl_lightning.services.starting import imported
+        imported("ftl_lightning.apps.lightning_cli")
+    from ftl_lightning.training.inversion import Inversion
     stopping(Inversion, "step_losses")
 assert cli.main(arguments) == 0
 told()

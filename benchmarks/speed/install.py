@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.checkout import copied

@@ -35,18 +35,18 @@ from diffusers.optimization import get_scheduler
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.data import InversionData
-from ftl_lightning.learning.inversion import invert
-from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.few_shot.tuned import ModelSettings
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.progress import bar
-from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import write_text
-from ftl_lightning.tuned import ModelSettings
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.data import InversionData
+from ftl_lightning.training.inversion import invert
+from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.training.model_folder import read_model
 
 Batching = Literal["one by one", "batched"]
 CONCEPTS, PLANS, DENOISING, K, GUIDANCE = 10, 50, 100, 2, 1.2

@@ -3,7 +3,7 @@
     python benchmarks/speed/play.py [--out results/play.json] [--kinds KIND ...]
 
 Chromium draws with a synthetic mouse. Each kind is one that pretraining does not show, in five strokes as a hand draws them
-(:mod:`ftl_lightning.testing.more_strokes`). Samples are told apart by a judge of nearest templates that learning knows nothing of.
+(:mod:`ftl_lightning.apps.testing.more_strokes`). Samples are classified by nearest templates, independently of learning.
 Seconds are of this machine, whatever else runs on it.
 """
 
@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.tensor_file import write_text
-from ftl_lightning.testing.more_strokes import TEST, VALIDATION, Judge, drawn
+from ftl_lightning.apps.testing.more_strokes import TEST, VALIDATION, Judge, drawn
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.services.tensor_file import write_text
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the browser is that of the tests
-from tests.play.browser import Browser, browser
-from tests.play.served import Served, served
+from tests.apps.play.browser import Browser, browser
+from tests.apps.play.served import Served, served
 
 SEED, SHOWN, SAMPLES = 11, 5, 100
 """Of the strokes; how many are drawn; samples that are judged."""

@@ -24,8 +24,8 @@ import yaml
 from counting import Counted, counted
 from steps import FLOAT, Made, Published, Step, on_paper, ours, paper, published
 
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
 
 ROOT = Path(__file__).parents[2]
 NUMBERS = (1, 10, 1_000, 1_000_000)

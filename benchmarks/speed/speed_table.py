@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 RESULTS = Path(__file__).parents[2] / "results"
 NOT_QUIET = 1.2

@@ -13,16 +13,16 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.guidance import composed_epsilon
-from ftl_lightning.diffusion import PAPER_SIZE
-from ftl_lightning.diffusion.image_encoder import RESNET18, ImageEncoders
-from ftl_lightning.diffusion.samplers import timesteps
-from ftl_lightning.diffusion.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
-from ftl_lightning.learning.adam import Group
-from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.samplers import timesteps
+from ftl_lightning.igm.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel, build_denoiser
-from ftl_lightning.tuned import ModelSettings, settings_of
+from ftl_lightning.networks import PAPER_SIZE
+from ftl_lightning.networks.image_encoder import RESNET18, ImageEncoders
+from ftl_lightning.training.adam import Group
+from ftl_lightning.training.model_folder import read_model
 
 ROOT = Path(__file__).parents[2]
 DOMAINS = ("object_rearrangement", "agent", "driving", "mocap", "tabletop", "strokes")

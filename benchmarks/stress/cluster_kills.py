@@ -29,11 +29,11 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from ftl_lightning.ablation.plan import Stage
-from ftl_lightning.ablation.record import Entry, read_record
+from ftl_lightning.apps.ablation.plan import Stage
+from ftl_lightning.apps.ablation.record import Entry, read_record
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import write_text
 
 ROOT = Path(__file__).parents[2]
 STAGE = {

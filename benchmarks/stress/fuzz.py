@@ -31,22 +31,22 @@ import safetensors.torch
 import torch
 import yaml
 
-from ftl_lightning.concepts.adapter import LowRank, adaptable
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept, Origin
-from ftl_lightning.concepts.modes import Modes
-from ftl_lightning.configuration import load
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.errors import LONGEST, UserError
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
-from ftl_lightning.learning.checkpoint import read_checkpoint
-from ftl_lightning.learning.concept_check import expect_concept
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.igm.adapter import LowRank, adaptable
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept, Origin
+from ftl_lightning.igm.modes import Modes
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.seeding import generator
-from ftl_lightning.shipped import pretrained_folder
+from ftl_lightning.services.configuration import load
+from ftl_lightning.services.errors import LONGEST, UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.shipped import pretrained_folder
+from ftl_lightning.training.checkpoint import read_checkpoint
+from ftl_lightning.training.concept_check import expect_concept
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.pretrained import load_model
 
 SLOW, MEMORY = 5.0, 2**30
 HEADER = "ftl_lightning"

@@ -18,9 +18,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from ftl_lightning.learning.checkpoint import read_checkpoint
-from ftl_lightning.progress import bar
-from ftl_lightning.tensor_file import visible
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.tensor_file import visible
+from ftl_lightning.training.checkpoint import read_checkpoint
 
 FIT = [
     "fit",

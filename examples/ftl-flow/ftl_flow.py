@@ -7,19 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.branches import Context
-from ftl_lightning.concepts.composition import Composition, batched
-from ftl_lightning.concepts.guidance import composed_epsilon
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion import MLPDenoiser
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.learning.concept_model import Draws
-from ftl_lightning.learning.method import Method
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretraining import Pretraining
-from ftl_lightning.learning.text_concept_model import TextConceptModel
+from ftl_lightning.data.features import Observed
+from ftl_lightning.igm.branches import Context
+from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.networks import MLPDenoiser
+from ftl_lightning.training.concept_model import Draws
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.method import Method
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretraining import Pretraining
+from ftl_lightning.training.text_concept_model import TextConceptModel
 
 METHOD = Method("flow matching", kind="flow", model="ftl_flow:FlowModel", pretraining="ftl_flow:FlowPretraining")
 Velocity = Callable[[Tensor, Tensor], Tensor]  # (x (batch, horizon, state), t (batch,)) -> like x

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Show
-from ftl_lightning.escape import figure_text
+from ftl_lightning.services.escape import figure_text
 
 if TYPE_CHECKING:  # importing matplotlib takes half a second
     from matplotlib.figure import Figure

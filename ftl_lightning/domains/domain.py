@@ -14,15 +14,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Feature, InitialStates, Observed
 from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.distances import Distance
 from ftl_lightning.domains.paper import PAPERS_METHOD, Compared, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite
-from ftl_lightning.errors import UserError, short, shown
-from ftl_lightning.representation import Shown, counted
+from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.representation import Shown, counted
 
 if TYPE_CHECKING:
     import gymnasium
@@ -225,8 +225,8 @@ class ClosedLoop:
             plans are also executed.
         policies: reference lines that act step by step, by name: ``(goal, initial states, demonstrations that the concept was
             learned from or None, seed) -> policy``, or ``None`` where it would take too long.
-        expect: raises a :class:`~ftl_lightning.errors.UserError` where a package that the environment needs is missing; asked
-            before the work.
+        expect: raises a :class:`~ftl_lightning.services.errors.UserError` if the environment lacks a package; called
+            before any work.
     """
 
     environment: "Callable[[], gymnasium.Env[Any, Any]]"

@@ -30,13 +30,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
 from ftl_lightning.domains.hand_drawn import drawn_by_hand
 from ftl_lightning.domains.recognition import Recognition
-from ftl_lightning.errors import UserError, about, short
-from ftl_lightning.seeding import generator
+from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.seeding import generator
 
 OWN = "own"
 """Name of the domain of user data."""

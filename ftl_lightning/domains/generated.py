@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations, padded
+from ftl_lightning.data.container import Demonstrations, padded
 from ftl_lightning.domains.domain import Plans, Split
-from ftl_lightning.seeding import VALIDATION_SEED
+from ftl_lightning.services.seeding import VALIDATION_SEED
 
 
 @dataclass(frozen=True)

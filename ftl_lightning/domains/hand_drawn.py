@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
 from ftl_lightning.domains.recorder import Numbers, Recorder, Scene
 from ftl_lightning.domains.vector_film import VectorFilm, still
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 MARGIN = 0.15
 """Margin of the window around the examples, relative to their extent."""

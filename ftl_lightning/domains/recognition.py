@@ -21,9 +21,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.diffusion.spectrum import cosines
-from ftl_lightning.seeding import generator
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.spectrum import cosines
 
 STILL = 0.05
 """Size, relative to the examples', below which behaviour counts as still and has no shape."""

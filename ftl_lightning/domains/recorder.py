@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.vector_film import VectorFilm
-from ftl_lightning.errors import UserError, shown
+from ftl_lightning.services.errors import UserError, shown
 
 Kind = Literal["draw", "arrange", "steer"]
 Numbers = NDArray[np.float64]
@@ -68,7 +68,7 @@ class Recorder:
         hint: instruction in a sentence.
         scene: ``(task or '', seed) -> scene``; deterministic.
         record: ``(scene, path (step, piece, 2) in the film's unit, seconds (step,)) -> demonstration`` without a text. Raises
-            :class:`~ftl_lightning.errors.UserError` for an unusable path. Arguments are validated by :func:`expect_path`.
+            :class:`~ftl_lightning.services.errors.UserError` for an unusable path. Arguments are validated by :func:`expect_path`.
         tasks: tasks with different scenes; empty if scenes do not depend on the task.
     """
 

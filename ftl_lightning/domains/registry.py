@@ -4,8 +4,8 @@ import functools
 import importlib
 
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.errors import UserError, short
-from ftl_lightning.trust import OPTION, entry_points, is_vouched
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.trust import OPTION, entry_points, is_vouched
 
 GROUP = "ftl_lightning.domains"
 """Entry-point group of domains: ``name = package.module:DOMAIN``."""

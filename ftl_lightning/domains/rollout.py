@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, Observed, take
+from ftl_lightning.data.features import InitialStates, Observed, take
 
 
 @dataclass(frozen=True)

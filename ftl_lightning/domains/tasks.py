@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 WITHOUT_WEIGHT = -0.5
 """Guidance weight of the texts in ``without``."""

@@ -5,10 +5,10 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from ftl_lightning.errors import short
 from ftl_lightning.evaluation.evaluable import Evaluable
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import public
+from ftl_lightning.services.errors import short
 
 USUAL = "usual"
 """Name of the default form."""

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.features import InitialStates, Observed, moved, take
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.features import InitialStates, Observed, moved, take
 from ftl_lightning.domains.domain import ClosedLoop, Policy
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.progress import Advance, bar
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.progress import Advance, bar
+from ftl_lightning.training.concept_model import ConceptModel
 
 if TYPE_CHECKING:
     import gymnasium

@@ -20,14 +20,14 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.distances import Distance, scaled_distance
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult
-from ftl_lightning.progress import bar
-from ftl_lightning.seeding import FRESH_SEED
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.seeding import FRESH_SEED
 
 _LOG = logging.getLogger(__name__)
 

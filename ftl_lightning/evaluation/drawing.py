@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING
 
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from ftl_lightning.board import FILMS, PICTURES, ROLLOUTS
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.beside import Drawn, beside
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult, share
 from ftl_lightning.evaluation.tensorboard import log_animation
-from ftl_lightning.learning.quality import first_windows
+from ftl_lightning.training.board import FILMS, PICTURES, ROLLOUTS
+from ftl_lightning.training.quality import first_windows
 
 if TYPE_CHECKING:  # slow import
     from matplotlib.figure import Figure

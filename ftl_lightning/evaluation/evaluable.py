@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any, Protocol, TypeGuard
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.point import Point
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.point import Point
+from ftl_lightning.training.concept_model import ConceptModel
 
 
 class Evaluable(Protocol):

@@ -10,8 +10,6 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from ftl_lightning.domains.data import InversionData, PretrainingData
-from ftl_lightning.errors import UserError, short
 from ftl_lightning.evaluation.chosen import chosen
 from ftl_lightning.evaluation.diversity import lines, real_behaviour
 from ftl_lightning.evaluation.drawing import draw
@@ -23,9 +21,11 @@ from ftl_lightning.evaluation.record import record
 from ftl_lightning.evaluation.references import references
 from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import log_projector, log_test, own_rows, setting_means
-from ftl_lightning.learning.checkpoint import Random
-from ftl_lightning.printing import say
-from ftl_lightning.ranges import expect_count
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.printing import say
+from ftl_lightning.services.ranges import expect_count
+from ftl_lightning.training.checkpoint import Random
+from ftl_lightning.training.data import InversionData, PretrainingData
 
 _LOG = logging.getLogger(__name__)
 

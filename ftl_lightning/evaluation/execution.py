@@ -9,18 +9,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import ClosedLoop, Domain, closed_loop_of
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.animation import captioned, gif, outcome_text
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, roll_out, sampled_plans
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.representation import Shown, counted
-from ftl_lightning.seeding import generator
-from ftl_lightning.tensor_file import atomic
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import atomic
+from ftl_lightning.training.concept_model import ConceptModel
 
 
 def episodes(

@@ -17,7 +17,7 @@ from ftl_lightning.domains.vector_film import Shape, VectorFilm, of_wireframe
 from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.row import METHOD, Row
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 FILMED = 4
 """Number of filmed samples or episodes per task."""

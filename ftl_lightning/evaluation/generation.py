@@ -7,18 +7,18 @@ from pathlib import Path
 
 import torch
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.features import InitialStates, join, moved
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.features import InitialStates, join, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
 from ftl_lightning.evaluation.evaluable import Evaluable
 from ftl_lightning.evaluation.judged import TaskResult, executed
 from ftl_lightning.evaluation.summary import OWN
-from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_range
-from ftl_lightning.seeding import EVALUATION_SEED, generator, task_key
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.ranges import MOST_TOGETHER, expect_count, expect_range
+from ftl_lightning.services.seeding import EVALUATION_SEED, generator, task_key
 
 
 @dataclass(frozen=True)

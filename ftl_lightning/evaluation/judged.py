@@ -7,7 +7,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, join
+from ftl_lightning.data.features import InitialStates, join
 from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy, closed_loop_of
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask

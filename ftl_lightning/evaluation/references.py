@@ -3,15 +3,15 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates, expect_starts
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates, expect_starts
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult
-from ftl_lightning.tensor_file import bytes_hash
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.tensor_file import bytes_hash
 
 _KNOWN: dict[tuple[Any, ...], Any] = {}
 """Cache of reference behaviour by name and all arguments, shared by the cells of an ablation."""

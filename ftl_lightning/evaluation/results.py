@@ -9,10 +9,10 @@ from typing import Any
 
 import pandas as pd
 
-from ftl_lightning.errors import UserError, about, short, shown
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
-from ftl_lightning.limits import MOST_TEXT, expect_readable
-from ftl_lightning.tensor_file import alone, atomic, visible
+from ftl_lightning.services.errors import UserError, about, short, shown
+from ftl_lightning.services.limits import MOST_TEXT, expect_readable
+from ftl_lightning.services.tensor_file import alone, atomic, visible
 
 FOLDER = r"\w[\w .+-]{0,99}"
 """Pattern of domain names, which are folder names in a report."""

@@ -10,7 +10,7 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.evaluable import Evaluable, demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult, paired, share
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row
-from ftl_lightning.tensor_file import content_hash, file_hash
+from ftl_lightning.services.tensor_file import content_hash, file_hash
 from ftl_lightning.version import __version__
 
 LATER = (

@@ -18,13 +18,13 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams, scalar
 from torch.utils.tensorboard.writer import FileWriter
 
-from ftl_lightning.board import RESULTS
-from ftl_lightning.concepts.point import Part, Point
 from ftl_lightning.evaluation.animation import captioned, gif
 from ftl_lightning.evaluation.judged import LOST, WON
 from ftl_lightning.evaluation.row import METHOD, Row
 from ftl_lightning.evaluation.summary import plain, summary_table
-from ftl_lightning.printing import line
+from ftl_lightning.igm.point import Part, Point
+from ftl_lightning.services.printing import line
+from ftl_lightning.training.board import RESULTS
 
 HPARAMS = ".hparams"
 """Suffix of the event file for the HPARAMS tab. The file is separate so that a later test can replace it: TensorBoard shows only

@@ -9,7 +9,6 @@ from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, OURS, PAPERS_METHOD, WITH_MODES, Compared, Published
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
-from ftl_lightning.learning.methods import load_method
 from ftl_lightning.reporting.paired import Lead, leads, least_certain, same_outcome, signed
 from ftl_lightning.reporting.shown import (
     domain_of,
@@ -34,6 +33,7 @@ from ftl_lightning.reporting.table import (
     summarise,
 )
 from ftl_lightning.reporting.tables import against, as_learned_most
+from ftl_lightning.training.methods import load_method
 
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
 """Names of the paper's baselines."""

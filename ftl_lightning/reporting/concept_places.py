@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import torch
 
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.extras import expect_extra
-from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.training.concept_model import ConceptModel
 
 
 @dataclass(frozen=True)

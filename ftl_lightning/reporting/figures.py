@@ -8,15 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import CHOSEN, OURS, Compared
-from ftl_lightning.escape import figure_text
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import REFERENCE
 from ftl_lightning.evaluation.row import label as method_label
-from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting.colours import COLOURS, colours
 from ftl_lightning.reporting.colours import PAPER as PAPER_COLOUR
 from ftl_lightning.reporting.comparison import compared, methods, reference_lines, shown_lines
@@ -27,6 +25,8 @@ from ftl_lightning.reporting.shown import lookup, main_omega, settings
 from ftl_lightning.reporting.speed import Measured, reached
 from ftl_lightning.reporting.table import of_method, select, summarise
 from ftl_lightning.reporting.tables import labelled, main_rows
+from ftl_lightning.services.escape import figure_text
+from ftl_lightning.training.concept_model import ConceptModel
 
 LINES = ("dotted", "dashed", "dashdot", (0, (1, 4)), (0, (6, 2, 1, 2, 1, 2)), "solid")
 """Line styles of reference policies."""

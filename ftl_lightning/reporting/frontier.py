@@ -18,7 +18,7 @@ from ftl_lightning.domains.paper import PAPERS_METHOD
 from ftl_lightning.evaluation.row import label
 from ftl_lightning.reporting.listed import read_listed
 from ftl_lightning.reporting.table import MISSING, Table, make_table, of_method, select
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 FRONTIER = "frontier.json"
 """Name of the file in a folder of results."""

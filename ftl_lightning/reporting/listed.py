@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from ftl_lightning.errors import UserError, shown
-from ftl_lightning.schema import from_mapping, read_json
+from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.schema import from_mapping, read_json
 
 T = TypeVar("T")
 

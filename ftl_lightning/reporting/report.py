@@ -9,11 +9,8 @@ from matplotlib.figure import Figure
 
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.paper import OURS, PAPERS_METHOD
-from ftl_lightning.errors import UserError, shown
 from ftl_lightning.evaluation.results import CHANGES, COMPARISON, CURVES, read_rows, read_study, replaced
 from ftl_lightning.evaluation.row import METHOD
-from ftl_lightning.limits import read_text
-from ftl_lightning.printing import say
 from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.comparison import (
     all_methods,
@@ -31,7 +28,10 @@ from ftl_lightning.reporting.shown import domain_of, metrics
 from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.table import Table, of_method, select
 from ftl_lightning.reporting.tables import as_learned_most, tables
-from ftl_lightning.tensor_file import atomic, write_text
+from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.limits import read_text
+from ftl_lightning.services.printing import say
+from ftl_lightning.services.tensor_file import atomic, write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 """Lines around the text that ``report --readme`` writes."""

@@ -10,7 +10,6 @@ import pandas as pd
 
 from ftl_lightning.domains.domain import CLOSED, EXECUTED, Domain
 from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, Compared, Published
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.judged import LOST, WON
 from ftl_lightning.evaluation.results import LARGEST_WHOLE, labels, latest
 from ftl_lightning.evaluation.row import METHOD, REFERENCE
@@ -39,6 +38,7 @@ from ftl_lightning.reporting.table import (
     select,
     summarise,
 )
+from ftl_lightning.services.errors import UserError
 
 USUAL_K = 2
 """Number of components in the main tables, as in the paper."""

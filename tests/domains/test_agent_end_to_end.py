@@ -10,13 +10,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.agent.scenes import OBSERVED
-from ftl_lightning.domains.data import InversionData, PretrainingData
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.learning.pretrained import load_model
 from ftl_lightning.methods.ftl_igm.model import build_denoiser
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.data import InversionData, PretrainingData
+from ftl_lightning.training.pretrained import load_model
 from tests import tiny
 from tests.conftest import CONF, ROOT, refused, succeed
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.agent.domain import DOMAIN
 from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED
@@ -18,7 +18,7 @@ from ftl_lightning.domains.agent.rendering import SEEN
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
 from ftl_lightning.domains.recorder import Scene, expect_path
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 assert DOMAIN.recorder is not None
 RECORDER = DOMAIN.recorder

@@ -6,15 +6,15 @@ from typing import Any
 import pytest
 import torch
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import ClosedLoop, Domain, Metric
 from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.references import references
+from ftl_lightning.services.errors import UserError
 
 STATES = torch.zeros(5, 1, 21)
 GOAL = "circle right of square"

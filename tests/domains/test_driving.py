@@ -16,7 +16,7 @@ from ftl_lightning.domains.driving.scenarios import SCENARIOS, arrived, make, ob
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.simulation import advance, restore, save
 from ftl_lightning.domains.driving.traffic import NAMES, OBSERVED, SCENARIO, SCENE, STEP, TRAFFIC, decision_seconds, origin, scene
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 
 def slow(*names: str) -> list[Any]:

@@ -10,10 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.data import InversionData
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.foresight import VETOES, Foresight
@@ -21,14 +18,17 @@ from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.traffic import BELIEF, SCENARIO, STATE, TRAFFIC, origin
 from ftl_lightning.domains.driving.views import VIEWS
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import planner
 from ftl_lightning.evaluation.evaluator import Evaluator
-from ftl_lightning.learning.model_config import find_view
-from ftl_lightning.learning.model_folder import read_model
-from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.seeding import generator
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.training.data import InversionData
+from ftl_lightning.training.model_config import find_view
+from ftl_lightning.training.model_folder import read_model
+from ftl_lightning.training.prepared import Prepared
 from tests import tiny
 from tests.conftest import CONF, ROOT, refused, succeed
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.motion import drive

@@ -9,22 +9,22 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.concepts.hashing import HashingEncoder
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Feature
-from ftl_lightning.domains.data import InversionData, OwnData
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning import InversionModule, PretrainingModule
-from ftl_lightning.learning.inversion_settings import BudgetOptions
-from ftl_lightning.learning.model_folder import save_model
-from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.trainer import Trainer
+from ftl_lightning.networks.hashing import HashingEncoder
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training import InversionModule, PretrainingModule
+from ftl_lightning.training.data import InversionData, OwnData
+from ftl_lightning.training.inversion_settings import BudgetOptions
+from ftl_lightning.training.model_folder import save_model
+from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.trainer import Trainer
 
 SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go between": (0.5, 0.5)}
 TIME = 12

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.data import InversionData, PretrainingData, shares
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import DOMAIN, skeleton
 from ftl_lightning.domains.mocap.measures import MEASURES, bone_error
 from ftl_lightning.domains.mocap.recordings import FILE, Recordings
@@ -18,7 +17,8 @@ from ftl_lightning.domains.mocap.skeleton import HORIZON, R_WRIST, as_joints, bo
 from ftl_lightning.domains.mocap.source import LONGEST, POSE, Recorded, at_rest, glitches, hang_down, pieces
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, NEW_CONCEPTS, SUITES, TRAINING_CONCEPTS, cleaned, mirrored_text
 from ftl_lightning.domains.mocap.views import with_rigid_bones
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.data import InversionData, PretrainingData, shares
 from tests.domains.mocap_samples import folder, motion, named_recordings, recordings
 
 NAME = "ftl_lightning.domains.mocap:DOMAIN"

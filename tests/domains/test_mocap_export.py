@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.export import HIPS, TREE, bvh
 from ftl_lightning.domains.mocap.recordings import read_folder
 from ftl_lightning.domains.mocap.skeleton import as_joints
 from ftl_lightning.domains.mocap.standing import standing_poses
 from ftl_lightning.domains.mocap.views import with_rigid_bones
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT, refused, succeed
 from tests.domains.mocap_samples import named_recordings
 from tests.domains.test_mocap_rendering import waving

@@ -15,9 +15,9 @@ from ftl_lightning.domains.mocap.recordings import FILE
 from ftl_lightning.domains.mocap.skeleton import HORIZON, L_ANKLE, L_ELBOW, L_WRIST, R_ANKLE, R_ELBOW, R_WRIST, as_joints, mirrored
 from ftl_lightning.domains.mocap.standing import standing_poses
 from ftl_lightning.domains.mocap.tasks import ACTION_OF, AND, TRAINING_CONCEPTS
-from ftl_lightning.errors import UserError
-from ftl_lightning.shipped import shipped
-from ftl_lightning.tensor_file import save_tensors
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.shipped import shipped
+from ftl_lightning.services.tensor_file import save_tensors
 from tests.domains.mocap_samples import named_recordings, recordings, script
 
 ALL = (*LOWER, *UPPER)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import kinematics, measures
 from ftl_lightning.domains.mocap.domain import DOMAIN
 from ftl_lightning.domains.mocap.kinematics import RULES

@@ -2,13 +2,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import measures
 from ftl_lightning.domains.mocap.judge import Judge
 from ftl_lightning.domains.mocap.measures import MEASURES, POSE, bone_error, distances, diversity, jerk, learned_elsewhere, rise
 from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON, L_WRIST, R_WRIST, as_joints
 from ftl_lightning.domains.mocap.standing import standing_poses
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 
 def people(count: int, seed: int = 0) -> Tensor:

@@ -17,7 +17,7 @@ from ftl_lightning.domains.mocap.recordings import FILE, Recordings, read_folder
 from ftl_lightning.domains.mocap.segments import SEGMENTS, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.source import Recorded
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 from tests.conftest import refused, succeed
 from tests.domains.mocap_samples import BONES, amc, asf, database, motion, named_recordings, recordings, swing
 

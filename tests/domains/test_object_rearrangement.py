@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ftl_lightning.domains.object_rearrangement import generation, relations
 from ftl_lightning.domains.object_rearrangement.relations import SHAPES, Relation, columns, holds, overlap, parse
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 DOMAIN = load_domain("object_rearrangement")
 SOURCE = DOMAIN.source(None)

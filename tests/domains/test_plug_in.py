@@ -13,14 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.data import InversionData, PretrainingData
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.domain import Concepts, Domain, Plans
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.registry import domain_names, load_domain, recorded_name
 from ftl_lightning.domains.tasks import few_shot_suites
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.data import InversionData, PretrainingData
 from tests.conftest import ROOT, Once, python, refused, succeed
 from tests.domains.test_registry import offering
 
@@ -38,7 +38,7 @@ SAMPLE = ["sample", f"--pretrained={FOLDER}", "--count=3", "--steps=2", "--sampl
 LEARNED = ["--concept=logs/strokes/invert/concepts/wave_upwards.safetensors", "--goal=wave upwards"]
 VERBS = """
 import json, sys
-from ftl_lightning.cli import main
+from ftl_lightning.cli.main import main
 for arguments in map(json.loads, sys.argv[1:]):
     if code := main(arguments):
         sys.exit(code)

@@ -8,7 +8,7 @@ import pytest
 
 from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import domain_names, load_domain
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 BUILT_IN = ("agent", "driving", "mocap", "object_rearrangement", "tabletop", "tabletop_wide")
 MODULE = """

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.concepts.encoder import load_encoder
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tabletop import DOMAIN, WIDE, experts, source, tasks
 from ftl_lightning.domains.tabletop import scenes as layout
@@ -23,8 +22,9 @@ from ftl_lightning.domains.tabletop.scenes import BOOK, BOWL, CIRCLE, TRIANGLE, 
 from ftl_lightning.domains.tabletop.success import judge, judged
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK, PUSH_TO_BOWL, TASKS, TO_BOOK, TO_WHITE
 from ftl_lightning.domains.tabletop.world import COLOUR
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
+from ftl_lightning.networks.text_encoder import load_encoder
+from ftl_lightning.services.errors import UserError
 from tests.conftest import succeed
 
 assert DOMAIN.closed_loop is not None

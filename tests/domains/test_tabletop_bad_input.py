@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.cli import main
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
-from ftl_lightning.domains.data import InversionData, PretrainingData
+from ftl_lightning.cli.main import main
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.tabletop import DOMAIN, policies, source
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode
@@ -22,10 +21,11 @@ from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, OPEN
 from ftl_lightning.domains.tabletop.scenes import CIRCLE, HAND, TRIANGLE, scene_of
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, TRAINING_CONCEPTS
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation import generation
 from ftl_lightning.evaluation.closed_loop import fixed_plans, reset, roll_out
 from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.data import InversionData, PretrainingData
 from tests.conftest import refused
 
 assert DOMAIN.closed_loop is not None

@@ -8,7 +8,7 @@ import pytest
 from ftl_lightning.domains.tabletop import DOMAIN
 from ftl_lightning.domains.tabletop.interface import IMAGE, POSE
 from ftl_lightning.domains.tabletop.tasks import PUSH_TO_WHITE
-from ftl_lightning.few_shot import FewShot
+from ftl_lightning.few_shot.learner import FewShot
 from tests.conftest import ROOT
 
 PAGE = ROOT / "docs" / "domains" / "table-top.md"

@@ -9,19 +9,19 @@ from typing import Any
 import pytest
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.image_encoder import ImageEncoders
-from ftl_lightning.domains.data import PretrainingData
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.tabletop import source
 from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
 from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning import PretrainingModule
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.seeding import generator
-from ftl_lightning.trainer import Trainer
+from ftl_lightning.networks.image_encoder import ImageEncoders
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.training import PretrainingModule
+from ftl_lightning.training.data import PretrainingData
+from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.trainer import Trainer
 from tests.conftest import ROOT
 from tests.domains.tabletop_samples import made_up
 

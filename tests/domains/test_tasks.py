@@ -6,7 +6,7 @@ import pytest
 
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, few_shot_suites
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 
 def test_a_suite_learns_every_concept_that_a_task_names_once_and_a_component_is_named_after_its_own() -> None:

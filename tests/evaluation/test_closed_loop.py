@@ -11,18 +11,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.demonstrations.features import Feature, InitialStates, Observed
-from ftl_lightning.demonstrations.normalization import Normalization
-from ftl_lightning.diffusion.samplers import Sampling
+from ftl_lightning.data.features import Feature, InitialStates, Observed
+from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.domain import ClosedLoop
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation import closed_loop
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, reset, roll_out, sampled_plans
-from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
-from ftl_lightning.seeding import generator
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.training.prepared import Prepared
 
 
 class Line(gymnasium.Env[Any, Any]):

@@ -7,16 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.distances import path_distance, scaled_distance
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import own_domain, warped_distances
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED, Real, coverage, lines, novelty
 from ftl_lightning.evaluation.results import read_rows
-from ftl_lightning.seeding import DEMONSTRATION_SEED
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import DEMONSTRATION_SEED
 from tests.evaluation.conftest import invert
 
 SCENES = load_domain("object_rearrangement")

@@ -16,13 +16,10 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.metadata import parse_session_start_info_plugin_data
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.point import Point
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.drawing import picture
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.evaluator import Evaluator
@@ -31,8 +28,11 @@ from ftl_lightning.evaluation.judged import TaskResult, share, standard_error
 from ftl_lightning.evaluation.results import append_rows, read_rows
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.evaluation.rows import configuration
-from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.point import Point
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.model_folder import read_model
 from tests.evaluation.rows import row as usual_row
 
 

@@ -9,24 +9,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition, batched
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.data import Batch, OwnData, PretrainingData
-from ftl_lightning.errors import UserError
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import origin
-from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.learning.method import Method
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.model_folder import read_model
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretraining import Pretraining
-from ftl_lightning.trainer import Trainer
-from ftl_lightning.tuned import ModelSettings
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Observed
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.few_shot.tuned import ModelSettings
+from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.data import Batch, OwnData, PretrainingData
+from ftl_lightning.training.inversion import origin
+from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.training.method import Method
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.model_folder import read_model
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretraining import Pretraining
+from ftl_lightning.training.trainer import Trainer
 
 MEMORY = f"{__name__}:remember"
 METHOD = Method("memory", kind="memory", model=f"{__name__}:Memory", learner=MEMORY)

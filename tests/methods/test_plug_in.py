@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.methods import load_method, method_names, method_of
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.training.methods import load_method, method_names, method_of
 from tests.conftest import ROOT, Once, python, succeed
 from tests.domains.test_plug_in import VERBS, installed
 

@@ -5,25 +5,25 @@ from pathlib import Path
 import pytest
 import torch
 
-from ftl_lightning.errors import UserError
-from ftl_lightning.few_shot import FewShot
-from ftl_lightning.learning.adaptation import Adaptation
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.forms import learn
-from ftl_lightning.learning.inversion_module import InversionModule
-from ftl_lightning.learning.inversion_settings import AdapterOptions
-from ftl_lightning.learning.learner_adaptation import LearnerAdaptation
-from ftl_lightning.learning.method import Form, Method
-from ftl_lightning.learning.methods import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
-from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.methods.in_context.prompting import prompt
 from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.methods.lora.adaptation import FineTuning
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.forms import learn
+from ftl_lightning.training.inversion_module import InversionModule
+from ftl_lightning.training.inversion_settings import AdapterOptions
+from ftl_lightning.training.learner_adaptation import LearnerAdaptation
+from ftl_lightning.training.method import Form, Method
+from ftl_lightning.training.methods import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
+from ftl_lightning.training.pretraining import Pretraining
 from tests.conftest import ROOT
 
 KINDS = ["diffusion", "bc", "cvae", "in-context"]
 MODULE = """
-from ftl_lightning.learning.method import Method
+from ftl_lightning.training.method import Method
 METHOD = Method(name="echo", kind="diffusion", adaptation="echo_method:Missing")
 NOTHING = "a text"
 """

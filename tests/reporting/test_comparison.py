@@ -8,13 +8,12 @@ import pandas as pd
 import pytest
 import torch
 
-from ftl_lightning.cli import main
-from ftl_lightning.concepts.concept import Concept, Origin
+from ftl_lightning.cli.main import main
 from ftl_lightning.domains.paper import Compared
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
 from ftl_lightning.evaluation.row import Row
-from ftl_lightning.learning.pretrained import load_model
+from ftl_lightning.igm.concept import Concept, Origin
 from ftl_lightning.reporting.changes import changes_table
 from ftl_lightning.reporting.colours import COLOURS, OF_METHODS, colours
 from ftl_lightning.reporting.comparison import (
@@ -30,6 +29,7 @@ from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
 from ftl_lightning.reporting.report import BEGIN, END
 from ftl_lightning.reporting.table import MOST_COLUMNS, Table, select
 from ftl_lightning.reporting.tables import tables
+from ftl_lightning.training.pretrained import load_model
 from tests.conftest import ROOT
 from tests.evaluation.rows import REFERENCE
 from tests.evaluation.rows import row as usual_row

@@ -12,13 +12,13 @@ import pytest
 import torch
 from torch import nn
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.domains.data import InversionData
-from ftl_lightning.learning.inversion import invert
-from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.learning.model_folder import read_model
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.seeding import generator
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.training.data import InversionData
+from ftl_lightning.training.inversion import invert
+from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.training.model_folder import read_model
 from tests.conftest import ROOT
 
 Script = Mapping[str, Any]

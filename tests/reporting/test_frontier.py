@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from ftl_lightning.cli import main
+from ftl_lightning.cli.main import main
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import append_rows
 from ftl_lightning.reporting.figures import frontier
 from ftl_lightning.reporting.frontier import frontier_table, read_frontier, write_frontier
+from ftl_lightning.services.errors import UserError
 from tests.evaluation.rows import row as measured
 from tests.reporting.test_speed import write as write_speed
 

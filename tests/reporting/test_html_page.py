@@ -17,7 +17,7 @@ from ftl_lightning.reporting.table import select
 from tests.conftest import ROOT, Once, refused, succeed
 
 if TYPE_CHECKING:
-    from tests.play.browser import Browser
+    from tests.apps.play.browser import Browser
 
 ASK = """
 const told = {};

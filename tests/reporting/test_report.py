@@ -4,9 +4,8 @@ from typing import Any
 
 import pytest
 
-from ftl_lightning.cli import main
+from ftl_lightning.cli.main import main
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
 from ftl_lightning.evaluation.row import Row
 from ftl_lightning.reporting.comparison import all_methods, comparison_table, short_overview
@@ -14,6 +13,7 @@ from ftl_lightning.reporting.figures import accuracy_bars
 from ftl_lightning.reporting.report import BEGIN, END, _splice
 from ftl_lightning.reporting.table import summarise
 from ftl_lightning.reporting.tables import tables
+from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT, refused
 from tests.evaluation.rows import REFERENCE
 from tests.evaluation.rows import row as usual_row

@@ -24,10 +24,8 @@ import numpy as np
 import torch
 
 from ftl_lightning import FewShot
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.encoder import load_encoder
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.domain import DOMAIN, Expert
@@ -38,11 +36,13 @@ from ftl_lightning.domains.driving.policies import POLICIES
 from ftl_lightning.domains.driving.simulation import advance
 from ftl_lightning.domains.driving.traffic import MAX_STEPS, STATE, STEP, TRAFFIC, decision_seconds
 from ftl_lightning.evaluation.closed_loop import PlanFollower, planner, sampled_plans
-from ftl_lightning.learning.concept_model import ConceptModel
+from ftl_lightning.igm.composition import Composition
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.progress import bar
-from ftl_lightning.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.networks.text_encoder import load_encoder
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED, generator
+from ftl_lightning.services.tensor_file import write_text
+from ftl_lightning.training.concept_model import ConceptModel
 
 SEED = 880
 """Of the drives."""

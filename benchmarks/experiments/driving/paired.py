@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from ftl_lightning import FewShot
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.encoder import load_encoder
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
+from ftl_lightning.igm.composition import Composition
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.in_context.model import InContextModel
+from ftl_lightning.networks.text_encoder import load_encoder
 from ftl_lightning.reporting.paired import episodes
-from ftl_lightning.seeding import DEMONSTRATION_SEED
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.seeding import DEMONSTRATION_SEED
+from ftl_lightning.services.tensor_file import write_text
 
 OURS = "ours"
 METHODS = {OURS: "steps", "BC": "bc", "CVAE": "cvae", "in-context": "in_context", "language": "steps"}

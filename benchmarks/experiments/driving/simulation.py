@@ -20,7 +20,7 @@ from rich.progress import track
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.scenarios import SCENARIOS, make
 from ftl_lightning.domains.driving.simulation import advance, restore, save
-from ftl_lightning.tensor_file import write_text
+from ftl_lightning.services.tensor_file import write_text
 
 REPEATS = 20
 IDLE = 1

@@ -7,26 +7,26 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import origin
-from ftl_lightning.learning.inversion_settings import InversionSettings
-from ftl_lightning.learning.method import Method
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Observed
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.inversion import origin
+from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.training.method import Method
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretraining import Pretraining
 
 METHOD = Method(
     "replay",
     kind="replay",
     model="ftl_replay:ReplayModel",
     pretraining="ftl_replay:ReplayPretraining",
-    adaptation="ftl_lightning.learning.learner_adaptation:LearnerAdaptation",
+    adaptation="ftl_lightning.training.learner_adaptation:LearnerAdaptation",
     learner="ftl_replay:learn",
     configurations=str(Path(__file__).parent),  # suites.yaml
 )

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.cache import cached
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates, Observed, expect_starts
+from ftl_lightning.data.cache import cached
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates, Observed, expect_starts
 from ftl_lightning.domains.agent import dynamics, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
 from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, MAX_STEPS, expect_simulator
@@ -23,8 +23,8 @@ from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.recorder import Recorder
-from ftl_lightning.errors import UserError
-from ftl_lightning.seeding import VALIDATION_SEED
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import VALIDATION_SEED
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.agent.environment import AgentEnvironment

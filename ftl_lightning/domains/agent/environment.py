@@ -24,7 +24,7 @@ from ftl_lightning.domains.agent.scenes import (
     scenes,
 )
 from ftl_lightning.domains.physics import Simulator, pybullet
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 BOWL_THICKNESS = 0.025
 FLOOR = [2.2, 0.01, 1.1]

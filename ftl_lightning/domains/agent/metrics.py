@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, expect_starts
+from ftl_lightning.data.features import InitialStates, expect_starts
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
 from ftl_lightning.domains.rollout import Rollout
 

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.agent.domain import NAME, drives, environment, initial_states
 from ftl_lightning.domains.agent.dynamics import STEP, expect_simulator
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED, STOP, Plane, follow
@@ -12,7 +12,7 @@ from ftl_lightning.domains.agent.scenes import OBSERVED, PLANE, object_positions
 from ftl_lightning.domains.agent.tasks import COMPOSITIONS
 from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
 from ftl_lightning.domains.recorder import Numbers, Piece, Scene
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 BRAKING = 20
 """States of a demonstration reserved for braking."""

@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, STATE
 from ftl_lightning.domains.domain import View
 

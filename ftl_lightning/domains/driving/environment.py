@@ -26,7 +26,7 @@ from ftl_lightning.domains.driving.traffic import (
     origin,
     scene,
 )
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 DRIVE = 4
 """Columns of a drive."""

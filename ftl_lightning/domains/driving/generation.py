@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.foresight import VETOES
@@ -30,8 +30,8 @@ from ftl_lightning.domains.driving.traffic import (
     episode_seed,
     scene,
 )
-from ftl_lightning.errors import UserError
-from ftl_lightning.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.tensor_file import cache_folder, content_hash, load_tensors, save_tensors
 
 _LOG = logging.getLogger(__name__)
 

@@ -12,11 +12,11 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, expect_starts, take
+from ftl_lightning.data.features import InitialStates, expect_starts, take
 from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, decision_seconds, expect_simulator
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
-from ftl_lightning.escape import figure_text
+from ftl_lightning.services.escape import figure_text
 
 MAX_COLUMNS, MAX_PANELS = 4, 8
 BETWEEN = 4

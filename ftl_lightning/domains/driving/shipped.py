@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate
+from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 SHIPPED = Path(__file__).parent / "demonstrations"
 """Folder with a file of expert episodes per training scenario; see its data card."""

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Feature, InitialStates
-from ftl_lightning.errors import UserError
-from ftl_lightning.extras import expect_extra
+from ftl_lightning.data.features import Feature, InitialStates
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.extras import expect_extra
 
 NAME = "driving"
 HORIZON = 8

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.demonstrations.container import Demonstrations
+from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
 from ftl_lightning.domains.mocap.bvh_file import Motion, read_motion
 from ftl_lightning.domains.mocap.export import NODES as EXPORTED
 from ftl_lightning.domains.mocap.normalise import normalised, z_up
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON
 from ftl_lightning.domains.mocap.source import moving, pieces
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 METRES = INCH / 0.45
 """Metres per unit of the conversion, which is that of the ASF files."""

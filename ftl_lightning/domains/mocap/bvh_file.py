@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.errors import UserError, short
-from ftl_lightning.limits import read_text
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.limits import read_text
 
 Numbers = NDArray[np.float64]
 END = "EndSite"

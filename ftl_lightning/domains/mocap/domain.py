@@ -4,7 +4,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates, expect_starts
+from ftl_lightning.data.features import InitialStates, expect_starts
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
 from ftl_lightning.domains.mocap.actions import TESTED, action, judged

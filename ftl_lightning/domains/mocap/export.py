@@ -16,7 +16,7 @@ from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.bvh_file import END
 from ftl_lightning.domains.mocap.skeleton import FPS, as_joints
 from ftl_lightning.domains.mocap.standing import standing_poses
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 Numbers = NDArray[np.float64]
 HIPS = len(skeleton.JOINTS)

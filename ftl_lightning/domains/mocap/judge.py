@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from ftl_lightning.domains.mocap.actions import CLASSES, LEG_CLASSES, OTHER, STAND, actions, of_legs
 from ftl_lightning.domains.mocap.features import LOWER, UPPER, extremes, signals, summary, turns
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints
-from ftl_lightning.errors import UserError
-from ftl_lightning.shipped import shipped
-from ftl_lightning.tensor_file import file_hash, load_tensors, save_tensors
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.shipped import shipped
+from ftl_lightning.services.tensor_file import file_hash, load_tensors, save_tensors
 
 KIND = "motion judge"
 PATH = Path("pretrained/mocap/judge.safetensors")

@@ -13,13 +13,13 @@ from torch import Tensor
 from torchmetrics.image.fid import FrechetInceptionDistance
 from torchmetrics.image.kid import KernelInceptionDistance
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import kinematics
 from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
 from ftl_lightning.domains.mocap.skeleton import BONES, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
-from ftl_lightning.errors import UserError
-from ftl_lightning.extras import expect_extra
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.extras import expect_extra
 
 POSE = "pose"
 """Observed feature of the initial pose."""

@@ -14,13 +14,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.demonstrations.npz import expect_arrays
+from ftl_lightning.data.formats.npz import expect_arrays
 from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.tasks import cleaned
-from ftl_lightning.errors import UserError, short
-from ftl_lightning.limits import expect_readable
-from ftl_lightning.tensor_file import atomic
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.limits import expect_readable
+from ftl_lightning.services.tensor_file import atomic
 
 FILE = "recordings.npz"
 FILES = (FILE, "cmu14_trials.npz")

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations, padded
-from ftl_lightning.demonstrations.features import Feature, InitialStates
+from ftl_lightning.data.container import Demonstrations, padded
+from ftl_lightning.data.features import Feature, InitialStates
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.recordings import WHERE, Recordings, read_folder
@@ -20,8 +20,8 @@ from ftl_lightning.domains.mocap.segments import Segment
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, FPS, HORIZON, as_joints, mirrored
 from ftl_lightning.domains.mocap.standing import standing_poses, walking_poses
 from ftl_lightning.domains.mocap.tasks import DEMONSTRATORS, HELD_OUT, NEW_CONCEPTS, TRAINING_CONCEPTS, mirrored_text
-from ftl_lightning.errors import UserError
-from ftl_lightning.seeding import generator, task_key
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import generator, task_key
 
 NAME = "mocap"
 POSE = "pose"

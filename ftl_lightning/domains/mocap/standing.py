@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.skeleton import COLUMNS, as_joints
-from ftl_lightning.tensor_file import load_tensors, save_tensors
+from ftl_lightning.services.tensor_file import load_tensors, save_tensors
 
 _RIGHT_SIDE = (
     (0.09, 0.0, 0.0),

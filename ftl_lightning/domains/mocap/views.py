@@ -6,12 +6,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.mocap.skeleton import L_HIP, R_HIP, RIGID, as_joints
 from ftl_lightning.domains.mocap.source import OBSERVED, POSE
 from ftl_lightning.domains.mocap.standing import drawn_poses
-from ftl_lightning.processes import drawn
+from ftl_lightning.services.processes import drawn
 
 SHORTEST = 1e-3
 """Minimum length in metres of a generated bone with a direction; shorter bones are not changed."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
@@ -16,7 +16,7 @@ from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAP
 from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.recorder import Recorder
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 NAME = "object_rearrangement"
 STATE_NAMES = tuple(

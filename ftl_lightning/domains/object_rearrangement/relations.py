@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 SHAPES = ("circle", "triangle", "square")
 EXTENT = 5.0

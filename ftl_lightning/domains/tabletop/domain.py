@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import Observed
+from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Concepts, Domain, Plans, Privileged, Show
 from ftl_lightning.domains.paper import Paper, Published

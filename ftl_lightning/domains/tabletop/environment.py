@@ -24,7 +24,7 @@ from ftl_lightning.domains.tabletop.scenes import (
 )
 from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
 from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 TARGETS, SUBSTEPS = 3, 8
 """Arm targets per step, and simulation steps per target."""

@@ -1,8 +1,8 @@
 """Observations and actions of the table-top, without the simulator."""
 
-from ftl_lightning.demonstrations.features import Feature
+from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.tabletop.world import OVERHEAD
-from ftl_lightning.extras import expect_extra
+from ftl_lightning.services.extras import expect_extra
 
 NAME, WIDE_NAME = "tabletop", "tabletop_wide"
 STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")

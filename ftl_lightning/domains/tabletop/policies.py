@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform
 from ftl_lightning.domains.tabletop.interface import ACTION, expect_simulator
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, expect_task
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 _LOG = logging.getLogger(__name__)
 

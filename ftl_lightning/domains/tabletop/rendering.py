@@ -9,13 +9,13 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tabletop.interface import HERTZ, POSE, THRESHOLD, expect_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
 from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, FRONT, TABLE_COLOUR
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
-from ftl_lightning.escape import figure_text
+from ftl_lightning.services.escape import figure_text
 
 MAX_COLUMNS = 4
 FRAMES = 60

@@ -27,8 +27,8 @@ from ftl_lightning.domains.tabletop.tasks import (
     TO_WHITE,
     expect_task,
 )
-from ftl_lightning.errors import UserError
-from ftl_lightning.seeding import task_key
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import task_key
 
 CIRCLE, TRIANGLE, BOOK, WHITE, BOWL = OBJECTS = ("green circle", "orange triangle", "book", "white surface", "purple bowl")
 COLUMNS = {name: slice(4 * number, 4 * number + 4) for number, name in enumerate(OBJECTS)}

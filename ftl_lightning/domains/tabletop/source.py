@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ftl_lightning.demonstrations.cache import cached
-from ftl_lightning.demonstrations.container import Demonstrations, concatenate, padded
-from ftl_lightning.demonstrations.features import InitialStates
+from ftl_lightning.data.cache import cached
+from ftl_lightning.data.container import Demonstrations, concatenate, padded
+from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.tabletop import distractors, environment, experts, pushing, success, world
 from ftl_lightning.domains.tabletop import scenes as scene_settings
@@ -20,8 +20,8 @@ from ftl_lightning.domains.tabletop.experts import Episode, led_astray, perform
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
 from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, expect_task
-from ftl_lightning.errors import UserError
-from ftl_lightning.seeding import VALIDATION_SEED, task_key
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.seeding import VALIDATION_SEED, task_key
 
 _LOG = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
 """Tasks of the table-top, and their evaluation suites."""
 
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
-from ftl_lightning.errors import UserError
+from ftl_lightning.services.errors import UserError
 
 TO_BOOK = "pick green circle to book"
 TO_WHITE = "pick green circle to elevated white surface"

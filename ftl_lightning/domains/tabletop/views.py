@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ftl_lightning.demonstrations.features import Feature, Observed
+from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.domains.domain import View
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, PLACES, POSE
 from ftl_lightning.domains.tabletop.world import OVERHEAD
-from ftl_lightning.processes import drawn
+from ftl_lightning.services.processes import drawn
 
 HAND, POINTS, MOVED = "hand", "points", "moved"
 ORIGIN = "origin"
@@ -99,7 +99,7 @@ def misplaced(read: Tensor, places: Tensor) -> Tensor:
 
     Args:
         read: x, y, height and visibility logit of each object, all x first ``(sample, 20)``; see
-            :class:`ftl_lightning.diffusion.image_encoder.Points`.
+            :class:`ftl_lightning.networks.image_encoder.Points`.
         places: :data:`~ftl_lightning.domains.tabletop.interface.SEEN` ``(sample, 5, 4)``.
     """
     read, seen = read.unflatten(1, (4, -1)).transpose(1, 2), places[..., 0]

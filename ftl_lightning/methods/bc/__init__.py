@@ -1,7 +1,7 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details')."""
 
 from ftl_lightning.domains.paper import WITH_MODES
-from ftl_lightning.learning.method import Form, Method
+from ftl_lightning.training.method import Form, Method
 
 METHOD = Method(
     name="BC",
@@ -10,5 +10,5 @@ METHOD = Method(
     pretraining="ftl_lightning.methods.bc.pretraining:CloningPretraining",
     forms=(Form(WITH_MODES, "modes", 1),),
     configurations="conf/bc",
-    suits="ftl_lightning.learning.transitions:expect_present_or_moment",
+    suits="ftl_lightning.training.transitions:expect_present_or_moment",
 )

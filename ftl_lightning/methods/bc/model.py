@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import Composition, batched
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.learning.additive import AdditiveModel, added
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.text_concept_model import TextConceptModel
-from ftl_lightning.learning.transitions import StepConfig, unroll
+from ftl_lightning.data.features import Observed
+from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bc import METHOD
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.training.additive import AdditiveModel, added
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.text_concept_model import TextConceptModel
+from ftl_lightning.training.transitions import StepConfig, unroll
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,13 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretraining import Pretraining
-from ftl_lightning.learning.transitions import expect_window
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretraining import Pretraining
+from ftl_lightning.training.transitions import expect_window
 
 
 class CloningPretraining(Pretraining[CloningModel]):
@@ -20,8 +20,8 @@ class CloningPretraining(Pretraining[CloningModel]):
     Args:
         hidden_dim, members: see :class:`CloningConfig`.
         plan_horizon: states in an unrolled plan; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``, or 1.
-        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+        stride: see :class:`~ftl_lightning.training.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``, or 1.
+        options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
     """
 
     def __init__(

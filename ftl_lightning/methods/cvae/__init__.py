@@ -1,7 +1,7 @@
 """Conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the paired concepts."""
 
 from ftl_lightning.domains.paper import WITH_MODES
-from ftl_lightning.learning.method import Form, Method
+from ftl_lightning.training.method import Form, Method
 
 METHOD = Method(
     name="CVAE",

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.concepts.composition import Composition, batched
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.learning.additive import AdditiveModel, added
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
+from ftl_lightning.data.features import Observed
+from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.cvae import METHOD
+from ftl_lightning.training.additive import AdditiveModel, added
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,14 +5,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.demonstrations.features import moved
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretraining import Pretraining, expect_shown
+from ftl_lightning.data.features import moved
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
-from ftl_lightning.processes import drawn
-from ftl_lightning.ranges import expect_range
+from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretraining import Pretraining, expect_shown
 
 
 class VAEPretraining(Pretraining[VAEModel]):
@@ -22,7 +22,7 @@ class VAEPretraining(Pretraining[VAEModel]):
         latent_dim: size of z.
         hidden_dim: see :class:`VAEConfig`.
         beta: weight of the divergence from the prior, per value of the behaviour, relative to the squared error.
-        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+        options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
     """
 
     def __init__(self, latent_dim: int = 20, hidden_dim: int = 512, beta: float = 1.0, **options: Any) -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ftl_lightning.diffusion.schedule import MOST_STEPS
-from ftl_lightning.processes import drawn, mean
-from ftl_lightning.ranges import expect_count, expect_range
-from ftl_lightning.seeding import generator
+from ftl_lightning.igm.schedule import MOST_STEPS
+from ftl_lightning.services.processes import drawn, mean
+from ftl_lightning.services.ranges import expect_count, expect_range
+from ftl_lightning.services.seeding import generator
 
 
 @dataclass(frozen=True)

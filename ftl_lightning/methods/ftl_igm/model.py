@@ -7,24 +7,24 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning import diffusion
-from ftl_lightning.concepts.adapter import LowRank, adaptable
-from ftl_lightning.concepts.branches import Context
-from ftl_lightning.concepts.composition import Composition, batched
-from ftl_lightning.concepts.guidance import composed_epsilon
-from ftl_lightning.demonstrations.features import Observed
-from ftl_lightning.diffusion.prediction import PREDICTIONS, Prediction, loss_weights
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.diffusion.schedule import MOST_STEPS, cosine_alpha_bar, denoising_loss, timesteps
-from ftl_lightning.diffusion.spectrum import Spectrum
-from ftl_lightning.errors import UserError, short
-from ftl_lightning.learning.concept_model import Draws
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.text_concept_model import TextConceptModel
+from ftl_lightning import networks
+from ftl_lightning.data.features import Observed
+from ftl_lightning.igm.adapter import LowRank, adaptable
+from ftl_lightning.igm.branches import Context
+from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.prediction import PREDICTIONS, Prediction, loss_weights
+from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.schedule import MOST_STEPS, cosine_alpha_bar, denoising_loss, timesteps
 from ftl_lightning.methods.ftl_igm import METHOD
-from ftl_lightning.ranges import expect_range
-from ftl_lightning.schema import from_mapping
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.schema import from_mapping
+from ftl_lightning.services.spectrum import Spectrum
+from ftl_lightning.training.concept_model import Draws
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.text_concept_model import TextConceptModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class DiffusionConfig(ModelConfig):
     """Configuration of a diffusion model.
 
     Attributes:
-        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
+        denoiser: name of a class of :mod:`ftl_lightning.networks`.
         denoiser_args: arguments of the denoiser other than the sizes.
         diffusion_steps: T.
         prediction: parametrisation of the output, ``'epsilon'`` (the paper's), ``'v'``, ``'clean'``, ``'displacement'`` or
@@ -55,13 +55,13 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     Raises:
         UserError: for an unknown class or invalid arguments.
     """
-    if config.denoiser not in diffusion.__all__:
-        raise UserError(f"denoiser: expected one of {', '.join(diffusion.__all__)}, found {short(config.denoiser)!r}")
+    if config.denoiser not in networks.__all__:
+        raise UserError(f"denoiser: expected one of {', '.join(networks.__all__)}, found {short(config.denoiser)!r}")
     if config.prediction not in PREDICTIONS:
         raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {short(config.prediction)!r}")
     if config.prediction in ("epsilon", "v") and config.denoiser_args.get("smooth"):
         raise UserError(f"denoiser_args.smooth: expected 0 for a network that puts out {config.prediction}, which is not smooth")
-    kind: type[nn.Module] = getattr(diffusion, config.denoiser)
+    kind: type[nn.Module] = getattr(networks, config.denoiser)
     if config.prediction == "cosines" and getattr(kind, "over_time", False):
         raise UserError(f"prediction: expected clean for {config.denoiser}, whose output is smooth by itself, found cosines")
     points = config.denoiser_args.get("initial_encoder") == "points"
@@ -102,7 +102,7 @@ class GenerativeModel(TextConceptModel):
 
     @property
     def over_time(self) -> bool:
-        over_time: bool = getattr(diffusion, self.config.denoiser).over_time
+        over_time: bool = getattr(networks, self.config.denoiser).over_time
         return over_time
 
     def adaptable(self) -> dict[str, tuple[int, int]]:

@@ -7,19 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.diffusion import PAPER_SIZE
-from ftl_lightning.diffusion.prediction import LOSSES, Prediction, loss_weights
-from ftl_lightning.diffusion.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.errors import UserError, short
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretraining import Pretraining
+from ftl_lightning.igm.prediction import LOSSES, Prediction, loss_weights
+from ftl_lightning.igm.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
-from ftl_lightning.option_groups import flat, groups_of
-from ftl_lightning.processes import drawn
-from ftl_lightning.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.networks import PAPER_SIZE
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.option_groups import flat, groups_of
+from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretraining import Pretraining
 
 WINDOWS = 4096
 """Maximum number of windows for fitting the scales of cosines."""
@@ -44,7 +44,7 @@ class LossOptions:
     Attributes:
         kind: quantity of the squared error, ``'epsilon'`` (Eq. 1), ``'v'`` or ``'clean'``. ``'v'`` and ``'clean'`` give more weight
             to noisy timesteps, at which the concept matters: factors 1 / abar_t and (1 - abar_t) / abar_t.
-        timestep_power: see :func:`ftl_lightning.diffusion.schedule.timesteps`; 1 is the paper's.
+        timestep_power: see :func:`ftl_lightning.igm.schedule.timesteps`; 1 is the paper's.
         discount: state k of a window has weight ``discount ** k``; use values below 1 with replanning.
         condition_dropout: probability p of replacing a sample's concept by the unconditional embedding; drawn per sample
             (the published code draws per batch).
@@ -70,20 +70,20 @@ class PretrainingModule(Pretraining[GenerativeModel]):
     """Trains a denoiser on a domain's pairs of behaviour and concept.
 
     Args:
-        denoiser: name of a class of :mod:`ftl_lightning.diffusion`.
+        denoiser: name of a class of :mod:`ftl_lightning.networks`.
         denoiser_args: arguments of the denoiser other than the sizes.
-        paper_size: override the arguments by the paper's full size (:data:`ftl_lightning.diffusion.PAPER_SIZE`).
+        paper_size: override the arguments by the paper's full size (:data:`ftl_lightning.networks.PAPER_SIZE`).
         diffusion_steps: T.
         draws: number of timesteps and noises per window and step; the observation is encoded once for all draws.
         prediction: parametrisation of the output: ``'epsilon'`` (the paper's), ``'v'``, ``'clean'``, ``'displacement'`` or
-            ``'cosines'`` (:class:`ftl_lightning.diffusion.prediction.Prediction`).
+            ``'cosines'`` (:class:`ftl_lightning.igm.prediction.Prediction`).
         loss: options of the loss.
         codes: coarse codes of behaviour for some samples, which prepare the network for concepts that vary over a plan and for
             concepts without a text.
         compile: compile the denoiser for training (worth it on GPUs).
         learning_rate: learning rate of AdamW.
         guidance: guidance weight omega for training concepts in evaluation.
-        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+        options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
     """
 
     flat = PRETRAINING

@@ -7,16 +7,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.concepts.composition import Composition, batched
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.demonstrations.features import Observed, moved
-from ftl_lightning.diffusion.samplers import Sampling
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.transitions import StepConfig, unroll
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Observed, moved
+from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.in_context import METHOD
-from ftl_lightning.ranges import LARGEST, expect_range
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.ranges import LARGEST, expect_range
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.transitions import StepConfig, unroll
 
 
 @dataclass(frozen=True, kw_only=True)

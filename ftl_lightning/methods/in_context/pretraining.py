@@ -7,14 +7,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.domains.data import Batch, PretrainingData
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning.model_config import ModelConfig
-from ftl_lightning.learning.prepared import Prepared
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.learning.pretraining import Pretraining, expect_shown
-from ftl_lightning.learning.transitions import expect_present, expect_window
 from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.pretraining import Pretraining, expect_shown
+from ftl_lightning.training.transitions import expect_present, expect_window
 
 
 class InContextPretraining(Pretraining[InContextModel]):
@@ -24,10 +24,10 @@ class InContextPretraining(Pretraining[InContextModel]):
         tokens, bins, width, layers, heads: see :class:`InContextConfig`.
         prompts: maximum number of demonstrations in a prompt; the number is drawn per step and concept.
         plan_horizon: number of states in an unrolled plan; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.learning.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``.
+        stride: see :class:`~ftl_lightning.training.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``.
         images: folder of a trained model of any method with frozen image encoders for observed images, as demonstrations are
             encoded before training.
-        options: see :class:`~ftl_lightning.learning.pretraining.Pretraining`.
+        options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
 
     Raises:
         UserError: for a value out of range, or a model without images in ``images``.

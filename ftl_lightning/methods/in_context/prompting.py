@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import torch
 
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.demonstrations.container import Demonstrations
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning.concept_model import ConceptModel
-from ftl_lightning.learning.inversion import origin
-from ftl_lightning.learning.inversion_settings import InversionSettings
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.igm.concept import Concept
 from ftl_lightning.methods.in_context.model import InContextModel
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.inversion import origin
+from ftl_lightning.training.inversion_settings import InversionSettings
 
 
 def prompt(

@@ -1,7 +1,7 @@
 """Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, conditioned on task descriptions."""
 
-from ftl_lightning.learning.method import Method
 from ftl_lightning.methods.ftl_igm import METHOD as OURS
+from ftl_lightning.training.method import Method
 
 METHOD = Method(
     name="language",

@@ -3,15 +3,15 @@
 import torch
 from torch import Tensor
 
-from ftl_lightning.concepts.composition import Composition
-from ftl_lightning.concepts.concept import Concept
-from ftl_lightning.concepts.encoder import load_encoder
 from ftl_lightning.domains.tasks import EvaluationTask
-from ftl_lightning.errors import UserError
-from ftl_lightning.learning.adaptation import Adaptation
-from ftl_lightning.learning.inversion import origin
-from ftl_lightning.learning.text_concept_model import TextConceptModel
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
 from ftl_lightning.methods.language import METHOD
+from ftl_lightning.networks.text_encoder import load_encoder
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.inversion import origin
+from ftl_lightning.training.text_concept_model import TextConceptModel
 
 
 class LanguageAdaptation(Adaptation):
@@ -22,7 +22,7 @@ class LanguageAdaptation(Adaptation):
     Args:
         pretrained: folder of our pretrained model.
         omega: guidance weight of the description.
-        encoder, revision: text encoder, see :func:`ftl_lightning.concepts.encoder.load_encoder`; must equal the pretrained model's.
+        encoder, revision: text encoder, see :func:`ftl_lightning.networks.text_encoder.load_encoder`; as in pretraining.
             The table has no new sentences.
         output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
         seed: seed in the evaluation's rows.

@@ -1,8 +1,8 @@
 """Fine-tuning our model by a low-rank adapter of all branches (LoRA, Hu et al., 2022), a baseline."""
 
 from ftl_lightning.domains.paper import FINE_TUNED
-from ftl_lightning.learning.method import Method
 from ftl_lightning.methods.ftl_igm import METHOD as OURS
+from ftl_lightning.training.method import Method
 
 METHOD = Method(
     name=FINE_TUNED,

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
-from ftl_lightning.learning.inversion_module import InversionModule
-from ftl_lightning.learning.inversion_settings import AdapterOptions
+from ftl_lightning.training.inversion_module import InversionModule
+from ftl_lightning.training.inversion_settings import AdapterOptions
 
 _WHOLE = AdapterOptions(rank=4, scope="all")
 
@@ -15,7 +15,7 @@ class FineTuning(InversionModule):
     Args:
         pretrained: folder of the pretrained model.
         adapter: rank and learning rate; the scope is always ``'all'``.
-        options: see :class:`~ftl_lightning.learning.inversion_module.InversionModule`.
+        options: see :class:`~ftl_lightning.training.inversion_module.InversionModule`.
     """
 
     def __init__(self, pretrained: str, adapter: AdapterOptions = _WHOLE, **options: Any) -> None:

@@ -10,15 +10,12 @@ from typing import Any
 
 import pandas as pd
 
-from ftl_lightning.concepts.concept import Concept
 from ftl_lightning.domains.domain import CLOSED, Domain
 from ftl_lightning.domains.paper import OURS, Compared
-from ftl_lightning.errors import UserError
 from ftl_lightning.evaluation.films import FORMAT
 from ftl_lightning.evaluation.results import COMPARISON, CURVES, latest, read_rows, read_study
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, label
-from ftl_lightning.learning.pretrained import load_model
-from ftl_lightning.printing import say
+from ftl_lightning.igm.concept import Concept
 from ftl_lightning.reporting.colours import COLOURS, colours
 from ftl_lightning.reporting.comparison import METHODS, all_methods, compared, methods, reference_lines, shown_lines
 from ftl_lightning.reporting.concept_places import concept_places
@@ -26,11 +23,14 @@ from ftl_lightning.reporting.curves import AXES, points
 from ftl_lightning.reporting.shown import decisive, domain_of, lookup, settings
 from ftl_lightning.reporting.speed import read_speed
 from ftl_lightning.reporting.table import of_method, select, summarise
-from ftl_lightning.schema import read_json
-from ftl_lightning.shipped import shipped
-from ftl_lightning.tensor_file import visible, write_text
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.printing import say
+from ftl_lightning.services.schema import read_json
+from ftl_lightning.services.shipped import shipped
+from ftl_lightning.services.tensor_file import visible, write_text
+from ftl_lightning.services.web import FILM
+from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.version import __version__
-from ftl_lightning.web import FILM
 
 HERE = Path(__file__).parent
 FILMS, CONCEPTS = "films", "concepts"

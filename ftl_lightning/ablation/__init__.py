@@ -1,5 +1,0 @@
-"""Ablations: grids of configurations, run through the usual verbs; configurations with results are skipped."""
-
-from ftl_lightning.ablation.plan import Stage
-
-__all__ = ["Stage"]

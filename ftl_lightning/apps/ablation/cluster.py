@@ -1,0 +1,275 @@
+"""Run cells on a Ray cluster, placed by their resources; a cell that loses its process or machine runs once more."""
+
+import fcntl
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.apps.ablation.outcome import Attempt, Outcome, Run, Tell
+from ftl_lightning.apps.ablation.plan import Cell
+from ftl_lightning.services import trust
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.tensor_file import alone, write_text
+
+POLL = 0.5
+"""Seconds between two checks of the cells."""
+LOOK = 5.0
+"""Seconds between two checks of the cluster."""
+HEAD_WAIT = 20.0
+"""Maximum seconds without an answer of the head; Ray ends the process after 60 without a useful message."""
+NODE_WAIT = 60.0
+"""Maximum seconds that a cell waits for a machine that has left the cluster."""
+MOST_RUNS = 2
+"""Maximum runs of a cell, so that a cell that crashes machines does not crash them all."""
+_FOLDER = ".cells."
+
+
+@contextmanager
+def cluster(address: str, attempt: Attempt, cells: Sequence[Cell] = ()) -> Iterator[Run]:
+    """Connect to a Ray cluster for the length of the block; an existing connection is used and stays open.
+
+    Args:
+        address: ``'HOST:PORT'`` of the head; ``'auto'`` for the cluster of this machine; ``'local'`` for the processors of this
+            machine; empty for Ray's order: ``RAY_ADDRESS``, else a cluster on this machine, else its processors.
+        attempt: runs a cell on a machine of the cluster, in the current folder.
+        cells: cells to run.
+
+    Raises:
+        UserError: if Ray is missing, no cluster answers, or a cell fits on no machine.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise UserError("executor: 'ray' needs its extra; run: pip install 'ftl-lightning[cluster]'") from error
+    started = not ray.is_initialized()
+    if started:
+        _connect(address or os.environ.get("RAY_ADDRESS", ""))
+    try:
+        _expect_room(cells)
+        yield partial(_run, attempt)
+    finally:
+        if started:
+            ray.shutdown()
+
+
+def _connect(address: str) -> None:
+    import ray
+
+    if "://" in address:
+        expected = "HOST:PORT of a cluster's head, and ablate called on one of its machines, in a folder that all of them share"
+        raise UserError(f"address: expected {expected}; found {short(address)!r}")
+    here = _here() if address in ("", "auto") else ""
+    if address == "auto" and not here:
+        raise UserError("address: expected a Ray cluster that this machine is a node of, found none; start it by: ray start")
+    if ":" in address and not _answers(address):
+        raise UserError(f"address: expected the head of a Ray cluster at {short(address)}, found that nothing answers there")
+    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's default gives workers low priority
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        # With "auto" Ray also finds the token of the cluster.
+        ray.init(address="auto" if here else address or "local", log_to_driver=False, include_dashboard=False)
+    except (ConnectionError, RuntimeError, ValueError) as error:  # also for other versions of Ray or Python
+        raise UserError(f"address: expected a Ray cluster at {here or address}, found: {short(str(error), 150)}") from error
+
+
+def _here() -> str:
+    """The address of this machine's cluster; empty for none.
+
+    Ray itself trusts the file with the address, and tries for minutes to reach a killed cluster.
+    """
+    folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
+    file = Path(folder, "ray", "ray_current_cluster")
+    try:
+        if file.stat().st_uid not in (os.getuid(), 0):  # the folder is writable for anyone, and a cluster runs code
+            return ""
+        address = file.read_text("utf-8").strip()
+    except OSError:
+        return ""
+    return address if _answers(address) else ""
+
+
+def _answers(address: str) -> bool:
+    """Whether something listens at ``'HOST:PORT'``."""
+    host, _, port = address.rpartition(":")
+    if not port.isdigit() or not 0 < int(port) < 2**16:
+        return False
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
+    except OSError:
+        return False
+    return True
+
+
+@dataclass
+class _Sent:
+    """A cell on the cluster, with attempt number, and the file to which it writes its node when it begins."""
+
+    cell: Cell
+    runs: int
+    begun: Path
+    node: str = ""
+    homeless: float = 0.0
+    """Clock time in seconds since which the cell fits on no machine; 0 if it fits."""
+
+
+def _run(attempt: Attempt, cells: Sequence[Cell], known: set[str], tell: Tell) -> Iterator[tuple[Cell, Outcome]]:
+    import ray
+
+    address = ray.get_runtime_context().gcs_address
+    remote = ray.remote(max_retries=0)(_attempt_in)  # otherwise Ray silently repeats lost cells
+    with _begun_folder() as folder:
+        waiting: dict[Any, _Sent] = {}
+
+        def send(cell: Cell, runs: int) -> None:
+            begun = folder / f"{len(sent)}"
+            sent.append(cell)
+            task = remote.options(name=cell.folder, **cell.resources.ray())
+            sent_task = task.remote(str(Path.cwd()), cell, known, trust.vouched(), attempt, str(begun), runs > 1)
+            waiting[sent_task] = _Sent(cell, runs, begun)
+
+        sent: list[Cell] = []
+        for cell in cells:
+            send(cell, 1)
+        looked, silent = time.monotonic(), 0.0
+        while waiting:
+            ready, _ = ray.wait(list(waiting), num_returns=1, timeout=POLL)
+            now = time.monotonic()
+            _tell_begun(waiting.values(), tell)
+            for task in ready:
+                ended = waiting.pop(task)
+                outcome, lost = _outcome(task)
+                if lost and ended.runs < MOST_RUNS:
+                    tell(ended.cell, "again", ended.node, outcome.error)
+                    send(ended.cell, ended.runs + 1)
+                else:
+                    yield ended.cell, replace(outcome, node=outcome.node or ended.node)
+            if ready or now - looked < LOOK:
+                continue
+            looked = now
+            if _answers(address):
+                silent = 0.0
+                yield from _without_home(waiting, now)
+                continue
+            silent = silent or now
+            if now - silent > HEAD_WAIT:
+                raise UserError(
+                    f"address: the head of the cluster at {address} no longer answers; start it again, and give the same command: "
+                    "cells that are done stay done"
+                )
+
+
+def _expect_room(cells: Sequence[Cell]) -> None:
+    """Refuse cells that fit on no machine of the cluster and would wait for ever.
+
+    Raises:
+        UserError: naming the first such cell.
+    """
+    nodes = [node["Resources"] for node in _nodes()]
+    for cell in cells:
+        if not any(cell.resources.fit(node) for node in nodes):
+            raise UserError(
+                f"resources: {cell}: expected a machine with {cell.resources} in the cluster, found none among {len(nodes)}; "
+                "lower them or add a machine"
+            )
+
+
+def _nodes() -> list[dict[str, Any]]:
+    import ray
+
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
+def _tell_begun(waiting: Iterable[_Sent], tell: Tell) -> None:
+    for sent in waiting:
+        if not sent.node and sent.begun.is_file():
+            sent.node = sent.begun.read_text("utf-8") or "?"
+            tell(sent.cell, "running", sent.node, "")
+
+
+def _outcome(task: Any) -> tuple[Outcome, bool]:
+    """Outcome of a cell, and whether its process or machine was lost."""
+    import ray
+
+    try:
+        return ray.get(task), False
+    except ray.exceptions.RayTaskError as error:  # an error in our code; a second run would fail, too
+        return Outcome(error=short(str(error.cause), 200)), False
+    except ray.exceptions.RayError as error:
+        return Outcome(error=f"{type(error).__name__}: {short(str(error).partition('. ')[0], 200)}"), True
+
+
+def _without_home(waiting: dict[Any, _Sent], now: float) -> Iterator[tuple[Cell, Outcome]]:
+    """Give up cells that have fitted on no machine for :data:`NODE_WAIT`."""
+    import ray
+
+    nodes = [node["Resources"] for node in _nodes()]
+    for task, sent in list(waiting.items()):
+        if sent.node or any(sent.cell.resources.fit(node) for node in nodes):
+            sent.homeless = 0.0
+            continue
+        sent.homeless = sent.homeless or now
+        if now - sent.homeless > NODE_WAIT:
+            ray.cancel(task)
+            del waiting[task]
+            yield sent.cell, Outcome(error=f"no machine of the cluster has {sent.cell.resources} any more")
+
+
+@contextmanager
+def _begun_folder() -> Iterator[Path]:
+    """Create a hidden folder in which cells write their node; folders of killed processes are removed."""
+    with ExitStack() as stack:
+        with alone(Path.cwd()):  # protects new folders until they are locked
+            for left in Path.cwd().glob(f"{_FOLDER}*"):
+                with suppress(OSError), _locked(left):
+                    shutil.rmtree(left)
+            folder = Path(tempfile.mkdtemp(prefix=_FOLDER, dir=Path.cwd()))
+            stack.enter_context(_locked(folder))
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder.
+
+    Raises:
+        OSError: if another process holds the lock.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _attempt_in(
+    folder: str, cell: Cell, known: set[str], vouched: frozenset[str], attempt: Attempt, begun: str, again: bool
+) -> Outcome:
+    """Run a cell in the shared folder of a cluster, with the modules that the user vouches for."""
+    node = _node_name()
+    if not Path(begun).parent.is_dir():
+        message = f"{folder}: expected a folder that all machines share, found that {node} does not have it; call ablate in one"
+        return Outcome(error=message, node=node)
+    os.chdir(folder)
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # as on the command line; checkpoints may be read
+    write_text(begun, node)
+    with trust.vouching(vouched):
+        return replace(attempt(cell, known, again), node=node)
+
+
+def _node_name() -> str:
+    """Host name and the first letters of the node id, since a machine may run several nodes."""
+    import ray
+
+    return f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"

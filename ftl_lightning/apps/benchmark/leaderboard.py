@@ -1,0 +1,109 @@
+"""Leaderboard page from a folder of submissions."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from ftl_lightning.apps.benchmark.check import expect_submission
+from ftl_lightning.apps.benchmark.run import references_of
+from ftl_lightning.apps.benchmark.submission import GIVEN, Row, Run, Score, Submission, score
+from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite, suite_names
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.escape import markdown
+from ftl_lightning.services.tensor_file import visible
+
+BEGIN, END = "<!-- leaderboard: begin -->\n", "<!-- leaderboard: end -->\n"
+HEAD = """# Leaderboard
+
+This page is made by `ftl-lightning benchmark --leaderboard docs/leaderboard.md` from the files in `results/submissions`,
+each of which passes `benchmark --check`. [The protocol](benchmark.md) says what the numbers mean and how to add a line.
+"""
+
+
+def suite_table() -> str:
+    """Markdown table of suites, without hashes."""
+    head = ["suite", "to pretrain on", "to tune on", "in the test", "demonstrations of each", "measures", "needs"]
+    lines = []
+    for suite in map(load_suite, suite_names()):
+        more = f", and up to {suite.training.recoveries} recoveries of each" if suite.training.recoveries else ""
+        lines.append(
+            [
+                f"`{suite.name}`",
+                f"{suite.training.count} of each of {len(suite.training.concepts)} concepts{more}",
+                str(len(suite.validation)),
+                str(len({task.concept for task in suite.test})),
+                str(suite.demonstrations),
+                ", ".join(suite.measures),
+                f"extra `{suite.needs}`" if suite.needs else "your own copy of the recordings" if suite.recordings else "nothing",
+            ]
+        )
+    return "\n".join(_row(cells) for cells in (head, ["---"] * len(head), *lines))
+
+
+def read_submissions(folder: Path) -> list[Submission]:
+    """Read and check the submissions of a folder, sorted by name.
+
+    Raises:
+        UserError: for the first invalid file, two submissions of a method, or a folder without submissions.
+    """
+    files = visible(folder, "*.json") if folder.is_dir() else []
+    if not files:
+        raise UserError(f"{folder}: expected a folder of submissions (.json), found none")
+    known: dict[str, Submission] = {}
+    for path in files:
+        submission, _ = expect_submission(path)
+        if submission.name in known:
+            raise UserError(f"{path}: expected one submission of {submission.name!r}, found two; remove one")
+        known[submission.name] = submission
+    return [known[name] for name in sorted(known)]
+
+
+def leaderboard(submissions: Sequence[Submission]) -> str:
+    """The page, in Markdown."""
+    suites = [load_suite(name) for name in suite_names()]
+    chosen = [suite for suite in suites if any(suite.name in entry.suites for entry in submissions)]
+    parts = [HEAD, BEGIN, *(_section(suite, submissions) for suite in chosen)]
+    if missing := [suite.title for suite in suites if suite not in chosen]:
+        parts.append(f"No submission has these suites yet: {', '.join(map(markdown, missing))}.\n")
+    return "\n".join((*parts, END))
+
+
+def _section(suite: BenchmarkSuite, submissions: Sequence[Submission]) -> str:
+    runs = {
+        entry.name: [run for run in entry.runs if run.suite == suite.name] for entry in submissions if suite.name in entry.suites
+    }
+    measures = [name if kind == "rate" else f"{name} (less is better)" for name, kind in suite.measures.items()]
+    head = ["method", *measures, "model", "pretraining, s", "learning and evaluation, s"]
+    lines = sorted(_lines(suite, runs), key=lambda line: -line[0])
+    table = [_row(head), _row(["---"] * len(head)), *(_row(cells) for _, cells in lines)]
+    return f"## {markdown(suite.title)}\n\n" + "\n".join(table) + "\n"
+
+
+def _lines(suite: BenchmarkSuite, runs: Mapping[str, Sequence[Run]]) -> Iterator[tuple[float, list[str]]]:
+    """Score and cells of each line: methods, then reference lines of the first submission with them."""
+    others = [name for name in suite.measures if name != suite.headline]
+    for name, group in runs.items():
+        rows = [run.rows for run in group]
+        main = score(suite, rows)
+        model = "given" if group[0].origin == GIVEN else "pretrained"
+        times = [f"{sum(getattr(run, key) for run in group) / len(group):.0f}" for key in ("pretraining_seconds", "seconds")]
+        times[0] = "-" if group[0].origin == GIVEN else times[0]
+        yield (
+            main.mean,
+            [f"**{markdown(name)}**", _shown(main), *(_shown(score(suite, rows, measure)) for measure in others), model, *times],
+        )
+    lines: dict[str, Sequence[Sequence[Row]]] = {}
+    for references in references_of(runs).values():
+        lines = references | lines
+    for name, known in lines.items():
+        main = score(suite, known)
+        measured = set.intersection(*({*row.measures} for rows_of_seed in known for row in rows_of_seed))
+        cells = [_shown(score(suite, known, measure)) if measure in measured else "-" for measure in others]
+        yield main.mean, [f"*{markdown(name)}*", _shown(main), *cells, "-", "-", "-"]
+
+
+def _shown(value: Score) -> str:
+    return f"{value.mean:.2f} ± {value.error:.2f}" if value.concepts > 1 else f"{value.mean:.2f}"
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,179 @@
+"""Submission files, and scores from their rows."""
+
+import dataclasses
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ftl_lightning.apps.benchmark.suite import BenchmarkSuite
+from ftl_lightning.services.errors import about
+from ftl_lightning.services.limits import expect_readable
+from ftl_lightning.services.schema import from_mapping, read_json
+from ftl_lightning.services.tensor_file import content_hash, write_text
+from ftl_lightning.version import __version__
+
+KIND, FORMAT = "few-shot concepts", 1
+MOST = 4 * 2**20
+"""Maximum size of a file in bytes; nine suites with three seeds need a twentieth."""
+PRETRAINED, GIVEN = "pretrained", "given"
+"""Origins of a model: pretrained in the run, or given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Measurements of a concept.
+
+    Attributes:
+        setting, concept: the test task.
+        n: number of samples or episodes.
+        measures: values by name, rounded to six decimals.
+    """
+
+    setting: str
+    concept: str
+    n: int
+    measures: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run of a suite with a seed.
+
+    Attributes:
+        suite, seed: suite and seed.
+        model: hash of the pretrained model.
+        origin: ``pretrained`` in this run, or ``given``.
+        data: hashes of the drawn data, by part.
+        configuration: hash of the whole configuration.
+        pretraining_seconds, seconds: duration of pretraining (0 for a given model), and of learning with evaluation.
+        rows: rows of the method, one for each concept of the test.
+        references: rows of the reference lines by name, if the suite has them.
+    """
+
+    suite: str
+    seed: int
+    model: str
+    origin: str
+    data: Mapping[str, str]
+    configuration: str
+    pretraining_seconds: float
+    seconds: float
+    rows: Sequence[Row]
+    references: Mapping[str, Sequence[Row]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """Score of a suite: its first measure, averaged over seeds, then over concepts.
+
+    Attributes:
+        mean: mean over concepts.
+        error: standard error of the mean over concepts; 0 for a single concept.
+        concepts: number of concepts.
+    """
+
+    mean: float
+    error: float
+    concepts: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Submission:
+    """Results of a method.
+
+    Attributes:
+        kind, format: kind and format of the file.
+        method: registered name of the method.
+        name: name in tables.
+        code: hash of the package with the method; empty for methods of ftl-lightning.
+        version: version of ftl-lightning.
+        machine: description of the machine.
+        seeds: seeds of every suite.
+        suites: hashes of the suites' definitions by name.
+        runs: one for each suite and seed.
+        scores: scores of complete suites.
+    """
+
+    kind: str = KIND
+    format: int = FORMAT
+    method: str
+    name: str
+    code: str = ""
+    version: str = __version__
+    machine: Mapping[str, str]
+    seeds: Sequence[int]
+    suites: Mapping[str, str]
+    runs: Sequence[Run] = ()
+    scores: Mapping[str, Score] = field(default_factory=dict)
+
+    def run(self, suite: str, seed: int) -> Run | None:
+        """The run of a suite and a seed, or ``None``."""
+        return next((run for run in self.runs if (run.suite, run.seed) == (suite, seed)), None)
+
+    @property
+    def hash(self) -> str:
+        """16-digit hash of the content."""
+        return content_hash(dataclasses.asdict(self))
+
+    def save(self, path: Path) -> None:
+        """Write the file atomically."""
+        write_text(path, json.dumps(dataclasses.asdict(self), indent=1, ensure_ascii=False) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> "Submission":
+        """Read a file; nothing that it names is imported or opened.
+
+        Raises:
+            UserError: for an invalid file, naming file and key.
+        """
+        expect_readable(path, "submission", MOST)
+        with about(path):
+            return from_mapping(cls, read_json(path, "a submission"), "")
+
+
+def machine() -> dict[str, str]:
+    """Processor, system, Python, torch and threads, on which numbers depend; no name of a computer or person."""
+    import torch
+
+    return {
+        "processor": _processor(),
+        "cores": str(os.cpu_count()),
+        "threads": str(torch.get_num_threads()),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def _processor() -> str:
+    """Name of the processor, if known."""
+    about_it = Path("/proc/cpuinfo")
+    lines = about_it.read_text("utf-8", errors="replace").splitlines() if about_it.is_file() else []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or "unknown")
+
+
+def by_concept(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str) -> list[float]:
+    """Mean of a measure over seeds for each concept of the test, in the suite's order.
+
+    Args:
+        suite: the suite.
+        rows: rows of all concepts, by seed.
+        measure: name of the measure.
+    """
+    values: dict[tuple[str, str], list[float]] = {(row.setting, row.concept): [] for row in rows[0]} if rows else {}
+    for seed_rows in rows:
+        for row in seed_rows:
+            values[row.setting, row.concept].append(row.measures[measure])
+    return [sum(known) / len(known) for task in suite.test if (known := values[task.setting, task.concept])]
+
+
+def score(suite: BenchmarkSuite, rows: Sequence[Sequence[Row]], measure: str = "") -> Score:
+    """Score of a suite from the rows of each seed, for its first measure by default."""
+    values = by_concept(suite, rows, measure or suite.headline)
+    count, mean = len(values), sum(values) / len(values)
+    variance = sum((value - mean) ** 2 for value in values) / (count - 1) if count > 1 else 0.0
+    return Score(mean=round(mean, 6), error=round((variance / count) ** 0.5, 6), concepts=count)

@@ -1,0 +1,324 @@
+"""Verbs with a trainer: Lightning's command line and ``invert``."""
+
+import logging
+import sys
+import warnings
+from argparse import ArgumentError
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import NoneType
+from typing import Any, get_args, get_type_hints
+
+import lightning.pytorch as pl
+from jsonargparse import Namespace, set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities import rank_zero_only
+from omegaconf import OmegaConf
+
+from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.services import log_folder, trust
+from ftl_lightning.services.configuration import configurations, expanded, parts
+from ftl_lightning.services.errors import UserError, mistake_behind, short
+from ftl_lightning.services.inputs import options
+from ftl_lightning.services.printing import say
+from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.training import process_group
+from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
+from ftl_lightning.training.trainer import Trainer
+from ftl_lightning.training.training_bar import TrainingBar, accuracies
+
+
+class CommandLine(LightningCLI):
+    """Lightning's command line with the verb ``invert``."""
+
+    def __init__(self, model: type, data: type, args: list[str], **options: Any) -> None:
+        self._asked = args[0] if args else ""
+        super().__init__(model, data, args=args, **options)
+
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
+        """The requested verb and its non-option arguments; parsers of all verbs would take a third of the start-up time."""
+        verbs = LightningCLI.subcommands() | {"invert": {"model", "datamodule"}}
+        return {verb: names for verb, names in verbs.items() if verb == self._asked}  # none if nothing is run
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add a common default seed and the evaluator's options."""
+        parser.add_lightning_class_args(Evaluator, "evaluation")
+        parser.set_defaults({"seed_everything": 0, "trainer.enable_model_summary": False})
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse arguments, and refuse a seed that numpy does not accept."""
+        super().parse_arguments(parser, args)
+        verb = self.config.get("subcommand")
+        self._expect_keys(self.config[verb] if verb else self.config, args)
+        for key in ("model", "data"):
+            _expect_values(key, (self.config[verb] if verb else self.config).get(key), [option for option, _ in options(args)])
+        seed = (self.config[verb] if verb else self.config).get("seed_everything")
+        if isinstance(seed, int) and not isinstance(seed, bool):
+            expect_range("seed_everything", seed, 0, 2**32 - 1)
+
+    @staticmethod
+    def _expect_keys(known: Namespace, arguments: Sequence[str]) -> None:
+        """Refuse an unknown key without subkeys in a configuration, which jsonargparse accepts.
+
+        Raises:
+            ArgumentError: with the key.
+        """
+        for option, text in options(arguments):
+            keys = OmegaConf.to_container(OmegaConf.create(text)) if option == "config" and ":" in text else {}
+            for key in keys if isinstance(keys, dict) else ():
+                if key not in known.as_dict():
+                    raise ArgumentError(None, f"Group 'configuration' does not accept option '{short(str(key))}'")
+
+    def instantiate_classes(self) -> None:
+        """Build everything; model and data must have the same seed, as Lightning logs a single seed."""
+        with trust.vouching(self._domains()):
+            try:
+                super().instantiate_classes()
+            except (ValueError, MisconfigurationException) as error:
+                message = _behind(error)
+                raise mistake_behind(error) or UserError(f"configuration: {short(message, 230)}; see --help") from error
+        model, data = (getattr(module, "hparams", {}).get("seed") for module in (self.model, self.datamodule))
+        if model is not None and data is not None and model != data:
+            raise UserError(f"model.seed: expected {data} (data.seed), found {model}; give --seed_everything, which sets both")
+
+    def _domains(self) -> list[str]:
+        """The domain in the configuration, if any, which a pretrained model's folder may then use.
+
+        Raises:
+            UserError: for a module that is neither installed nor trusted by the user.
+        """
+        options = (self._get(self.config, "data") or {}).get("init_args") or {}
+        domain = options.get("domain")
+        if not isinstance(domain, str) or ":" not in domain:
+            return []
+        trust.expect_module(domain, "data.domain")
+        return [domain]
+
+    def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
+        """The trainer, with this package's progress bar."""
+        configured = self._get(self.config_init, "trainer")
+        callbacks = list(configured["callbacks"] or [])
+        if configured["enable_progress_bar"] is not False and not any(isinstance(callback, ProgressBar) for callback in callbacks):
+            callbacks.append(TrainingBar())
+        return super().instantiate_trainer(**kwargs, callbacks=callbacks)
+
+    def before_instantiate_classes(self) -> None:
+        """Claim a log folder that no concurrent run uses: a new folder for an inversion, ``invert``, then ``invert_1`` and so on.
+
+        A pretraining reuses the folder of an earlier run unless that is running. A run from a checkpoint uses the given folder.
+        """
+        if getattr(rank_zero_only, "rank", 0):  # the first process of a run claims the folder
+            return
+        logger = self._get(self.config, "trainer").get("logger")
+        options = logger.get("init_args") if isinstance(logger, Namespace) else None
+        if not options or not isinstance(options.get("version"), str) or not {"save_dir", "name"} <= set(options.keys()):
+            return
+        folder, name = Path(options["save_dir"]) / (options["name"] or ""), options["version"]
+        if self._get(self.config, "ckpt_path") and self._verb in ("fit", "invert"):
+            log_folder.hold(folder / name)
+        elif self._verb in ("fit", "invert"):
+            options["version"] = log_folder.claim(folder, name, new=self._verb == "invert")
+
+    @property
+    def _verb(self) -> str:
+        return self.subcommand or ""
+
+    def after_fit(self) -> None:
+        """Print the folder of the model."""
+        folder = self.model.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
+        say(", ".join((f"pretrained model: {folder}", *accuracies(self.trainer))))
+
+    def after_invert(self) -> None:
+        """Print the log folder."""
+        say(f"logged in {self.trainer.log_dir or self.trainer.default_root_dir}")
+
+    def before_fit(self) -> None:
+        """Find the last checkpoint, if requested."""
+        self._find_last()
+
+    before_invert = before_fit
+
+    def before_validate(self) -> None:
+        """Require a checkpoint; Lightning would evaluate random weights."""
+        self._find_last()
+        if not self.config_init[self._verb].get("ckpt_path"):
+            raise UserError(f"ckpt_path: {self._verb} expected a checkpoint file, found none; give --ckpt_path FILE")
+
+    before_test = before_validate
+
+    def _find_last(self) -> None:
+        """Resolve ``last`` to the path of the last checkpoint; without any, the run starts anew with a note."""
+        options = self.config_init[self._verb]
+        if options.get("ckpt_path") == "last":
+            options["ckpt_path"] = last_checkpoint(self.trainer)
+            if options["ckpt_path"] is None and self._verb in ("fit", "invert"):
+                say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
+
+    def _parse_ckpt_path(self) -> None:
+        # Lightning would override configuration and command line by the checkpoint's hyper-parameters, class included.
+        # Here the configuration takes precedence, and a checkpoint of another class is refused.
+        path = self.config[self.config.subcommand].get("ckpt_path") if "subcommand" in self.config else None
+        if path and path != "last":
+            read_checkpoint(path)
+
+
+def _expect_values(key: str, values: Namespace | None, given: Sequence[str]) -> None:
+    """Refuse values that jsonargparse accepts: null for an argument without ``None``, and abbreviated names in option groups.
+
+    Args:
+        key: ``model`` or ``data``.
+        values: parsed values.
+        given: names of options on the command line.
+
+    Raises:
+        ArgumentError: with the key.
+    """
+    if values is None or "class_path" not in values:
+        return
+    module, _, name = values["class_path"].rpartition(".")
+    hints: dict[str, Any] = {}
+    for base in reversed(getattr(sys.modules.get(module), name, object).__mro__):
+        with suppress(Exception):  # foreign annotations may not resolve
+            hints |= get_type_hints(vars(base)["__init__"])
+    groups = {name: get_type_hints(hint) for name, hint in hints.items() if is_dataclass(hint)}
+    in_groups = {f"{name}.{option}": hint for name, options in groups.items() for option, hint in options.items()}
+    for option in given:
+        name = option.removeprefix(f"{key}.init_args.").removeprefix(f"{key}.")
+        if option.startswith(f"{key}.") and name.partition(".")[0] in groups and name not in groups and name not in in_groups:
+            raise ArgumentError(None, f"Option '{key}.{name}' is not accepted")
+    for name, value in (values.get("init_args") or Namespace()).items(branches=True):
+        hint = (hints | in_groups).get(name)
+        if value is None and hint in (int, float, str, bool):
+            raise ArgumentError(None, f'Key "{key}.{name}": Expected a {hint}. Got value: null')
+        if value is None and name in groups:
+            raise ArgumentError(None, f'Key "{key}.{name}": expected some of {", ".join(groups[name])}, found null')
+        if value is None and name in in_groups and NoneType not in get_args(hint):
+            raise ArgumentError(None, f'Key "{key}.{name}": expected a value, found null')
+
+
+GROUPS = ("adapter", "budget", "codes", "embeddings", "loss", "modes", "weights")
+"""Option groups of shipped modules."""
+
+
+def _null_in_groups(arguments: Sequence[str]) -> list[str]:
+    """Rewrite ``--model.GROUP.OPTION null`` as ``--model.GROUP={"OPTION": null}``; the parser reads the former as a text."""
+    result, rest = [], list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        option, equals, value = argument.partition("=")
+        group, dot, name = option.removeprefix("--model.").removeprefix("init_args.").partition(".")
+        if not (option.startswith("--model.") and dot and group in GROUPS):
+            result.append(argument)
+            continue
+        if not equals and rest and not rest[0].startswith("--"):
+            equals, value = "=", rest.pop(0)
+        result.append(f'--model.{group}={{"{name}": null}}' if value == "null" else f"{option}{equals}{value}")
+    return result
+
+
+def _behind(error: BaseException) -> str:
+    """Message of the root cause of an exception."""
+    while behind := error.__cause__ or error.__context__:
+        error = behind
+    return str(error)
+
+
+class _Inversion(CommandLine):
+    """Build an inversion without running it."""
+
+    _verb = "invert"
+
+
+class _Fit(CommandLine):
+    """Build a pretraining without running it."""
+
+    _verb = "fit"
+
+
+class _Parser(CommandLine):
+    """Parse without building anything."""
+
+    def before_instantiate_classes(self) -> None:
+        """Nothing."""
+
+    def instantiate_classes(self) -> None:
+        """Nothing."""
+
+
+def run(arguments: list[str]) -> None:
+    """Parse and run one of Lightning's verbs or ``invert``."""
+    with process_group.one_voice(), log_folder.run():
+        _command_line(CommandLine, arguments[0], arguments, run=True)
+
+
+def build(verb: str, options: list[str]) -> CommandLine:
+    """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
+    line = _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
+    process_group.expect_alone(line.trainer, "what another program runs")  # other processes would repeat its command line
+    return line
+
+
+def parse(verb: str, options: list[str]) -> dict[str, Any]:
+    """Parse the options of a verb to values by key; nothing is built."""
+    config: dict[str, Any] = _command_line(_Parser, verb, options, run=False).config.as_dict()
+    return config
+
+
+PACKAGES = ("ftl_lightning", "lightning", "lightning_fabric", "pytorch_lightning", "torch", "torchmetrics")
+"""Packages with classes that configurations may name."""
+
+
+def _expect_trusted(verb: str, arguments: list[str]) -> None:
+    """Allow a configuration only classes of packages that are installed or trusted by the user.
+
+    Raises:
+        UserError: with file, key and module of another class.
+    """
+    packages = set(PACKAGES)
+    sources = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
+    for where, keys in (*sources, ("options", dict(options(arguments)))):
+        trust.expect_classes(keys, where)
+        packages |= trust.allowed(keys)
+    trust.allow_classes(packages)
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+
+
+def _command_line(kind: type[CommandLine], verb: str, arguments: list[str], run: bool) -> CommandLine:
+    _expect_trusted(verb, arguments)
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")  # data are in memory
+    warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")  # there are no workers
+    warnings.filterwarnings("ignore", message=".*module.s. in eval mode at the start of training.*")  # averaged or frozen
+    warnings.filterwarnings(
+        "ignore", message=".*resuming from a checkpoint that ended before the epoch ended.*"
+    )  # steps are stateless
+    warnings.filterwarnings("ignore", message=".*is smaller than the logging interval.*")  # in short runs
+    warnings.filterwarnings("ignore", message=".*LightningCLI's args parameter is intended.*")
+    warnings.filterwarnings("ignore", message=".*`isinstance.treespec, LeafSpec.` is deprecated.*")  # within Lightning
+    for name in ("lightning.pytorch", "lightning.fabric"):  # advice and advertisements; warnings and errors stay
+        logging.getLogger(name).setLevel(logging.WARNING)
+    try:
+        return kind(
+            pl.LightningModule,
+            pl.LightningDataModule,
+            trainer_class=Trainer,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            save_config_kwargs={"overwrite": True},
+            parser_kwargs={"parser_mode": "omegaconf+", "exit_on_error": False},
+            run=run,
+            args=expanded(_null_in_groups(arguments), verb),
+        )
+    except OSError as error:
+        raise UserError(
+            f"{error.filename or 'output'}: {error.strerror or error}; choose a place that exists, is writable and has room"
+        ) from error
+    except MisconfigurationException as error:
+        raise UserError(f"trainer: {short(str(error), 200)}") from error
+    except Exception as error:
+        if mistake := mistake_behind(error):
+            raise mistake from None
+        raise

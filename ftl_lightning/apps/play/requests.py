@@ -1,0 +1,147 @@
+"""Requests of the page, as read from JSON."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.ranges import expect_count, expect_factor, expect_range
+
+MOST_SAMPLES, MOST_DRAWN, MOST_PARTS, MOST_NAME = 64, 20, 12, 100
+"""Maximum number of samples and of drawn demonstrations per request, of concepts in a mixture, and of letters in a name."""
+MOST_TEMPERATURE = 4.0
+
+
+def expect_name(name: str) -> None:
+    """Refuse an invalid name.
+
+    Raises:
+        UserError: for an empty or too long name, or letters that cannot be printed.
+    """
+    if not 1 <= len(name.strip()) <= MOST_NAME or not name.isprintable():
+        raise UserError(f"name: expected 1 to {MOST_NAME} letters, found {len(name)}")
+
+
+@dataclass(frozen=True)
+class Open:
+    """Open a model, by name."""
+
+    model: str
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Draw a new scene, of a task where scenes differ."""
+
+    task: str = ""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Demonstration recorded by hand.
+
+    Attributes:
+        scene: number of the scene.
+        path: positions ``(step, piece, 2)`` in the film's unit.
+        seconds: time of each step, from any zero.
+    """
+
+    scene: int
+    path: Sequence[Sequence[Sequence[float]]]
+    seconds: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Draw demonstrations from the library."""
+
+    task: str
+    count: int = 5
+
+    def __post_init__(self) -> None:
+        expect_count("count", self.count, 1, MOST_DRAWN)
+
+
+@dataclass(frozen=True)
+class One:
+    """A demonstration by its number."""
+
+    id: int
+
+
+@dataclass(frozen=True)
+class Named:
+    """A concept, by its identifier on the page."""
+
+    id: str
+
+
+@dataclass(frozen=True)
+class Renamed:
+    """New name of a concept that was learned or opened here."""
+
+    id: str
+    name: str
+
+    def __post_init__(self) -> None:
+        expect_name(self.name)
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """Request without content."""
+
+
+@dataclass(frozen=True)
+class Learn:
+    """Learn from the current demonstrations.
+
+    Attributes:
+        name: name of the concept.
+        quick: learn in the paper's form until little changes; else in the form selected by the demonstrations.
+    """
+
+    name: str
+    quick: bool = True
+
+    def __post_init__(self) -> None:
+        expect_name(self.name)
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A concept of a mixture, by its identifier on the page, with a factor of its weight, on some groups of columns or all."""
+
+    id: str
+    weight: float = 1.0
+    groups: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        expect_factor(f"weight of {self.id}", self.weight)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Generate samples of a mixture.
+
+    Attributes:
+        parts: concepts of the mixture.
+        count: number of samples.
+        seed: seed of the noise and of the initial states.
+        temperature: temperature of the sampler; ``None`` for the tuned value.
+        execute: whether samples are executed in closed loop.
+        task: task of the initial states; empty for the default.
+    """
+
+    parts: Sequence[Mixed]
+    count: int = 8
+    seed: int = 0
+    temperature: float | None = None
+    execute: bool = False
+    task: str = field(default="")
+
+    def __post_init__(self) -> None:
+        expect_count("parts", len(self.parts), 1, MOST_PARTS)
+        expect_count("count", self.count, 1, MOST_SAMPLES)
+        expect_range("seed", self.seed, 0)
+        if self.temperature is not None and not 0 <= self.temperature <= MOST_TEMPERATURE:
+            raise UserError(f"temperature: expected 0 to {MOST_TEMPERATURE:g}, found {self.temperature}")

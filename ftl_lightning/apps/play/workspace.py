@@ -1,0 +1,365 @@
+"""A session with one model on the page: demonstrations, learned concepts and samples of mixtures."""
+
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from ftl_lightning.apps.play import requests
+from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
+from ftl_lightning.apps.play.films import Json, films
+from ftl_lightning.apps.play.mixing import Mixture, goal_of, judge_of, judged, samples, sampling_of, starts_of
+from ftl_lightning.apps.play.same import VARIABLES, Learned, Part, Sampled, command, python
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
+from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.few_shot.tuned import OWN
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import KIND, Concept
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.tensor_file import kind_of
+from ftl_lightning.training.inversion_settings import PAPER
+from ftl_lightning.training.quality import GENERATED
+
+SHOWN, SHOWN_FIRST = 8, 4
+"""Number of samples shown of a learned concept, and during learning."""
+FIRST, EVERY, SHARE = 0.2, 0.5, 3.0
+"""Seconds of learning before the first samples, minimum seconds between samples, minimum ratio of learning to sampling time."""
+TOLD = 0.05
+"""Minimum seconds between reported losses: each report takes time from learning."""
+QUICK: Mapping[str, Any] = {"form": PAPER, "samples": 16, "learning_rate": 0.3}
+QUICK_STEPS = 250
+"""Steps of quick learning from a user's data; chosen on strokes, see docs/experiments-own-data.md."""
+
+Tell = Callable[[Json], None]
+
+
+class Stopped(Exception):
+    """Learning was aborted because no client waits for the result."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """A concept that can be mixed.
+
+    Attributes:
+        name: text of the concept.
+        kind: ``'training'``; ``'shipped'`` or ``'saved'`` in the model's library; ``'opened'`` from a file; ``'learned'`` here.
+        composition: composition to sample from.
+        concept: content of the concept's file; ``None`` for a training concept.
+        file: path or name of the concept's file; empty for training concepts and those learned here.
+        learned: how the concept was learned here; else ``None``.
+        demonstrations: training data of a concept learned here; else ``None``.
+        accuracy: fraction of correct samples; ``None`` if not judged.
+    """
+
+    name: str
+    kind: str
+    composition: Composition
+    concept: Concept | None = None
+    file: str = ""
+    learned: Learned | None = None
+    demonstrations: Demonstrations | None = None
+    accuracy: float | None = None
+
+    @property
+    def form(self) -> str:
+        """Form of the concept in a word or two; empty for training concepts."""
+        if self.concept is None:
+            return ""
+        return self.concept.choice.form if self.concept.choice else "modes" if self.concept.modes else "one set"
+
+
+class Workspace:
+    """One model and the state of its session. No files are written: the browser saves them.
+
+    Args:
+        model: name of a shipped model, or a folder.
+        root: folder of the user's copy of recordings, for domains whose demonstrations do not ship.
+
+    Raises:
+        UserError: if the model does not exist, or cannot learn concepts.
+    """
+
+    def __init__(self, model: str, root: Path | None = None) -> None:
+        self.name = model
+        self._model = FewShot.from_pretrained(model)
+        self._domain = self._model.domain
+        self._shown = Demonstrating(self._model, self._domain.source(root))
+        self._count = 0
+        self._newest: Learned | None = None
+        self._concepts = {
+            f"t{number}": Known(text, "training", self._model[text]) for number, text in enumerate(self._model.training_concepts)
+        }
+        learned = self._model.library().learned
+        for number, entry in enumerate(learned):
+            concept = self._model.load(str(entry.path))
+            name = entry.stem if sum(item.name == entry.name for item in learned) > 1 else entry.name
+            known = Known(name, entry.kind, concept, concept.concept, str(entry.path), accuracy=entry.accuracy)
+            self._concepts[f"s{number}"] = known
+
+    def state(self) -> dict[str, Any]:
+        """Initial state of the page."""
+        domain, recorder = self._domain, self._domain.recorder
+        return {
+            "title": self.name.rpartition("/")[2].replace("_", " "),
+            "model": {"name": self.name, "title": domain.name.replace("_", " "), "hash": self._model.model.hash},
+            "recorder": recorder and {"kind": recorder.kind, "hint": recorder.hint, "tasks": list(recorder.tasks)},
+            "library": self._shown.library,
+            "uploads": list(self._shown.files),
+            "executes": domain.closed_loop is not None and domain.closed_loop.vector_film is not None,
+            "groups": list(domain.plans.groups),
+            "temperature": self._model.tuned.sampling.temperature,
+            "concepts": self._listed(),
+            "work": self.work(),
+            "viewer": None,
+            "offline": None,
+        }
+
+    def work(self) -> dict[str, Any]:
+        """Current demonstrations and findings of their check."""
+        parts = (Part(self._newest.label, learned=self._newest),) if self._newest else ()
+        return self._shown.told() | {"same": self._same(parts, None)}
+
+    @property
+    def suggestion(self) -> str:
+        """Suggested name of the concept: the name of the demonstrations, if a file or the library gave it."""
+        return self._shown.name or "new concept"
+
+    # Demonstrations.
+
+    def scene(self, asked: requests.Pose) -> Json:
+        """Draw a new scene for a demonstration."""
+        return self._shown.scene(asked)
+
+    def record(self, asked: requests.Recorded) -> Json:
+        """Add a demonstration recorded by hand; return the new work."""
+        self._shown.record(asked)
+        return self.work()
+
+    def draw(self, asked: requests.Drawn) -> Json:
+        """Add demonstrations of the library; return the new work."""
+        self._shown.draw(asked)
+        return self.work()
+
+    def remove(self, asked: requests.One) -> Json:
+        """Remove a demonstration; return the new work."""
+        self._shown.remove(asked)
+        return self.work()
+
+    def undo(self, asked: requests.Nothing) -> Json:
+        """Undo the last change; return the new work."""
+        self._shown.undo()
+        return self.work()
+
+    def clear(self, asked: requests.Nothing) -> Json:
+        """Remove all demonstrations; return the new work."""
+        self._shown.clear()
+        return self.work()
+
+    def upload(self, name: str, content: bytes) -> None:
+        """Read a file of demonstrations, of a concept, or of another program.
+
+        Raises:
+            UserError: for another kind of file, or a file of another model or domain.
+        """
+        if (ending := Path(name).suffix.lower()) not in self._shown.files:
+            raise UserError(f"file: expected one that ends in {' or '.join(self._shown.files)}, found {short(name)!r}")
+        if ending == ".safetensors" and kind_of(content) == KIND:
+            self._open(Path(name).name, content)
+        else:
+            self._shown.read(name, content)
+
+    def demonstrations_file(self, key: str) -> tuple[str, bytes]:
+        """Name and bytes of an ``.npz`` of the current demonstrations, or of those of a concept learned here.
+
+        Raises:
+            UserError: if there are none.
+        """
+        if not key:
+            return "demonstrations.npz", as_npz(self._shown.together(""))
+        known = self._known(key)
+        if known.demonstrations is None or known.learned is None:
+            raise UserError(f"id: expected a concept that was learned here, found {short(known.name)!r}")
+        return known.learned.demonstrations, as_npz(known.demonstrations)
+
+    # Concepts.
+
+    def _known(self, key: str) -> Known:
+        if (known := self._concepts.get(key)) is None:
+            raise UserError(f"id: expected a concept that is there, found {short(key)!r}")
+        return known
+
+    def _listed(self) -> list[Json]:
+        return [self._entry(key, known) for key, known in self._concepts.items()]
+
+    def _entry(self, key: str, known: Known) -> Json:
+        count = None if known.concept is None else known.concept.origin.count
+        entry = {"id": key, "name": known.name, "kind": known.kind, "count": count, "form": known.form}
+        return entry | {"accuracy": known.accuracy, "hash": self._model.model.hash}
+
+    def _open(self, name: str, content: bytes) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "concept.safetensors"
+            path.write_bytes(content)
+            try:
+                concept = self._model.load(path)
+            except UserError as error:
+                message = str(error).replace(str(path), short(name))
+                raise UserError(f"{message}; open the model that it was learned with first") from error
+        self._count += 1
+        self._concepts[f"o{self._count}"] = Known(concept.concept.origin.name, "opened", concept, concept.concept, name)
+
+    def concept_file(self, key: str) -> tuple[str, bytes]:
+        """Name and bytes of a concept's file.
+
+        Raises:
+            UserError: for a training concept, which is part of the model.
+        """
+        known = self._known(key)
+        if known.concept is None:
+            raise UserError(f"id: expected a learned concept, found the training concept {short(known.name)!r}")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "concept.safetensors"
+            known.concept.save(path)
+            return known.learned.file if known.learned else Path(known.file).name, path.read_bytes()
+
+    def forget(self, asked: requests.Named) -> None:
+        """Remove a concept that was learned or opened here.
+
+        Raises:
+            UserError: for a concept of the model.
+        """
+        if self._known(asked.id).kind not in ("learned", "opened"):
+            raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
+        del self._concepts[asked.id]
+
+    def rename(self, asked: requests.Renamed) -> None:
+        """Rename a concept that was learned or opened here, also in its file.
+
+        Raises:
+            UserError: for a concept of the model.
+        """
+        known, name = self._known(asked.id), " ".join(asked.name.split())
+        if known.kind not in ("learned", "opened") or known.concept is None:
+            raise UserError("id: expected a concept that was learned or opened here, found one of the model's")
+        if name == known.name:
+            return
+        concept = replace(known.concept, origin=replace(known.concept.origin, name=name))
+        learned = known.learned and replace(known.learned, label=self._unused(name))
+        self._newest = learned if self._newest is known.learned else self._newest
+        self._concepts[asked.id] = replace(known, name=name, concept=concept, learned=learned)
+
+    def learn(self, asked: requests.Learn, tell: Tell, stopped: Callable[[], bool]) -> None:
+        """Learn a concept from the demonstrations, and report loss and samples meanwhile.
+
+        Args:
+            asked: name and settings.
+            tell: called with each line for the page.
+            stopped: whether no client waits any more.
+
+        Raises:
+            UserError: without demonstrations, or if they cannot be learned from.
+            Stopped: if no client waits.
+        """
+        name = " ".join(asked.name.split())
+        demonstrations, begin = self._shown.together(name), monotonic()
+        changes, steps = self._settings(asked.quick)
+        due, reported = begin + FIRST, begin
+
+        def watch(now: Learning) -> None:
+            nonlocal due, reported
+            if stopped():
+                raise Stopped
+            if (clock := monotonic()) >= reported + TOLD or now.step in (1, steps):
+                tell({"step": now.step, "steps": steps, "loss": round(now.loss, 5)})
+                reported = clock
+            if clock >= due:
+                tell({"step": now.step, "samples": self._samples(now.so_far(), SHOWN_FIRST, demonstrations)[0]})
+                due = monotonic() + max(EVERY, SHARE * (monotonic() - clock))
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the page shows these warnings beside the demonstrations
+            concept = self._model.learn(demonstrations, name=name, steps=steps, watch=watch, **changes)
+        seconds = monotonic() - begin
+        self._count += 1
+        changed_steps = None if steps == self._model.tuned.learning_steps else steps
+        key, learned = f"l{self._count}", Learned(name, self._unused(name), changes, changed_steps)
+        known = Known(name, "learned", concept, concept.concept, learned=learned, demonstrations=demonstrations)
+        shown, right = self._samples(concept, GENERATED, demonstrations)
+        quality: Json = {"line": right, "numbers": {}}
+        if len(demonstrations) > 1:
+            measured = concept.quality.quality
+            quality = {"line": ", ".join(filter(None, (right, measured.words))), "numbers": measured.numbers}
+        decided = [film["right"] for film in shown if film["right"] is not None]
+        self._concepts[key] = known = replace(known, accuracy=sum(decided) / len(decided) if decided else None)
+        self._newest = learned
+        result = {"done": True, "concept": self._entry(key, known), "concepts": self._listed(), "quality": quality}
+        same = self._same((Part(learned.label, learned=learned),), None)
+        tell({**result, "samples": shown[:SHOWN], "seconds": round(seconds, 2), "same": same})
+
+    def _unused(self, name: str) -> str:
+        """Label whose files and variable differ from those of every concept learned here."""
+        taken = VARIABLES | {known.learned.variable for known in self._concepts.values() if known.learned}
+        label, number = name, 2
+        while Learned(name, label).variable in taken:
+            label, number = f"{name} {number}", number + 1
+        return label
+
+    def _settings(self, quick: bool) -> tuple[dict[str, Any], int]:
+        """Changes to the tuned settings, and steps. Only a single set of embeddings is learned quickly."""
+        tuned, steps = self._model.tuned.inversion, self._model.tuned.learning_steps
+        if not quick or tuned.modes.sets != 1 or tuned.adapter.rank:
+            return {}, steps
+        if self._model.settings == OWN:
+            return dict(QUICK), QUICK_STEPS
+        return {"form": PAPER}, steps
+
+    # Samples.
+
+    def sample(self, asked: requests.Sample) -> Json:
+        """Generate samples of a mixture.
+
+        Raises:
+            UserError: for an unknown concept or group, or if behaviour cannot be executed.
+        """
+        begin = monotonic()
+        known = [self._known(part.id) for part in asked.parts]
+        width, plans = self._model.model.config.state_dim, self._domain.plans
+        concepts = [
+            (part.weight * item.composition).on(plans.grouped(part.groups), width)
+            if part.groups
+            else part.weight * item.composition
+            for part, item in zip(asked.parts, known, strict=True)
+        ]
+        names = [item.name for item in known]
+        examples = [
+            replace(item.demonstrations, concepts=(item.name,) * len(item.demonstrations)) for item in known if item.demonstrations
+        ]
+        mixture = Mixture(concepts, names, examples)
+        shown, verdict, how = samples(self._model, mixture, asked, (self._shown.task, *names))
+        parts = [
+            Part(item.name, part.weight, tuple(part.groups), item.learned, item.file)
+            for part, item in zip(asked.parts, known, strict=True)
+        ]
+        return {"samples": shown, "told": verdict, "seconds": round(monotonic() - begin, 3), "same": self._same(parts, how)}
+
+    def _samples(self, concept: LearnedConcept, count: int, demonstrations: Demonstrations) -> tuple[list[Json], str]:
+        """Films of samples of a newly learned concept, and the fraction of correct samples in words."""
+        task, starts = starts_of(self._model, (self._shown.task,), count, 0)
+        plans = self._model.sample(concept, count, starts, seed=0, **sampling_of(self._model))
+        judge = judge_of(self._model, [demonstrations])
+        return judged(judge, plans, goal_of(judge, (concept.concept.origin.name,), task))
+
+    def thumbnail(self, key: str) -> Json:
+        """Film of one sample of a concept."""
+        known = self._known(key)
+        _, starts = starts_of(self._model, (known.name, self._shown.task), 1, 0)
+        plans = self._model.sample(known.composition, 1, starts, seed=0, **sampling_of(self._model))
+        return {"film": films(self._domain, plans)[0]}
+
+    def _same(self, parts: Sequence[Part], how: Sampled | None) -> Json:
+        return {"python": python(self.name, parts, how), "command": command(self.name, self._model.settings, parts, how)}

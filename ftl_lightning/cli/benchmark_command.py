@@ -1,0 +1,237 @@
+"""The verb ``benchmark`` and its options. Imports are deferred for a fast start."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.printing import line, say
+
+if TYPE_CHECKING:
+    from ftl_lightning.apps.benchmark.run import Entry
+    from ftl_lightning.apps.benchmark.submission import Submission
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    """Run a method through the frozen suites, check a submission, make the leaderboard, or write the data.
+
+    Attributes:
+        method: registered name of the method, such as bc.
+        suites: comma-separated names; empty for all that can be run here.
+        skip: comma-separated names of suites to leave out.
+        seeds: comma-separated seeds; a submission needs 0,1,2.
+        out: submission file; a stopped run is resumed. Models and logs go to a folder beside it.
+        model: folder of the pretrained models, with placeholders {suite} and {seed}; "shipped" for the models that the method's
+            configurations name; empty to pretrain.
+        configurations: folder with SUITE.yaml for each suite, or suites.yaml for all; empty for those of the method's package, or
+            the defaults of its classes.
+        root: folder of your copy of recordings, for suites whose demonstrations do not ship.
+        list: print a table of the suites instead of running.
+        check: submission file to check instead of running; with a method, a part of it is run again.
+        recompute: share of rows that is run again.
+        salt: word that, with the file, selects these rows.
+        leaderboard: Markdown file to write from the submissions.
+        submissions: folder of submissions.
+        data: folder to write the suites' data to, with cards and hashes.
+        format: format of the data: npz, safetensors, lerobot or minari.
+    """
+
+    method: str = ""
+    suites: str = ""
+    skip: str = ""
+    seeds: str = "0,1,2"
+    out: str = "submission.json"
+    model: str = ""
+    configurations: str = ""
+    root: str = ""
+    list: bool = False
+    check: str = ""
+    recompute: float = 0.1
+    salt: str = ""
+    leaderboard: str = ""
+    submissions: str = "results/submissions"
+    data: str = ""
+    format: str = "npz"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.recompute <= 1:
+            raise UserError(f"recompute: expected a share from 0 to 1, found {self.recompute}")
+        if given := [f"--{name}" for name in ("list", "check", "leaderboard", "data") if getattr(self, name)][1:]:
+            raise UserError(
+                f"benchmark: expected one of --list, --check, --leaderboard and --data, found {given[0]} beside another"
+            )
+        if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", self.seeds) or len(set(self.seeds.split(","))) <= self.seeds.count(","):
+            raise UserError(
+                f"seeds: expected different numbers with commas between them, such as 0,1,2, found {short(self.seeds)!r}"
+            )
+
+
+def _numbers(options: BenchmarkOptions) -> list[int]:
+    """The seeds."""
+    return [int(part) for part in options.seeds.split(",")]
+
+
+def _root(options: BenchmarkOptions) -> Path | None:
+    return Path(options.root) if options.root else None
+
+
+def _entry(options: BenchmarkOptions, work: Path) -> "Entry":
+    """The method to run, with a folder for models and logs."""
+    from ftl_lightning.apps.benchmark.run import Entry
+
+    return Entry(options.method, options.model, options.configurations, _root(options), work)
+
+
+def benchmark(options: BenchmarkOptions) -> None:
+    """Run the verb."""
+    if options.list:
+        from ftl_lightning.apps.benchmark.leaderboard import suite_table
+
+        say(suite_table())
+    elif options.check:
+        _check(options)
+    elif options.leaderboard:
+        from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
+        from ftl_lightning.services.representation import counted
+        from ftl_lightning.services.tensor_file import write_text
+
+        submissions = read_submissions(Path(options.submissions))
+        write_text(Path(options.leaderboard), leaderboard(submissions))
+        say(f"{options.leaderboard}: {counted(len(submissions), 'submission')}")
+    elif options.data:
+        from ftl_lightning.apps.benchmark.data import write_data
+        from ftl_lightning.apps.benchmark.suite import load_suite
+
+        for name in _chosen(options):
+            written = write_data(load_suite(name), _numbers(options), Path(options.data), options.format, _root(options))
+            say(f"{Path(options.data) / name}: {len(written)} files")
+    elif options.method:
+        _run(options)
+    else:
+        raise UserError(
+            "method: expected the name of a method, such as ftl_igm, or --list, --check, --leaderboard or --data, found none"
+        )
+
+
+def _named(text: str, key: str) -> list[str]:
+    """Names of suites.
+
+    Raises:
+        UserError: for an unknown or repeated name.
+    """
+    from ftl_lightning.apps.benchmark.suite import suite_names
+
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if unknown := [name for name in names if name not in suite_names()]:
+        raise UserError(f"{key}: expected some of {', '.join(suite_names())}, found {short(unknown[0])!r}")
+    if len(set(names)) < len(names):
+        raise UserError(f"{key}: expected each suite once, found {short(text)!r}")
+    return names
+
+
+def _chosen(options: BenchmarkOptions) -> list[str]:
+    """The named suites; without names all that the method can run here, with notes on the others.
+
+    Raises:
+        UserError: for a named suite that cannot be run here.
+    """
+    from ftl_lightning.apps.benchmark.run import missing_of
+    from ftl_lightning.apps.benchmark.suite import load_suite, suite_names
+
+    requested, skipped = _named(options.suites, "suites"), _named(options.skip, "skip")
+    chosen, root = [], _root(options)
+    for name in requested or suite_names():
+        if name in skipped:
+            continue
+        if not (missing := missing_of(load_suite(name), root, options.method)):
+            chosen.append(name)
+        elif requested:
+            raise UserError(missing)
+        else:
+            say(line(f"note: left out: {missing}"), error=True)
+    if not chosen:
+        raise UserError("suites: expected one or more, found none that can be run here")
+    return chosen
+
+
+def _run(options: BenchmarkOptions) -> None:
+    from ftl_lightning.apps.benchmark.run import run_benchmark
+    from ftl_lightning.apps.benchmark.submission import Submission, machine
+    from ftl_lightning.apps.benchmark.suite import SEEDS, load_suite
+    from ftl_lightning.services.representation import counted
+    from ftl_lightning.services.targets import expect_writable_file
+    from ftl_lightning.training.methods import code_hash, load_method
+
+    out = Path(options.out)
+    work = out.with_name(f"{out.stem}.work")
+    expect_writable_file(options.out, "out")
+    method = load_method(options.method)
+    names = _chosen(options)
+    begun = Submission(
+        method=options.method,
+        name=method.name,
+        code=code_hash(options.method),
+        machine=machine(),
+        seeds=_numbers(options),
+        suites={name: load_suite(name).hash for name in names},
+    )
+    if out.is_file():
+        begun = _resumed(Submission.load(out), begun, out)
+        say(f"{out}: {counted(len(begun.runs), 'run')} kept")
+    elif work.exists():
+        raise UserError(f"{work}: expected no models and logs of another run, found some; remove the folder or give another --out")
+    entry = _entry(options, work)
+    for name in names:  # report mistakes early
+        entry.cells(load_suite(name), _numbers(options)[0])
+    begun.save(out)
+    submission = run_benchmark(entry, begun, names, out)
+    for name, score in submission.scores.items():
+        error = f" ± {score.error:.2f}" if score.concepts > 1 else ""
+        say(f"{name}: {load_suite(name).headline} {score.mean:.2f}{error}")
+    hint = f"check it with: ftl-lightning benchmark {options.method} --check {options.out}"
+    if tuple(_numbers(options)) != SEEDS:
+        hint = f"a submission needs the seeds {','.join(map(str, SEEDS))}"
+    say(f"{options.out}: {counted(len(submission.runs), 'run')}; {hint}")
+
+
+def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission":
+    """Resume a submission from its file.
+
+    Raises:
+        UserError: for a file of another method, code, version, machine or set of suites.
+    """
+    from dataclasses import replace
+
+    for key in ("kind", "format", "method", "name", "code", "version", "machine"):
+        if getattr(known, key) != getattr(begun, key):
+            raise UserError(f"{out}: expected a submission of the same {key}, found another; give --out another file")
+    for name in set(known.suites) & set(begun.suites):
+        if known.suites[name] != begun.suites[name]:
+            raise UserError(f"{out}: suite {name}: expected the hash {begun.suites[name]}, found another; give --out another file")
+    seeds = [*known.seeds, *(seed for seed in begun.seeds if seed not in known.seeds)]
+    return replace(known, suites={**known.suites, **begun.suites}, seeds=sorted(seeds))
+
+
+def _check(options: BenchmarkOptions) -> None:
+    from ftl_lightning.apps.benchmark.check import expect_submission, recompute
+    from ftl_lightning.services.representation import counted
+
+    path = Path(options.check)
+    if (options.salt or options.recompute != BenchmarkOptions.recompute) and not options.method:
+        raise UserError("recompute: expected the installed method, too: ftl-lightning benchmark METHOD --check FILE, found none")
+    submission, suites = expect_submission(path)
+    rows = sum(len(run.rows) for run in submission.runs)
+    counts = f"{counted(len(suites), 'suite')}, {counted(len(submission.runs), 'run')}, {counted(rows, 'row')}"
+    say(line(f"{path}: {submission.name}, {counts}: whole, and its numbers agree"))
+    if not options.method:
+        say("nothing was run again: that takes the installed method, too: ftl-lightning benchmark METHOD --check FILE")
+        return
+    if options.recompute == 0:
+        return
+    differences = recompute(_entry(options, Path()), submission, suites, options.recompute, options.salt)
+    for difference in differences:
+        say(line(f"differs: {difference}"))
+    if differences:
+        raise UserError(f"{path}: expected the submitted numbers, found {len(differences)} that differ; see above")

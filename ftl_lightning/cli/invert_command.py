@@ -1,0 +1,80 @@
+"""The verb ``invert`` with a model and a file, without a trainer; local imports for a fast start."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ftl_lightning.services.printing import line, say
+from ftl_lightning.services.ranges import LARGEST_STEP, expect_count, expect_range
+
+if TYPE_CHECKING:
+    from ftl_lightning.few_shot.learned_concept import LearnedConcept
+
+
+@dataclass(frozen=True)
+class InvertOptions:
+    """Learn the concepts of a file of demonstrations through a pretrained model, without a trainer.
+
+    The concepts equal those of "invert --config" for the same file, with the settings of the model's domain. Nothing is logged,
+    evaluated or resumed.
+
+    Attributes:
+        pretrained: folder of the pretrained model, or the name of a shipped model.
+        demonstrations: file of demonstrations (.npz or .safetensors), folder of a LeRobot data set, or name of a Minari data set;
+            each of its concepts is learned; demonstrations without a text are one concept named after the file.
+        out: folder to write, a file for each concept.
+        steps: gradient steps; 0 for those of the settings.
+        seed: seed of starts, noise and timesteps.
+        form: form of the concepts, such as "paper" or "modes"; empty to select it by leave-one-out error.
+        settings: configuration file of invert with settings of learning; empty for that of the domain.
+    """
+
+    pretrained: str
+    demonstrations: str
+    out: str = "concepts"
+    steps: int = 0
+    seed: int = 0
+    form: str = ""
+    settings: str = ""
+
+    def __post_init__(self) -> None:
+        expect_count("steps", self.steps, 0, LARGEST_STEP)
+        expect_range("seed", self.seed, 0)
+
+
+def invert(options: InvertOptions) -> None:
+    """Learn the concepts of the file together and write each."""
+    from ftl_lightning.domains.from_file import read_own
+    from ftl_lightning.few_shot.learner import FewShot
+    from ftl_lightning.igm.concept import file_name
+    from ftl_lightning.services.errors import UserError, about, short
+    from ftl_lightning.services.targets import expect_writable_file
+
+    model = FewShot.from_pretrained(options.pretrained, options.settings or None)
+    demos = read_own(options.demonstrations)
+    with about(options.demonstrations):
+        demos = model.demonstrations(demos)
+    names = tuple(dict.fromkeys(demos.concepts))
+    paths = [Path(options.out) / f"{file_name(name)}.safetensors" for name in names]
+    if len(set(paths)) < len(paths):
+        raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(names), 150)}")
+    for path in paths:
+        expect_writable_file(path, "out")
+    changes = {"form": options.form} if options.form else {}
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always", UserWarning)
+        learned = model.learn_all(demos, steps=options.steps or None, seed=options.seed, progress=True, **changes)
+    for note in notes:
+        say("note:", line(str(note.message)), error=True)
+    for path, concept in zip(paths, learned.values(), strict=True):
+        concept.save(path)
+        _tell(path, concept)
+
+
+def _tell(path: Path, learned: "LearnedConcept") -> None:
+    concept = learned.concept
+    weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
+    say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
+    if concept.choice is not None:
+        say(f"  form: {concept.choice}")

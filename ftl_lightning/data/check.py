@@ -1,0 +1,337 @@
+"""Check a few demonstrations for faults that show without a model: missing values, jumps, still stretches, copies, outliers.
+
+Thresholds were chosen on demonstrations of navigation, object rearrangement and driving, on pen strokes, noise and random walks: 99
+of 100 sets of three to ten good demonstrations pass (97 in driving).
+"""
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.finding import Finding
+from ftl_lightning.services.errors import short
+
+POINTS = 32
+"""Number of even times at which demonstrations are compared."""
+UNUSUAL = 3.0
+"""Ratio to all other lengths that makes a length unusual."""
+DISCRETE = 5
+"""Maximum number of distinct values of a discrete column, which may jump."""
+JUMP, JUMP_ALONE = 3.0, 10.0
+"""Ratio of a jump to the largest other step, in several columns and in a single column; fourfold for few steps."""
+WRAPPED = 0.8
+"""Share of a column's range that a step covers where an angle wraps."""
+STILL = 1e-3
+"""Maximum step that counts as standing still, as a share of the usual step."""
+FEW = 3
+"""Minimum steps of a still stretch, and of the longest demonstration, for a fault."""
+LONG = 0.4
+"""Minimum share of a demonstration in a still stretch."""
+SAME, ALIKE = 1e-6, 0.02
+"""Distances of equal and nearly equal demonstrations, as shares of the usual distance."""
+ENOUGH = 20
+"""Minimum numbers of a demonstration for a near-copy to be no coincidence; minimum steps to compare with."""
+UNITS = 10.0
+"""Ratio of values that suggests other units."""
+APART = {3: 25.0, 4: 12.0}
+"""Ratio to the usual distance that makes an outlier, by the number of demonstrations."""
+APART_PLACES, APART_SHAPES = 12.0, 4.0
+"""Ratios for five and more: of states, and of their shapes regardless of place and size."""
+CLOSEST = {3: 0.5}
+"""Minimum usual distance, as a share of the others' spread, by the number of demonstrations; otherwise 0.1."""
+BEYOND = 1.5
+"""Minimum ratio of an outlier's least distance to the others' largest, for five and more."""
+
+
+def mended(states: Tensor, lengths: Tensor) -> tuple[Tensor, tuple[Finding, ...]]:
+    """Replace missing and non-finite numbers in states.
+
+    Args:
+        states: ``(demo, time, state)`` of any floating type.
+        lengths: ``(demo,)``, length of each demonstration.
+
+    Returns:
+        States, linearly interpolated between finite values of a column (0 without any), and findings about them.
+    """
+    missing = ~states.isfinite()
+    if not missing.any():
+        return states, ()
+    findings, whole = [], states.clone()
+    for row in missing.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
+        length = int(lengths[row])
+        times = missing[row].any(dim=1).nonzero()[:, 0]
+        within = times[times < length]
+        if len(within):
+            columns = int(missing[row].any(dim=0).sum())
+            message = f"{len(within)} of {length} time steps are not finite (the first is {int(within[0])}), in {columns} columns"
+            findings.append(Finding(f"{message}; nothing can be learned from them", "error", (row,)))
+        else:
+            findings.append(Finding("its padding is not finite; pad with the last state", "error", (row,)))
+        for column in missing[row].any(dim=0).nonzero()[:, 0].tolist():
+            whole[row, :, column] = _interpolated(states[row, :, column])
+    return whole, tuple(findings)
+
+
+def _interpolated(values: Tensor) -> Tensor:
+    """Interpolate a column ``(time,)`` linearly where it is not finite."""
+    good = values.isfinite().nonzero()[:, 0]
+    if not len(good):
+        return torch.zeros_like(values)
+    times = torch.arange(len(values))
+    after = torch.searchsorted(good, times).clamp(max=len(good) - 1)
+    before = (torch.searchsorted(good, times, right=True) - 1).clamp(min=0)
+    first, last = good[before], good[after]
+    share = ((times - first) / (last - first).clamp(min=1)).clamp(0, 1).to(values.dtype)
+    return values[first] + share * (values[last] - values[first])
+
+
+def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
+    """Check demonstrations of a single concept; errors and warnings come first.
+
+    Later comparisons exclude demonstrations with a fault.
+
+    Args:
+        demonstrations: treated as a single concept, whatever their texts.
+    """
+    findings = [*_few(demonstrations), *_constant(demonstrations)]
+    left = list(range(len(demonstrations)))
+    for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
+        reported = [finding.among(left) for finding in look(demonstrations.rows(left))]
+        findings += reported
+        faulty = {row for finding in reported for row in (finding.rows[1:] if look is _duplicates else finding.rows)}
+        left = [row for row in left if row not in faulty] or left
+    return tuple(sorted(findings, key=lambda finding: finding.severity == "note"))
+
+
+def check_each(demonstrations: Demonstrations) -> dict[str, tuple[Finding, ...]]:
+    """Apply :func:`check` to each concept, by text; rows are those of all demonstrations."""
+    findings = {}
+    for text in dict.fromkeys(demonstrations.concepts):
+        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
+        findings[text] = tuple(finding.among(rows) for finding in check(demonstrations.rows(rows)))
+    return findings
+
+
+def distances(demonstrations: Demonstrations) -> Tensor:
+    """Distances ``(demo, demo)``: root mean square over even times and columns scaled by their spread."""
+    points = _points(_paths(demonstrations))
+    return _apart(points / _spread(points))
+
+
+def _paths(demonstrations: Demonstrations) -> list[Tensor]:
+    """States ``(time, state)`` of each demonstration without padding."""
+    lengths = demonstrations.lengths.tolist()
+    return [states[:length].double() for states, length in zip(demonstrations.states, lengths, strict=True)]
+
+
+def _points(paths: list[Tensor]) -> Tensor:
+    """Resample paths ``(time, state)`` of any lengths at even times, ``(demo, point, state)``."""
+    points = []
+    for path in paths:
+        times = torch.linspace(0, len(path) - 1, POINTS if max(map(len, paths)) > 1 else 1, dtype=torch.double)
+        before = times.floor().long().clamp(max=len(path) - 1)
+        after = (before + 1).clamp(max=len(path) - 1)
+        points.append(path[before] + (times - before)[:, None] * (path[after] - path[before]))
+    return torch.stack(points)
+
+
+def _spread(points: Tensor) -> Tensor:
+    """Standard deviation of each column of ``(demo, point, state)``; 1 for columns that are constant up to rounding."""
+    flat = points.flatten(0, 1)
+    spread = flat.std(dim=0, correction=0)
+    return torch.where(spread > SAME * flat.abs().amax(dim=0), spread, 1)
+
+
+def _apart(points: Tensor) -> Tensor:
+    flat = points.flatten(1)
+    return torch.cdist(flat, flat, compute_mode="donot_use_mm_for_euclid_dist") / flat.shape[1] ** 0.5
+
+
+def _pairs(distances: Tensor) -> Tensor:
+    """Distances of all pairs of different demonstrations, from ``(demo, demo)``."""
+    row, column = torch.triu_indices(len(distances), len(distances), offset=1)
+    return distances[row, column]
+
+
+def _others(count: int, row: int) -> list[int]:
+    return [index for index in range(count) if index != row]
+
+
+def _few(demonstrations: Demonstrations) -> Iterator[Finding]:
+    if len(demonstrations) < 3:
+        yield Finding("three to five demonstrations are usual; with fewer nothing tells which of them is odd", "note")
+
+
+def _lengths(demonstrations: Demonstrations) -> Iterator[Finding]:
+    lengths = demonstrations.lengths.tolist()
+    for row, length in enumerate(lengths if len(lengths) > 2 else ()):
+        others = [lengths[index] for index in _others(len(lengths), row)]
+        if UNUSUAL * length < min(others) or length > UNUSUAL * max(others):
+            yield Finding(f"has {length} steps, the others {min(others)} to {max(others)}", rows=(row,))
+
+
+def _constant(demonstrations: Demonstrations) -> Iterator[Finding]:
+    every = torch.cat(_paths(demonstrations))
+    varies = every.amax(dim=0) - every.amin(dim=0) > SAME * every.abs().amax(dim=0)
+    if len(every) > 1 and varies.any() and not varies.all():
+        names = [name for name, changes in zip(demonstrations.state_names, varies.tolist(), strict=True) if not changes]
+        yield Finding(f"{len(names)} of {len(varies)} columns never change ({short(', '.join(names), 50)})", "note")
+
+
+def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
+    """Find copies by states and observed features."""
+    paths, apart = _paths(demonstrations), distances(demonstrations)
+    usual = float(_pairs(apart).median()) if len(paths) > 2 else 1.0
+    for values in demonstrations.observed.values():
+        seen = values.double().flatten(1)
+        differ = (seen[:, None] - seen).abs() > ALIKE * seen.std(dim=0, correction=0)
+        apart = apart.masked_fill(differ.any(dim=2), torch.inf)
+    size = min(len(path) for path in paths) * paths[0].shape[1]
+    limit = max(ALIKE * usual if size >= ENOUGH else 0.0, SAME)
+    left = list(range(len(paths)))
+    while left:
+        first, *rest = left
+        copies = [row for row in rest if apart[first, row] <= limit]
+        if copies:
+            exact = all(torch.equal(paths[first], paths[row]) for row in copies)
+            yield Finding("are the same" if exact else "are nearly the same; they tell no more than one", rows=(first, *copies))
+        left = [row for row in rest if row not in copies]
+
+
+def _steps(paths: list[Tensor]) -> list[Tensor]:
+    """Steps ``(time - 1, state)`` of each path, in columns scaled by their spread."""
+    spread = _spread(torch.cat(paths)[None])
+    return [path.diff(dim=0) / spread for path in paths]
+
+
+def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
+    paths = _paths(demonstrations)
+    moved = [steps.square().mean(dim=1).sqrt() for steps in _steps(paths)]
+    every = torch.cat(moved)
+    if max(map(len, moved)) < FEW:
+        return
+    usual = float(every[every > 0].median()) if (every > 0).any() else 0.0
+    if not usual:
+        yield Finding("nothing moves in any of them")
+        return
+    runs = [_longest(sizes <= STILL * usual) for sizes in moved]
+    shares = [run / max(len(sizes), 1) for sizes, (run, _) in zip(moved, runs, strict=True)]
+    for row, (sizes, (run, start)) in enumerate(zip(moved, runs, strict=True)):
+        others = [shares[index] for index in _others(len(paths), row)]
+        if run < FEW or shares[row] < LONG:
+            continue
+        if run == len(sizes):
+            yield Finding(f"nothing moves in its {len(sizes) + 1} steps", rows=(row,))
+        elif not others or shares[row] > 2 * sorted(others)[len(others) // 2]:
+            where = f"from step {start} on" if start + run == len(sizes) else f"from step {start} to {start + run}"
+            hint = "; if it is padding, give its length" if start + run == len(sizes) else ""
+            yield Finding(f"stands still {where}, {run} of {len(sizes)} steps{hint}", rows=(row,))
+
+
+def _longest(still: Tensor) -> tuple[int, int]:
+    """Length and start of the longest run of true values ``(time,)``."""
+    best, run = (0, 0), 0
+    for time, value in enumerate(still.tolist()):
+        run = run + 1 if value else 0
+        best = max(best, (run, time - run + 1), key=lambda pair: pair[0])
+    return best
+
+
+def _jumps(demonstrations: Demonstrations) -> Iterator[Finding]:
+    """Find steps much larger than all others, in columns with more than a few values."""
+    paths = _paths(demonstrations)
+    states, steps = torch.cat(paths), [path.diff(dim=0).abs() for path in paths]
+    continuous = [column for column in range(states.shape[1]) if len(states[:, column].unique()) > DISCRETE]
+    for row, sizes in enumerate(steps if continuous else ()):
+        rest = torch.cat([steps[index] for index in _others(len(steps), row)] or [sizes[:0]])
+        many = 1 if len(steps) > 1 and len(sizes) >= ENOUGH else 4  # among few steps a movement may stand out more
+        worst = (0.0, 0, 0)
+        for time in sizes[:, continuous].argmax(dim=0).unique().tolist() if len(sizes) else ():
+            others = torch.cat((sizes[: max(time - 1, 0)], sizes[time + 2 :], rest))[:, continuous]  # a blip is two jumps
+            if len(others) < ENOUGH:
+                continue
+            largest = others.amax(dim=0)
+            ratios = torch.where(largest > 0, sizes[time, continuous] / largest.clamp(min=1e-30), 0)
+            order = ratios.argsort(descending=True)
+            if ratios[order[0]] > many * JUMP_ALONE or (len(order) > 1 and ratios[order[1]] > many * JUMP):
+                worst = max(worst, (float(ratios[order[0]]), time, continuous[int(order[0])]))
+        if worst[0]:
+            ratio, time, column = worst
+            name = short(demonstrations.state_names[column], 30)
+            yield Finding(f"jumps after step {time}: {ratio:.0f} times the largest other step of column {name!r}", rows=(row,))
+    wrapped = [column for column in continuous if _wraps(states[:, column], [sizes[:, column] for sizes in steps])]
+    if wrapped:
+        names = short(", ".join(demonstrations.state_names[column] for column in wrapped), 60)
+        yield Finding(f"columns that jump from end to end: {names}; if they are angles, give sine and cosine", "note")
+
+
+def _wraps(states: Tensor, steps: list[Tensor]) -> bool:
+    """Whether a column ``(time,)`` crosses its range in a step in several demonstrations, and otherwise moves in small steps."""
+    every = torch.cat(steps)
+    moving = every[every > 0]
+    if len(moving) < ENOUGH:
+        return False
+    large = [sizes > WRAPPED * (states.max() - states.min()) for sizes in steps]
+    often, several = sum(int(jumps.sum()) for jumps in large), sum(bool(jumps.any()) for jumps in large)
+    return several > 1 and often * JUMP_ALONE < len(moving) and bool(every.max() > 2 * JUMP_ALONE * moving.median())
+
+
+def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
+    """Find demonstrations whose values are many times the others', or a small part of them."""
+    paths = _paths(demonstrations)
+    sizes = torch.stack([path.abs().amax(dim=0) for path in paths])
+    varies = torch.cat(paths).std(dim=0, correction=0) > SAME * sizes.amax(dim=0)
+    for row in range(len(paths) if len(paths) > 2 and varies.any() else 0):
+        others = sizes[_others(len(paths), row)][:, varies].clamp(min=1e-30)
+        ratios = (sizes[row, varies].clamp(min=1e-30) / others).median(dim=1).values
+        if ratios.min() > UNITS or ratios.max() < 1 / UNITS:
+            ratio = float(ratios.median())
+            relation = f"{ratio:.0f} times the others'" if ratio > 1 else f"1/{1 / ratio:.0f} of the others'"
+            yield Finding(f"its values are about {relation}; other units?", rows=(row,))
+
+
+def _shapes(points: Tensor) -> Tensor:
+    """Points ``(demo, point, state)`` centred, with a root mean square of 1, in columns of spread 1."""
+    centred = points / _spread(points)
+    centred = centred - centred.mean(dim=1, keepdim=True)
+    size = centred.square().mean(dim=(1, 2), keepdim=True).sqrt()
+    return centred / size.clamp(min=SAME)
+
+
+_View = tuple[Callable[[Tensor], Tensor], float, str]
+"""Transformation of points, threshold of an outlier, and its description."""
+
+
+def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
+    """Find demonstrations far from all others, relative to the others' distances."""
+    count, points = len(demonstrations), _points(_paths(demonstrations))
+    if count < 3:
+        return
+    views: list[_View] = [(lambda values: values / _spread(values), APART_PLACES, "is far from the others")]
+    if points.shape[1] > 1:
+        views.append((_shapes, APART_SHAPES, "moves otherwise than the others"))
+    reported: set[int] = set()
+    for view, limit, words in views:
+        seen = view(points)
+        for row in range(count):
+            times, beyond = _far(seen, row)
+            if row not in reported and times > APART.get(count, limit) and (count < 5 or beyond > BEYOND):
+                reported.add(row)
+                yield Finding(f"{words}: {times:.0f} times the usual distance among them; another concept?", rows=(row,))
+
+
+def _far(points: Tensor, row: int) -> tuple[float, float]:
+    """Distance of a demonstration from the others: its median over theirs, and its minimum over their maximum.
+
+    Columns are scaled by the others' spread, lest an outlier hides itself.
+    """
+    others = _others(len(points), row)
+    scale = torch.maximum(
+        points[others].flatten(0, 1).std(dim=0, correction=0), 0.1 * points.flatten(0, 1).std(dim=0, correction=0)
+    )
+    apart = _apart(points / torch.where(scale > SAME, scale, 1))
+    gaps, among = apart[row, others], _pairs(apart[others][:, others])
+    closest = CLOSEST.get(len(points), 0.1)
+    return float(gaps.median() / among.median().clamp(min=closest)), float(gaps.min() / among.max().clamp(min=closest))

@@ -1,0 +1,313 @@
+"""Container of demonstrations of one or several tasks."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.features import Feature, InitialStates, Observed, take
+from ftl_lightning.data.formats.file_format import read, write
+from ftl_lightning.data.formats.file_keys import KIND, OBSERVED
+from ftl_lightning.services.data_names import written_to
+from ftl_lightning.services.errors import UserError, about, short, shown
+from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.tensor_file import bytes_hash, serialise
+
+
+@dataclass(frozen=True, repr=False)
+class Demonstrations(Shown):
+    """Demonstrations of one or several tasks, in the domain's units.
+
+    Attributes:
+        states: ``(demo, time, state)`` float32, padded beyond each demonstration's length.
+        lengths: ``(demo,)`` int64, between 1 and ``time``.
+        domain: name of the domain; empty if unknown.
+        state_names, state_units: an entry for each column of ``states``.
+        concepts: a text for each demonstration; empty if unknown.
+        observed: observed features by name. Features in ``per_step`` are ``(demo, time, *shape)``, conditions of a plan that starts
+            at that time. Other features are ``(demo, *shape)``, known only at the first time. Vectors are float32, images uint8.
+        per_step: names of the features that are known at every time.
+        scenes: ``(demo, scene)`` float32, which reset the environment to each demonstration's initial state and serve a judge,
+            never a model; ``None`` if there are none.
+        provenance: origin of the demonstrations (generator, seed, ...), anything JSON can hold.
+
+    Raises:
+        UserError: at construction, for other shapes or values.
+    """
+
+    states: Tensor
+    lengths: Tensor
+    domain: str
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    concepts: tuple[str, ...]
+    observed: Observed = field(default_factory=dict)
+    per_step: tuple[str, ...] = ()
+    scenes: Tensor | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.states.dim() != 3 or self.states.dtype != torch.float32:
+            raise UserError(
+                f"key 'states': expected float32 of shape (demo, time, state), found {self.states.dtype} {tuple(self.states.shape)}"
+            )
+        count, time, state = self.states.shape
+        if not count:
+            raise UserError("key 'states': expected at least one demonstration, found none")
+        if not time or not state:
+            raise UserError(f"key 'states': expected at least one time and column, found none in {tuple(self.states.shape)}")
+        if self.lengths.dtype != torch.int64:
+            raise UserError(f"key 'lengths': expected whole numbers (int64), found {self.lengths.dtype}")
+        if self.lengths.shape != (count,) or self.lengths.min() < 1 or self.lengths.max() > time:
+            lengths = shown(self.lengths.flatten()[:20].tolist())
+            raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {lengths}")
+        for key, values, expected in (
+            ("state_names", self.state_names, state),
+            ("state_units", self.state_units, state),
+            ("concepts", self.concepts, count),
+        ):
+            if len(values) != expected:
+                raise UserError(f"key {key!r}: expected {expected} entries, found {len(values)}")
+        if unknown := set(self.per_step) - set(self.observed):
+            raise UserError(f"key 'per_step': expected names of observed features, found {short(', '.join(sorted(unknown)))}")
+        for name, feature in self.observed.items():
+            leading = (count, time) if name in self.per_step else (count,)
+            if tuple(feature.shape[: len(leading)]) != leading or feature.dim() <= len(leading):
+                axes = ", ".join(map(str, leading))
+                raise UserError(f"key 'observed/{name}': expected shape ({axes}, ...), found {tuple(feature.shape)}")
+            if feature.dtype not in (torch.float32, torch.uint8):
+                dtype = str(feature.dtype).removeprefix("torch.")
+                raise UserError(f"key 'observed/{name}': expected float32, or uint8 for images, found {dtype}")
+        if self.scenes is not None and (self.scenes.dim() != 2 or len(self.scenes) != count):
+            raise UserError(f"key 'scenes': expected shape ({count}, scene), found {tuple(self.scenes.shape)}")
+        if self.scenes is not None and self.scenes.dtype != torch.float32:
+            raise UserError(f"key 'scenes': expected float32, found {self.scenes.dtype}")
+        for key, tensor in self.tensors.items():
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+                where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
+                raise UserError(f"key {key!r}: expected finite numbers, found {tensor[tuple(where)].item()} at index {where}")
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def _words(self) -> Iterator[str]:
+        if self.domain:
+            yield repr(self.domain)
+        yield f"states {tuple(self.states.shape)}"
+        shortest, longest = int(self.lengths.min()), int(self.lengths.max())
+        if shortest < self.states.shape[1]:
+            yield f"lengths {shortest} to {longest}"
+        if any(self.concepts):
+            yield repr(self.concepts[0]) if len(set(self.concepts)) == 1 else counted(len(set(self.concepts)), "concept")
+        for name, values in self.observed.items():
+            yield f"{name} {tuple(values.shape)}"
+        if self.scenes is not None:
+            yield f"scenes {tuple(self.scenes.shape)}"
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors, by their keys in a file."""
+        scenes = {} if self.scenes is None else {"scenes": self.scenes}
+        features = {OBSERVED + name: values for name, values in self.observed.items()}
+        return {"states": self.states, "lengths": self.lengths} | features | scenes
+
+    @property
+    def features(self) -> dict[str, Feature]:
+        """Shape and kind of each observed feature."""
+        return {name: Feature.of(values, leading=2 if name in self.per_step else 1) for name, values in self.observed.items()}
+
+    def select(self, concept: str) -> Self:
+        """Select the demonstrations of a concept."""
+        return self.rows([index for index, text in enumerate(self.concepts) if text == concept])
+
+    def rows(self, chosen: Sequence[int]) -> Self:
+        """Select demonstrations by their numbers from 0 (``chosen``)."""
+        return replace(
+            self,
+            states=self.states[chosen],
+            lengths=self.lengths[chosen],
+            concepts=tuple(self.concepts[row] for row in chosen),
+            observed=take(self.observed, chosen),
+            scenes=None if self.scenes is None else self.scenes[chosen],
+        )
+
+    def starts(self, rows: Tensor, share: Tensor, exponent: float, horizon: int, at_rest: bool = True) -> Tensor:
+        """Start times of windows ``(window,)`` int64.
+
+        If all features are observed at every time, a plan can start at any time. If a feature is known only at the first time, all
+        windows start at 0. Without observed features, nothing tells a plan where in a behaviour it is: windows stay within a
+        demonstration, and a window of its full length starts at 0.
+
+        Args:
+            rows: ``(window,)`` int64, demonstration of each window.
+            share: ``(window,)``, evenly spread over [0, 1).
+            exponent: u of ``start = length * share^u``; 1 is uniform, with 3 half of the windows start in the first eighth.
+            horizon: length of the windows.
+            at_rest: whether windows may reach past the end; otherwise they stay within demonstrations that are long enough.
+        """
+        if set(self.observed) - set(self.per_step):
+            return torch.zeros_like(rows)
+        past = bool(self.observed) and at_rest
+        room = self.lengths[rows] if past else (self.lengths[rows] - horizon + 1).clamp(min=1)
+        return (share**exponent * room).long()
+
+    def windows(self, rows: Tensor, starts: Tensor, horizon: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Windows of demonstrations, padded with the last state.
+
+        Args:
+            rows: ``(window,)`` int64, demonstration of each window.
+            starts: ``(window,)`` int64, first time of each window.
+            horizon: length of the windows.
+
+        Returns:
+            States ``(window, horizon, state)`` and features observed at each start, by name ``(window, *shape)``.
+        """
+        times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
+        observed = {name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()}
+        return self.states[rows[:, None], times], observed
+
+    @property
+    def initial_states(self) -> InitialStates:
+        """Initial state of each demonstration."""
+        first = {name: values[:, 0] if name in self.per_step else values for name, values in self.observed.items()}
+        return InitialStates(first, self.scenes)
+
+    @property
+    def final_states(self) -> InitialStates:
+        """Final states as initial states of behaviour that continues; features known only at the start are unchanged."""
+        rows, last = torch.arange(len(self)), self.lengths - 1
+        observed = {name: values[rows, last] if name in self.per_step else values for name, values in self.observed.items()}
+        return InitialStates(observed, self.scenes)
+
+    @property
+    def every_observation(self) -> dict[str, Tensor]:
+        """Observed features at all times of all demonstrations, by name ``(observation, *shape)``."""
+        return {name: values.flatten(0, 1) if name in self.per_step else values for name, values in self.observed.items()}
+
+    def named(self, concept: str) -> Self:
+        """Give demonstrations without a text the name ``concept``."""
+        return replace(self, concepts=tuple(text or concept for text in self.concepts))
+
+    @property
+    def hash(self) -> str:
+        """16-digit hash of states, lengths, observed features and scenes, independent of the file format."""
+        return bytes_hash(serialise(KIND, self.tensors, {}))
+
+    def save(self, path: str | Path) -> None:
+        """Write the demonstrations, whole or not at all.
+
+        Args:
+            path: a safetensors file, with compressed images (zlib); an ``.npz`` file, by its suffix; ``'minari:NAME'`` for a Minari
+                data set; or ``'lerobot:FOLDER'`` for a LeRobot data set. No format keeps padding, and ``.npz`` no provenance.
+
+        Raises:
+            UserError: naming the path, if it cannot be written or needs an extra that is not installed.
+        """
+        kind, name = written_to(str(path))
+        if kind != "file":
+            expect_extra(kind, f"{path}: this data set")
+        if kind == "minari":
+            from ftl_lightning.data.formats.minari import write_minari
+
+            return write_minari(self, name)
+        if kind == "lerobot":
+            from ftl_lightning.data.formats.lerobot_writing import write_lerobot
+
+            return write_lerobot(self, name)
+        header = {
+            "domain": self.domain,
+            "state_names": self.state_names,
+            "state_units": self.state_units,
+            "concepts": self.concepts,
+            "per_step": self.per_step,
+            "provenance": dict(self.provenance),
+        }
+        write(path, self.tensors, header)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read demonstrations from :meth:`save` or another program: a safetensors file, an ``.npz`` file without objects, a Minari
+        data set by its name, or the folder of a LeRobot data set.
+
+        An ``.npz`` file needs ``states`` ``(demo, time, state)``. Optional are ``concepts`` (texts, or a single text for all),
+        ``lengths`` (default: full), ``state_names``, ``state_units``, ``domain``, ``scenes``, and observed features as
+        ``observed/NAME``. Names listed in ``per_step`` are observed at every time.
+
+        Args:
+            path: path of the file or folder, or name of the data set.
+
+        Raises:
+            UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
+        """
+        contents = read(path)
+        with about(path):
+            return cls(**contents)
+
+    def fitted(self, features: Mapping[str, Feature]) -> Self:
+        """Return the demonstrations if their observed features are those of a domain.
+
+        Args:
+            features: features of the domain, by name.
+
+        Raises:
+            UserError: for a feature that is missing or has another type or shape.
+        """
+        for name, feature in features.items():
+            if (given := self.features.get(name)) is None or not given.fits(feature):
+                message = "none" if given is None else given.words
+                if given is not None and given.shape[1:] == feature.shape and name not in self.per_step:
+                    message += " (observed at every time? then list it in per_step)"
+                raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {message}")
+        return self
+
+
+def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
+    """Concatenate demonstrations of a domain, padded to the longest, with the provenance of the first part.
+
+    A feature is observed at every time, and there are scenes, only if this holds for all parts.
+    """
+    first = parts[0]
+    longest = max(part.states.shape[1] for part in parts)
+    per_step = tuple(name for name in first.per_step if all(name in part.per_step for part in parts))
+    scenes = [part.scenes for part in parts if part.scenes is not None]
+    return replace(
+        first,
+        states=torch.cat([_padded(part.states, longest) for part in parts]),
+        lengths=torch.cat([part.lengths for part in parts]),
+        concepts=tuple(text for part in parts for text in part.concepts),
+        observed={
+            name: torch.cat(
+                [
+                    _padded(part.observed[name], longest) if name in per_step else part.initial_states.observed[name]
+                    for part in parts
+                ]
+            )
+            for name in first.observed
+        },
+        per_step=per_step,
+        scenes=torch.cat(scenes) if len(scenes) == len(parts) else None,
+    )
+
+
+def padded(behaviours: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Pad behaviours of different lengths to a single tensor.
+
+    Args:
+        behaviours: ``(time, ...)`` each, with at least one time.
+
+    Returns:
+        ``(demo, longest time, ...)``, each padded with its last time, and lengths ``(demo,)`` int64.
+    """
+    lengths = torch.tensor([len(behaviour) for behaviour in behaviours])
+    longest = int(lengths.max())
+    return torch.cat([_padded(behaviour[None], longest) for behaviour in behaviours]), lengths
+
+
+def _padded(values: Tensor, time: int) -> Tensor:
+    """Pad ``(demo, time, ...)`` with its last time."""
+    last = values[:, -1:].expand(-1, time - values.shape[1], *(-1,) * (values.dim() - 2))
+    return torch.cat((values, last), dim=1)

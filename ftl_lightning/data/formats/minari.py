@@ -1,0 +1,164 @@
+"""Demonstrations as Minari data sets, and back. Needs the extra ``minari``.
+
+An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, one part holds the
+states, and its other vectors are observed features that are known at every time. A demonstration's text is the first ``concept`` in
+the episode's ``infos`` (of its first step, if there is one for each step), the episode's metadata, or the data set's metadata; by
+default, the data set's name.
+
+Metadata of the data set hold what Minari cannot: the domain, names and units of columns, names of features that are known only at
+the start, and provenance. Scenes are ``scene`` in an episode's ``infos``.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import minari
+import numpy as np
+from gymnasium.spaces import Box
+from minari.data_collector import EpisodeBuffer
+from numpy.typing import NDArray
+
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.formats.episodes import Beside, Episode, beside, contents, episodes, expect_names
+from ftl_lightning.data.formats.file_format import Contents
+from ftl_lightning.data.observations import PART, feature_parts, states_part
+from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.services.schema import from_mapping
+
+CONCEPT = "concept"
+"""Key of an episode's text, see this module."""
+SCENE = "scene"
+"""Key of an episode's scene."""
+_HEADER = "ftl_lightning"
+"""Metadata key of attributes that only :func:`write_minari` knows."""
+
+
+def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None) -> Demonstrations:
+    """Read demonstrations of an installed data set; nothing is downloaded.
+
+    Args:
+        name: name such as ``strokes/test-v0``. Minari looks in ``MINARI_DATASETS_PATH``, by default ``~/.minari/datasets``.
+        part: key of the states in dictionaries; empty for ``'observation'`` or the only vector.
+        observed: keys of observed features; ``None`` for all other vectors. Images are read only from data sets of
+            :func:`write_minari`.
+
+    Returns:
+        Demonstrations, padded to the longest episode with the last state. An episode of n steps has n + 1 states.
+
+    Raises:
+        UserError: naming the data set, if it is not installed, damaged or empty, or its observations are no vectors.
+    """
+    with about(name):
+        return Demonstrations(**read_contents(name, part, observed))
+
+
+def read_contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
+    """Read the attributes of demonstrations without validating them. Arguments as in :func:`read_minari`.
+
+    Raises:
+        UserError: naming the data set, if it is foreign, damaged or has other parts.
+    """
+    try:
+        dataset = minari.load_dataset(name)
+        metadata = dataset.storage.metadata
+        with about(name):
+            extra = from_mapping(Beside, metadata.get(_HEADER, {}), _HEADER)
+        written = _HEADER in metadata
+        with about(name):
+            part = states_part(dataset.observation_space, part)
+            features = feature_parts(dataset.observation_space, part, observed, images=written)
+        if observed is not None or part not in ("", PART):
+            extra = extra.of(features, part in ("", PART))
+        texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
+        whole = _text(metadata) or name
+        read = [_read(episode, part, features, text or whole, written) for episode, text in zip(dataset, texts, strict=True)]
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
+        ) from error
+    except (ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
+        message = short(str(error), 100)
+        raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
+    with about(name):
+        attributes = contents(read, extra)
+    return {**attributes, "provenance": attributes["provenance"] or {"minari": name}}
+
+
+def write_minari(demonstrations: Demonstrations, name: str) -> None:
+    """Write a data set for Minari and :func:`read_minari`, with an episode for each demonstration.
+
+    With observed features, an observation is a dictionary: the states as ``'observation'``, and each feature by its name.
+    Demonstrations have no actions: the actions and rewards that Minari requires are 0.
+
+    Args:
+        demonstrations: at least two states each, since n steps have n + 1 observations.
+        name: name of a new data set, such as ``strokes/test-v0``.
+
+    Raises:
+        UserError: naming the data set, if it exists or cannot be written, a demonstration is too short, or the name of an observed
+            feature cannot be a key.
+    """
+    if int(demonstrations.lengths.min()) < 2:
+        raise UserError(f"{name}: expected demonstrations of two states or more, found one of 1, which makes no step")
+    expect_names(demonstrations, PART, name)
+    space: gymnasium.Space[Any] = Box(-np.inf, np.inf, demonstrations.states.shape[2:], np.float32)
+    if demonstrations.observed:
+        parts = {key: _space(feature.kind == "image", feature.shape) for key, feature in demonstrations.features.items()}
+        space = gymnasium.spaces.Dict({PART: space, **parts})
+    try:
+        with warnings.catch_warnings(action="ignore"):  # advice about author, permalink and so on
+            written = minari.create_dataset_from_buffers(
+                name,
+                [_buffer(episode) for episode in episodes(demonstrations)],
+                observation_space=space,
+                action_space=Box(0, 0, (1,), np.float32),
+            )
+            written.storage.update_metadata({_HEADER: beside(demonstrations)})
+    except (ImportError, OSError, ValueError, AttributeError, TypeError) as error:
+        raise UserError(f"{name}: cannot be written as a Minari data set such as strokes/test-v0 ({error})") from error
+
+
+def _space(image: bool, shape: tuple[int, ...]) -> Box:
+    return Box(0, 255, shape, np.uint8) if image else Box(-np.inf, np.inf, shape, np.float32)
+
+
+def _buffer(episode: Episode) -> EpisodeBuffer:
+    times = len(episode.states)
+    steps = times - 1
+    scene = {} if episode.scene is None else {SCENE: [episode.scene] * times}
+    return EpisodeBuffer(
+        observations={PART: list(episode.states), **{key: list(values) for key, values in episode.observed.items()}}
+        if episode.observed
+        else list(episode.states),
+        actions=list(np.zeros((steps, 1), np.float32)),
+        rewards=[0.0] * steps,
+        terminations=[False] * steps,
+        truncations=[False] * (steps - 1) + [True],
+        infos={CONCEPT: [episode.concept] * times, **scene},
+    )
+
+
+def _read(episode: Any, part: str, features: Sequence[str], text: str, written: bool) -> Episode:
+    observations = episode.observations
+    states = np.asarray(observations[part] if part else observations, dtype=np.float32)
+    infos = episode.infos or {}
+    return Episode(
+        states.reshape(len(states), -1),
+        {key: _numbers(observations[key]) for key in features},
+        _text(infos) or text,
+        np.asarray(infos[SCENE], dtype=np.float32)[0] if written and SCENE in infos else None,
+    )
+
+
+def _numbers(values: Any) -> NDArray[Any]:
+    array = np.asarray(values)
+    return array if array.dtype == np.uint8 else array.astype(np.float32)
+
+
+def _text(where: Mapping[str, Any] | None) -> str:
+    """Text of the concept, or the first of several; empty if there is none."""
+    texts = np.ravel((where or {}).get(CONCEPT, ""))
+    first = texts[0] if len(texts) else ""
+    return first.decode("utf-8") if isinstance(first, bytes) else str(first)

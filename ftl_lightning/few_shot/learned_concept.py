@@ -1,0 +1,177 @@
+"""Learned concepts of the Python API."""
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.few_shot.shared_concept import write_folder
+from ftl_lightning.few_shot.tuned import ModelSettings
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.explanation import Explanation, explain
+from ftl_lightning.services.arguments import expect_whole
+from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.hub import upload
+from ftl_lightning.training.library import kept_file
+from ftl_lightning.training.quality import Inspection, inspected
+
+
+@dataclass(frozen=True)
+class Learning:
+    """State of learning, for callbacks.
+
+    Attributes:
+        step: number of completed steps.
+        loss: mean loss of the last step.
+        so_far: returns the current concept, of one set of embeddings whatever the final form.
+    """
+
+    step: int
+    loss: float
+    so_far: Callable[[], "LearnedConcept"]
+
+
+@dataclass(frozen=True, repr=False)
+class LearnedConcept(Composition):
+    """A learned concept, which composes like any composition.
+
+    Attributes:
+        concept: embeddings, weights and origin.
+        model: the concept's model.
+        tuned: the model's settings, for sampling its film.
+        known_as: public name of the model: a shipped model or ``'owner/name'`` on the Hub; empty without one.
+        demonstrations: its demonstrations, if it was learned in this process.
+        judging: domain that judges its samples, if it was learned in this process.
+    """
+
+    concept: Concept
+    model: ConceptModel
+    tuned: ModelSettings
+    known_as: str = ""
+    demonstrations: Demonstrations | None = None
+    judging: Domain | None = None
+
+    def _words(self) -> Iterator[str]:
+        return self.concept._words()
+
+    @functools.cached_property
+    def quality(self) -> Inspection:
+        """Quality of samples relative to the demonstrations: success rate, spread, novelty, roughness, and a figure.
+
+        Raises:
+            UserError: for a concept that was not learned in this process from two demonstrations or more.
+        """
+        if self.demonstrations is None or self.judging is None or len(self.demonstrations) < 2:
+            raise UserError("quality: expected a concept that was learned here from two demonstrations or more, found another")
+        return inspected(self.model, self.judging, self.demonstrations, self.concept, 0)
+
+    def explain(self, nearest: int = 3) -> Explanation:
+        """Explain the weighted sum, averaged over knots, by training concepts.
+
+        Args:
+            nearest: number of nearest training concepts, 1 or more.
+
+        Raises:
+            UserError: for another number.
+        """
+        expect_whole("nearest", nearest, 1)
+        embedding = self.concept.weighted_sum.mean(dim=0)
+        return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
+
+    def save(self, path: str | Path, quality: bool = False) -> None:
+        """Write the concept to a file that every command reads.
+
+        Args:
+            path: path of the file.
+            quality: also write :attr:`quality`, with the success rate, for libraries. It is an additional key of the file's header,
+                which older versions ignore; without it the file has the bytes that ``invert`` writes.
+
+        Raises:
+            UserError: if ``quality`` is requested and cannot be measured.
+        """
+        (replace(self.concept, quality=self.quality.record) if quality else self.concept).save(path)
+
+    def keep(self) -> Path:
+        """Save the concept to your library, with its quality if measurable, so that compositions find it by name.
+
+        An earlier concept of the same name and model is replaced.
+
+        Returns:
+            The file.
+        """
+        path = kept_file(self.model.hash, self.concept.origin.name)
+        self._judged.save(path)
+        return path
+
+    @property
+    def _judged(self) -> Concept:
+        """The concept with its quality, if measurable."""
+        measurable = self.demonstrations is not None and self.judging is not None and len(self.demonstrations) > 1
+        return replace(self.concept, quality=self.quality.record) if measurable else self.concept
+
+    def save_pretrained(self, folder: str | Path, demonstrations: bool = False) -> None:
+        """Write a folder to share: ``concept.safetensors`` with its quality, a film or picture of new samples, and a
+        ``README.md`` unless it exists.
+
+        Args:
+            folder: folder to write.
+            demonstrations: also write ``demonstrations.safetensors``; otherwise demonstrations stay private.
+
+        Raises:
+            UserError: if demonstrations are requested for a concept that was not learned in this process.
+        """
+        if demonstrations and self.demonstrations is None:
+            raise UserError("demonstrations: expected a concept that was learned here, found one from a file; leave them out")
+        shared = self.demonstrations if demonstrations else None
+        write_folder(Path(folder), self.model, self._judged, self.tuned, self.known_as, shared)
+
+    def push_to_hub(self, repository: str, private: bool = False, demonstrations: bool = False) -> str:
+        """Upload the folder of :meth:`save_pretrained` to the Hugging Face Hub as ``owner/name``; needs a network and a login.
+
+        Args:
+            repository: name of the repository.
+            private: whether a new repository is private.
+            demonstrations: also upload the demonstrations.
+
+        Returns:
+            The address.
+
+        Raises:
+            UserError: for an invalid name or a failed upload.
+        """
+        return upload(lambda folder: self.save_pretrained(folder, demonstrations), repository, private)
+
+
+def concept_of(model: ConceptModel, space: str, call: str, concept: object) -> Composition:
+    """Check a concept and move it to the model's device.
+
+    Args:
+        model: the model.
+        space: concept space of the model, see :func:`~ftl_lightning.igm.composition.space_of`.
+        call: name of the called method, such as ``'sample'``.
+        concept: argument of the method.
+
+    Raises:
+        UserError: for another model's concept, or another object.
+    """
+    if not isinstance(concept, Composition):
+        text = short(model.config.training_concepts[0], 40)
+        raise UserError(
+            f"{call}: expected a concept, such as model[{text!r}], model.compose(text), model.load(path) or what model.learn "
+            f"returns, found {shown(concept)}"
+        )
+    if concept.space not in ("", space):
+        raise UserError(
+            f"{call}: expected a concept of this model, {space}, found one of {concept.space}; learn it with this model"
+        )
+    n = model.config.concept_dim
+    if concept.embeddings.dim() != 3 or concept.embeddings.shape[2] != n:
+        raise UserError(
+            f"{call}: expected a concept of this model, {space}, with embeddings (K, knots, {n}), "
+            f"found {tuple(concept.embeddings.shape)}"
+        )
+    return concept if concept.weights.device == model.device else concept.to(model.device)

@@ -1,0 +1,215 @@
+"""Folder of a shared concept: its file, a card, and a film or picture of samples.
+
+Only the concept's file is read, as numbers and texts. The card is for people; if a concept belongs to another model, the card's
+name of that model is shown as text.
+"""
+
+import io
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import InitialStates, moved
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.evaluation.animation import captioned, gif
+from ftl_lightning.evaluation.execution import episodes
+from ftl_lightning.few_shot.tuned import ModelSettings
+from ftl_lightning.igm.composition import Composition, space_of
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.summary import summary
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.escape import markdown
+from ftl_lightning.services.limits import read_text
+from ftl_lightning.services.printing import line
+from ftl_lightning.services.representation import counted
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.services.tensor_file import atomic, write_text
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.library import CONCEPT
+
+CARD, FILM, PICTURE, DEMONSTRATIONS = "README.md", "film.gif", "picture.png", "demonstrations.safetensors"
+MOST_BYTES = 1_000_000
+"""Maximum size of a film or picture in bytes."""
+MOST_CARD = 64 * 2**10
+"""Maximum size of a card in bytes."""
+SAMPLES = 8
+"""Number of samples in a picture."""
+_MODEL = re.compile(r'^  model: "([^"\n]{1,200})"$', re.MULTILINE)
+
+
+def write_folder(
+    folder: Path,
+    model: ConceptModel,
+    concept: Concept,
+    tuned: ModelSettings,
+    known_as: str = "",
+    demonstrations: Demonstrations | None = None,
+) -> None:
+    """Write the folder of a concept; an existing card is kept.
+
+    Args:
+        folder: folder to write.
+        model: the concept's model.
+        concept: learned concept.
+        tuned: settings of sampling.
+        known_as: public name of the model; empty without one.
+        demonstrations: demonstrations to include; ``None`` for none.
+    """
+    concept.save(folder / CONCEPT)
+    shown = _film(model, concept, tuned)
+    if shown is not None:
+        name, content = shown
+        with atomic(folder / name) as temporary:
+            temporary.write_bytes(content)
+    if demonstrations is not None:
+        demonstrations.save(folder / DEMONSTRATIONS)
+    if not (folder / CARD).is_file():
+        write_text(folder / CARD, card(folder / CONCEPT, known_as, shown[0] if shown else "", demonstrations is not None))
+
+
+def read_folder(folder: Path, name: str, space: str) -> Concept:
+    """Read the concept of a shared folder.
+
+    Args:
+        folder: local or downloaded folder.
+        name: name given by the user, for messages.
+        space: concept space of the model, see :func:`~ftl_lightning.igm.composition.space_of`.
+
+    Raises:
+        UserError: without a concept, or for another model's concept, with that model.
+    """
+    concept = Concept.load(folder / CONCEPT)
+    if (owner := space_of(concept.origin.domain, concept.origin.pretrained)) != space:
+        called = _model_of(folder / CARD)
+        label = f", which its card calls {called!r}" if called else ""
+        raise UserError(
+            f"{short(name, 80)}: expected a concept of this model, {space}, found one of {short(owner, 60)}{label}; load that model"
+        )
+    return concept
+
+
+def _model_of(path: Path) -> str:
+    """A card's name of the concept's model; empty for an invalid card."""
+    try:
+        match = _MODEL.search(read_text(path, "Markdown", MOST_CARD).partition("\n---")[0])
+    except UserError:
+        return ""
+    return "" if match is None else short(line(match[1]), 60)
+
+
+def card(path: Path, known_as: str, shown: str, with_demonstrations: bool) -> str:
+    """Card with the Hub's metadata.
+
+    Args:
+        path: the concept's file.
+        known_as: public name of the model; empty without one.
+        shown: file name of the film or picture; empty for none.
+        with_demonstrations: whether the folder includes demonstrations.
+
+    Raises:
+        UserError: for a file that is not a concept.
+    """
+    content = summary(path)
+    if content is None:
+        raise UserError(f"{path}: expected a concept file, found another one")
+    origin, quality, model = content.origin, content.quality, known_as or "FOLDER OR NAME OF THE MODEL"
+    keys = {"concept": origin.name, **({"model": known_as} if known_as else {}), "hash": origin.pretrained, "domain": origin.domain}
+    # JSON strings are valid YAML; ``line`` has replaced unprintable characters, which YAML refuses.
+    quoted = {key: json.dumps(line(value), ensure_ascii=False) for key, value in keys.items()}
+    metadata = "".join(f"  {key}: {value}\n" for key, value in quoted.items())
+    base = f"base_model: {quoted['model']}\n" if known_as.count("/") == 1 else ""  # on the Hub, which refuses other names
+    rows = {
+        "model": f"{f'{known_as}, ' if known_as else ''}domain {origin.domain}, hash {origin.pretrained}; it works with no other",
+        "learned from": f"{counted(origin.count, 'demonstration')} (hash {origin.demonstrations})",
+        "form": f"{content.form}; {origin.weights} guidance weights; loss {origin.loss:.4f}",
+        "quality": "not measured",
+    }
+    if quality is not None:
+        right = "" if quality.right is None else f"{quality.metric} {quality.right:.2f}, "
+        numbers = ", ".join(f"{name} {getattr(quality, name):.2f}" for name in ("spread", "novelty", "roughness"))
+        rows["quality"] = f"{right}{numbers} ({counted(quality.samples, 'sample')}, started like the demonstrations)"
+    files = {CONCEPT: "the concept, numbers and texts alone", shown: "what it generates"}
+    files |= {DEMONSTRATIONS: "what it was learned from"} if with_demonstrations else {}
+    listed = "\n".join(f"- `{name}`: {what}" for name, what in files.items() if name)
+    table = "\n".join(f"| {key} | {markdown(value)} |" for key, value in rows.items())
+    return (
+        "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning, learned-concept]\n"
+        f"{base}ftl_lightning:\n{metadata}---\n# {markdown(origin.name)}\n\n"
+        "A concept that was learned from a few demonstrations through a generative model.\n\n"
+        f"{f'![what it generates]({shown})' if shown else ''}\n\n| | |\n|---|---|\n{table}\n\n"
+        "    from ftl_lightning import FewShot\n"
+        f"    model = FewShot.from_pretrained({json.dumps(line(model))})\n"
+        '    concept = model.load("FOLDER OR NAME")\n\n'
+        f"{listed}\n"
+    )
+
+
+def _film(model: ConceptModel, concept: Concept, tuned: ModelSettings) -> tuple[str, bytes] | None:
+    """File name and content of a film or picture of samples; ``None`` without initial states.
+
+    Initial states are new, so that no demonstration is shown.
+    """
+    domain, name = model.domain, concept.origin.name
+    starts = _starts(domain, name, SAMPLES)
+    if domain.observed and starts is None:
+        return None
+    composition = concept.composition.to(model.device)
+    if (frames := _frames(model, composition, tuned, starts)) and (content := small(captioned(frames, name))):
+        return FILM, content
+    plans = _plans(model, composition, tuned, starts, SAMPLES)
+    figure = domain.show.picture(plans, None, name, starts if domain.observed else None)
+    for dpi in (110, 80, 50):
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=dpi)
+        if len(file.getvalue()) <= MOST_BYTES:
+            return PICTURE, file.getvalue()
+    return None
+
+
+def _frames(
+    model: ConceptModel, concept: Composition, tuned: ModelSettings, starts: InitialStates | None
+) -> list[NDArray[np.uint8]]:
+    """Frames of a plan, or else of an episode; empty without films or the simulator."""
+    domain, loop = model.domain, model.domain.closed_loop
+    if domain.show.film is not None:
+        return domain.show.film(_plans(model, concept, tuned, starts, 1)[0])
+    if loop is None or loop.film is None or starts is None or starts.scenes is None:
+        return []
+    try:
+        loop.expect()
+        rollout, followed = episodes(model, loop, concept, starts.take([0]), tuned.sampling, tuned.replan, 0)
+        return loop.film(rollout, torch.stack(list(followed[0]))) if followed.get(0) else []
+    except UserError:  # a picture needs no simulator
+        return []
+
+
+def _plans(
+    model: ConceptModel, concept: Composition, tuned: ModelSettings, starts: InitialStates | None, count: int
+) -> torch.Tensor:
+    seen = {} if starts is None else moved(starts.take(slice(0, count)).observed, model.device)
+    return model.sample([concept], count, tuned.sampling, [generator("cpu", 0)], seen)[0].cpu()
+
+
+def _starts(domain: Domain, name: str, count: int) -> InitialStates | None:
+    """New initial states of a task, or of the first training concept if the domain cannot read the name."""
+    if not domain.observed:
+        return None
+    task = next((text for text in (name, *domain.concepts.training) if domain.concepts.reads(text)), "")
+    try:
+        return domain.source(None).starts(task, count, 0)
+    except (UserError, KeyError, ValueError, IndexError):  # a third-party source
+        return None
+
+
+def small(frames: Sequence[NDArray[np.uint8]]) -> bytes:
+    """Animation of at most :data:`MOST_BYTES`, with fewer frames and colours if necessary; empty if it cannot fit."""
+    for each, colours in ((1, 64), (2, 64), (4, 32), (8, 16)):
+        if len(content := gif(frames[::each], colours=colours)) <= MOST_BYTES:
+            return content
+    return b""

@@ -1,0 +1,308 @@
+"""A learned concept and its file."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.igm.adapter import LowRank
+from ftl_lightning.igm.composition import Composition, space_of
+from ftl_lightning.igm.modes import STRETCH, Modes
+from ftl_lightning.igm.point import Part
+from ftl_lightning.services.errors import UserError, about, short, shown
+from ftl_lightning.services.ranges import LARGEST_FACTOR, expect_factor, expect_range
+from ftl_lightning.services.representation import Shown, counted, numbers
+from ftl_lightning.services.schema import expect_type, from_mapping
+from ftl_lightning.services.shipped import shipped
+from ftl_lightning.services.tensor_file import expect_finite, load_tensors, save_tensors
+
+KIND = "concept"
+VERSION = 5
+"""Version of the file format."""
+MODES = ("mode_embeddings", "mode_weights")
+"""Tensors of the modes, with the header's key ``mixed``; only in files of concepts with modes."""
+COMPOSING = ("composing_embeddings", "composing_weights")
+"""Tensors that replace all others when composing; only in files of concepts with such a set."""
+ADAPTER = "adapter/"
+"""Prefix of the tensors of an adapter."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Provenance of a concept.
+
+    Attributes:
+        name: name of the task.
+        domain: name of the domain.
+        encoder: identity of the model's text encoder.
+        pretrained: hash of the pretrained model.
+        demonstrations: hash of the demonstrations.
+        count: number of demonstrations.
+        weights: ``'fixed'`` or ``'learned'``.
+        loss: final composed denoising loss on the demonstrations.
+    """
+
+    name: str
+    domain: str
+    encoder: str
+    pretrained: str
+    demonstrations: str
+    count: int
+    weights: str
+    loss: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Selection of a concept's form, see :mod:`ftl_lightning.training.forms`.
+
+    Attributes:
+        form: name of the form.
+        because: reason, as a sentence.
+        numbers: measurements by name.
+    """
+
+    form: str
+    because: str
+    numbers: Mapping[str, float]
+
+    def __str__(self) -> str:
+        return f"{self.form}: {self.because}"
+
+
+@dataclass(frozen=True)
+class QualityRecord:
+    """Quality of a concept's samples, see :mod:`ftl_lightning.training.quality`.
+
+    Attributes:
+        samples: number of evaluated samples.
+        novelty, spread, roughness: relative to the demonstrations, 0 or more.
+        metric: name of the domain's success metric; empty without such a metric.
+        right: share of right samples by ``metric``, 0 to 1; ``None`` without a metric.
+
+    Raises:
+        UserError: at construction, for a value out of range.
+    """
+
+    samples: int
+    novelty: float
+    spread: float
+    roughness: float
+    metric: str = ""
+    right: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("novelty", "spread", "roughness"):
+            expect_range(f"key 'quality.{name}'", getattr(self, name), 0)
+        if self.right is not None:
+            expect_range("key 'quality.right'", self.right, 0, 1)
+
+
+@dataclass(frozen=True, repr=False)
+class Concept(Shown):
+    """K embeddings and their guidance weights.
+
+    Attributes:
+        embeddings: ``(K, knots, n)`` float32 in the pretrained model's concept space. Each component has a single embedding (the
+            paper's form) or several at evenly spaced times of the plan.
+        weights: ``(K,)`` float32, omega.
+        origin: provenance.
+        modes: several sets of embeddings for sampling the concept alone; ``None`` for the paper's form. Composing uses
+            ``embeddings``, unless the concept has several knots.
+        adapter: low-rank change of the denoiser; ``None`` for the paper's form.
+        choice: how the form was selected; ``None`` if the user set it.
+        composing: embeddings ``(K, knots, n)`` and weights ``(K,)`` that replace all others, and the adapter, when composing;
+            ``None`` to compose the concept as it is alone.
+        quality: quality of the samples; ``None`` if not measured. Optional key of the file's header.
+
+    Raises:
+        UserError: at construction, for wrong shapes or dtypes.
+    """
+
+    embeddings: Tensor
+    weights: Tensor
+    origin: Origin
+    modes: Modes | None = None
+    adapter: LowRank | None = None
+    choice: Choice | None = None
+    composing: tuple[Tensor, Tensor] | None = None
+    quality: QualityRecord | None = None
+
+    def __post_init__(self) -> None:
+        _expect_shapes(self._sets)
+
+    @property
+    def _sets(self) -> dict[str, Tensor]:
+        """Embeddings and weights by tensor name."""
+        sets = {"embeddings": self.embeddings, "weights": self.weights}
+        if self.modes is not None:
+            sets |= dict(zip(MODES, (self.modes.embeddings, self.modes.weights), strict=True))
+        if self.composing is not None:
+            sets |= dict(zip(COMPOSING, self.composing, strict=True))
+        return sets
+
+    @property
+    def knots(self) -> int:
+        """Number of embeddings per component, at evenly spaced times of the plan; 1 is the paper's form."""
+        return self.embeddings.shape[1]
+
+    def _words(self) -> Iterator[str]:
+        yield repr(self.origin.name)
+        yield f"K = {len(self.weights)}"
+        if self.knots > 1:
+            yield counted(self.knots, "knot")
+        if self.modes is not None:
+            yield f"{counted(len(self.modes), 'mode')}{', mixed' if self.modes.mixed else ''}"
+        if self.adapter is not None:
+            yield "an adapter"
+        yield f"loss {self.origin.loss:.3f}"
+        yield f"weights {numbers(self.weights.tolist())}"
+        yield f"from {counted(self.origin.count, 'demonstration')}"
+        yield f"of {space_of(self.origin.domain, self.origin.pretrained)}"
+
+    @property
+    def composition(self) -> Composition:
+        """The concept as a composition, to sample alone or to compose."""
+        space = space_of(self.origin.domain, self.origin.pretrained)
+        plain = Composition(self.embeddings, self.weights, modes=self.modes, space=space)
+        if self.adapter is not None:
+            plain = replace(plain, adapters=(self.adapter,), adapter=torch.ones(len(self.weights), dtype=torch.int64))
+        return plain if self.composing is None else Composition(*self.composing, alone=plain, space=space)
+
+    def component(self, number: int) -> Composition:
+        """A single component; ``number`` counts from 1."""
+        rows = slice(number - 1, number)
+        component = replace(self, embeddings=self.embeddings[rows], weights=self.weights[rows], modes=None, composing=None)
+        return component.composition
+
+    def parts(self) -> dict[str, Part]:
+        """All knots of all components, including those of the modes, by name."""
+        sets: list[tuple[int | None, Tensor, Tensor]] = [(None, self.weights, self.embeddings)]
+        if self.modes is not None:
+            modes = zip(self.modes.weights, self.modes.embeddings, strict=True)
+            sets += [(number, weights, embeddings) for number, (weights, embeddings) in enumerate(modes, start=1)]
+        parts = [
+            Part(weight, embedding, number, mode, knot if self.knots > 1 else None)
+            for mode, weights, embeddings in sets
+            for number, (weight, component) in enumerate(zip(weights.tolist(), embeddings, strict=True), start=1)
+            for knot, embedding in enumerate(component, start=1)
+        ]
+        return {part.name: part for part in parts}
+
+    @property
+    def weighted_sum(self) -> Tensor:
+        """Weighted sum of the components ``(knots, n)``."""
+        return (self.weights @ self.embeddings.flatten(1)).unflatten(0, self.embeddings.shape[1:])
+
+    def at_knots(self, component: Tensor) -> dict[str, Tensor]:
+        """Embeddings ``(n,)`` of a component ``(knots, n)`` by name suffix: empty for a single knot, else ', knot 3'."""
+        return {"" if self.knots == 1 else f", knot {knot}": embedding for knot, embedding in enumerate(component, start=1)}
+
+    def expect_finite(self, where: str) -> None:
+        """Check that all tensors and the loss are finite and the tensors not too large.
+
+        Raises:
+            UserError: naming ``where`` and the first offending value.
+        """
+        expect_finite(self.numbers, where, "lower model.budget.learning_rate")
+        for name, value in self.numbers.items():
+            if name != "loss" and value.numel() and not value.abs().max() <= LARGEST_FACTOR:
+                raise UserError(f"{where}: expected numbers up to {LARGEST_FACTOR:g}, found larger ones in {short(name)!r}")
+
+    @property
+    def numbers(self) -> dict[str, Tensor]:
+        """Loss and all tensors by name."""
+        factors = {} if self.adapter is None else self.adapter.tensors()
+        return {"loss": torch.tensor(float(self.origin.loss)), **self._sets, **factors}
+
+    def save(self, path: str | Path) -> None:
+        """Write a safetensors file with a JSON header.
+
+        Args:
+            path: output file, written atomically.
+
+        Raises:
+            UserError: for non-finite or too large values.
+        """
+        self.expect_finite(str(path))
+        header = {**asdict(self.origin), "components": len(self.weights)}
+        if self.modes is not None:
+            header |= {"mixed": self.modes.mixed}
+            header |= {} if self.modes.stretch == STRETCH else {"stretch": self.modes.stretch}
+        if self.choice is not None:
+            header |= {"choice": asdict(self.choice)}
+        if self.quality is not None:
+            header |= {"quality": asdict(self.quality)}
+        if self.adapter is not None and self.adapter.everywhere:
+            header |= {"everywhere": True}
+        factors = {} if self.adapter is None else self.adapter.tensors()
+        tensors = {**self._sets, **{f"{ADAPTER}{name}": factor for name, factor in factors.items()}}
+        save_tensors(path, KIND, {name: values.contiguous() for name, values in tensors.items()}, header, VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a concept.
+
+        Args:
+            path: input file; ``pretrained/...`` is searched in the current folder, then among the shipped files.
+
+        Raises:
+            UserError: for a file that is missing, damaged or not a concept.
+        """
+        tensors, header = load_tensors(shipped(path), KIND, VERSION)
+        several, composed = "mixed" in header, COMPOSING[0] in tensors
+        names = ["embeddings", "weights", *(MODES if several else ()), *(COMPOSING if composed else ())]
+        keys = [field.name for field in fields(Origin)]
+        missing = [key for key in keys if key not in header] + [name for name in names if name not in tensors]
+        with about(path):
+            if missing:
+                raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")
+            factors = {name.removeprefix(ADAPTER): values for name, values in tensors.items() if name.startswith(ADAPTER)}
+            if unknown := set(tensors) - set(names) - {f"{ADAPTER}{name}" for name in factors}:
+                raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
+            _expect_shapes({name: tensors[name] for name in names})
+            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere")
+            adapter = LowRank.from_tensors(factors, everywhere) if factors else None
+            mixed = expect_type(header.get("mixed", False), bool, "mixed")
+            stretch = expect_type(header.get("stretch", STRETCH), float, "stretch")
+            expect_factor("key 'stretch'", stretch, 0)
+            modes = Modes(tensors[MODES[0]], tensors[MODES[1]], mixed, stretch) if several else None
+            origin = from_mapping(Origin, {key: header[key] for key in keys}, "")
+            choice = from_mapping(Choice, header["choice"], "choice") if header.get("choice") else None
+            composing = (tensors[COMPOSING[0]], tensors[COMPOSING[1]]) if composed else None
+            quality = from_mapping(QualityRecord, header["quality"], "quality") if header.get("quality") is not None else None
+            concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality)
+            if header.get("components", len(concept.weights)) != len(concept.weights):
+                raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
+            concept.expect_finite("content")
+            return concept
+
+
+def file_name(concept: str) -> str:
+    """File name of a concept: letters, digits and dots are kept, all else becomes underscores."""
+    return "".join(letter if letter.isalnum() or letter == "." else "_" for letter in concept)
+
+
+def _expect_shapes(tensors: Mapping[str, Tensor]) -> None:
+    """Check that the tensors of a concept are float32 with consistent shapes.
+
+    Args:
+        tensors: ``embeddings`` ``(K, knots, n)``, ``weights`` ``(K,)``; optionally :data:`MODES` and :data:`COMPOSING`.
+
+    Raises:
+        UserError: naming the first tensor with a wrong shape or dtype.
+    """
+    shape = tuple(tensors["embeddings"].shape)
+    if len(shape) != 3 or not all(shape):
+        raise UserError(f"key 'embeddings': expected shape (K, knots, n), found {shape}")
+    modes = max((*tensors.get("mode_embeddings", torch.empty(0)).shape, 0)[0], 1)
+    composing = (*tuple(tensors.get(COMPOSING[1], tensors["weights"]).shape)[:1], *shape[1:])
+    expected = {"embeddings": shape, "weights": shape[:1], "mode_embeddings": (modes, *shape), "mode_weights": (modes, shape[0])}
+    expected |= {COMPOSING[0]: composing, COMPOSING[1]: composing[:1]}
+    for name, values in tensors.items():
+        if values.shape != expected[name] or values.dtype != torch.float32:
+            actual = f"{str(values.dtype).removeprefix('torch.')} of shape {tuple(values.shape)}"
+            raise UserError(f"key {name!r}: expected float32 of shape {expected[name]}, found {actual}")

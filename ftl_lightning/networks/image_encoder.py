@@ -1,0 +1,284 @@
+"""Image encoders, trained jointly with the rest of the network."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ftl_lightning.data.features import Feature, Observed
+from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.processes import drawn
+from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.schema import from_mapping
+
+MOST_POINTS = 1000
+MOST_PIXELS = 100_000_000
+"""Maximum number of values of an image."""
+GROUPS = 8
+"""Groups of group normalisation. It replaces batch normalisation, whose statistics a running average of the weights omits (Chi et
+al., 2023)."""
+STRIDES = (2, 4)
+RESNET18 = "resnet18"
+NETWORKS = ("small", RESNET18)
+KEYPOINTS, POINTS, GRID = HEADS = ("keypoints", "points", "grid")
+POINT = 4
+"""Values per point: x, y, height, and the visibility logit."""
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions with group normalisation (He et al., 2016).
+
+    Args:
+        inputs, outputs: channels.
+        stride: stride of the first convolution.
+    """
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        self.norms = nn.ModuleList(nn.GroupNorm(GROUPS, outputs) for _ in range(2))
+        self.skip = nn.Conv2d(inputs, outputs, 1, stride, bias=False) if stride > 1 or inputs != outputs else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, inputs, height, width)`` to ``(batch, outputs, height / stride, width / stride)``."""
+        hidden = functional.relu(self.norms[0](self.first(x)))
+        out: Tensor = functional.relu(self.norms[1](self.second(hidden)) + self.skip(x))
+        return out
+
+
+class SpatialSoftmax(nn.Module):
+    """Spatial softmax: position and value of the maximum of each channel (Levine et al., 2016).
+
+    Args:
+        channels: channels of the feature map.
+        keypoints: number of keypoints.
+    """
+
+    def __init__(self, channels: int, keypoints: int) -> None:
+        super().__init__()
+        self.maps = nn.Conv2d(channels, keypoints, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to column, row (-1 to 1) and height of each keypoint ``(batch, 3 * keypoints)``."""
+        height, width = x.shape[2:]
+        rows, columns = (torch.linspace(-1, 1, side, device=x.device) for side in (height, width))
+        grid = torch.stack((columns.repeat(height), rows.repeat_interleave(width)), dim=-1)
+        maps = self.maps(x).flatten(2)
+        share = maps.softmax(dim=-1)
+        column, row = (share @ grid).unbind(dim=-1)  # a single product: sums over large maps dominate the time
+        return torch.cat((column, row, (share * maps).sum(dim=-1).tanh()), dim=-1)
+
+
+class Points(nn.Module):
+    """Locations of objects from all keypoints; pretraining defines the objects (``model.privileged``).
+
+    Args:
+        channels: channels of the feature map.
+        keypoints: number of keypoints.
+        points: number of objects.
+    """
+
+    def __init__(self, channels: int, keypoints: int, points: int) -> None:
+        super().__init__()
+        self.keypoints = SpatialSoftmax(channels, keypoints)
+        self.read = nn.Linear(3 * keypoints, POINT * points)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to x, y, height and visibility logit, all x first: ``(batch, 4 * points)``."""
+        out: Tensor = self.read(self.keypoints(x))
+        return out
+
+
+class Grid(nn.Module):
+    """Flattened feature map with fewer channels.
+
+    Args:
+        channels: channels of the feature map.
+        kept: channels of the output.
+        height, width: size of the feature map.
+    """
+
+    def __init__(self, channels: int, kept: int, height: int, width: int) -> None:
+        super().__init__()
+        self.kept = nn.Conv2d(channels, kept, 1)
+        self.size = kept * height * width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` to ``(batch, size)``."""
+        out: Tensor = self.kept(x).flatten(1)
+        return out
+
+
+def _small(channels: int, widths: Sequence[int], stride: int, height: int, width: int) -> tuple[nn.Module, tuple[int, int, int]]:
+    """Build a residual network and compute the shape of its feature map, which is smaller by ``stride`` in each direction.
+
+    The first convolution does all downsampling: in deeper stems, convolutions at high resolution dominate the time.
+    """
+    first = nn.Conv2d(channels, widths[0], 2 * stride, stride, padding=stride // 2, bias=False)
+    blocks = [ResidualBlock(before, after, 1) for before, after in itertools.pairwise(widths)]
+    height, width = ((side + 2 * (stride // 2) - 2 * stride) // stride + 1 for side in (height, width))
+    return nn.Sequential(first, nn.GroupNorm(GROUPS, widths[0]), nn.ReLU(), *blocks), (widths[-1], height, width)
+
+
+class _ResNet18(nn.Module):
+    """ResNet-18 of ``transformers``, from scratch, with group normalisation."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        from transformers import ResNetConfig, ResNetModel  # slow import, not needed for the small network
+
+        sizes = [64, 128, 256, 512]
+        self.network = ResNetModel(
+            ResNetConfig(num_channels=channels, embedding_size=64, hidden_sizes=sizes, depths=[2] * 4, layer_type="basic")
+        )
+        for module in list(self.network.modules()):
+            for name, child in module.named_children():
+                if isinstance(child, nn.BatchNorm2d):
+                    setattr(module, name, nn.GroupNorm(GROUPS, child.num_features))
+        self.network.pooler = nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.network(x).last_hidden_state
+        return out
+
+
+class ImageEncoder(nn.Module):
+    """Image encoder, trained from scratch: a residual network with group normalisation and a head.
+
+    Args:
+        shape: image shape ``(channels, height, width)``.
+        network: ``'small'``, or ``'resnet18'`` (11 million weights).
+        widths: channels of the small network's first convolution and of its residual blocks, multiples of 8.
+        stride: stride of the small network's first convolution and so of its feature map, 2 or 4; 2 localises more precisely.
+        head: ``'keypoints'`` (spatial softmax), ``'points'`` (locations of objects that pretraining defines) or ``'grid'`` (all of
+            the last feature map, for the small map of ResNet-18).
+        keypoints: number of keypoints; of the grid, number of channels.
+        points: number of objects, for ``'points'``.
+        crop: pixels removed from each side length: random crop in training, centre crop otherwise; 0 for none.
+        origin: name of an observed vector, the origin of keypoints or points, such as the position of a hand. Column and row
+            (-1 to 1) in the image for keypoints, x and y for points. Empty for the image centre.
+
+    Raises:
+        UserError: for an invalid value.
+    """
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        network: str = "small",
+        widths: Sequence[int] = (32,),
+        stride: int = 4,
+        head: str = "keypoints",
+        keypoints: int = 32,
+        points: int = 0,
+        crop: int = 0,
+        origin: str = "",
+    ) -> None:
+        super().__init__()
+        for name, value, known in (("network", network, NETWORKS), ("head", head, HEADS)):
+            if value not in known:
+                raise UserError(f"model.image_encoder.{name}: expected one of {', '.join(known)}, found {value!r}")
+        if not widths or any(width < GROUPS or width % GROUPS for width in widths):
+            raise UserError(f"model.image_encoder.widths: expected multiples of {GROUPS}, found {list(widths)}")
+        if stride not in STRIDES:
+            raise UserError(f"model.image_encoder.stride: expected one of {', '.join(map(str, STRIDES))}, found {stride!r}")
+        if len(shape) != 3 or not 0 < math.prod(shape) <= MOST_PIXELS:
+            raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {shown(tuple(shape))}")
+        channels, height, width = shape
+        expect_range("model.image_encoder.keypoints", keypoints, 1)
+        expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
+        if (points > 0) != (head == POINTS):
+            raise UserError(
+                f"model.image_encoder.points: expected {'1 or more' if head == POINTS else 0} for {head}, found {points}"
+            )
+        expect_range("model.image_encoder.points", points, 0, MOST_POINTS)
+        if origin and head == GRID:
+            raise UserError(f"model.image_encoder.origin: expected none for a head without keypoints, found {origin!r}")
+        self.crop, self.origin = crop, origin
+        height, width = height - crop, width - crop
+        if network == "small" and min(height, width) < 2 * stride:
+            raise UserError(
+                f"model.image_encoder.crop: expected images of {2 * stride} x {2 * stride} or more for the small network, "
+                f"found {height} x {width}"
+            )
+        if network == RESNET18:
+            self.network: nn.Module = _ResNet18(channels)
+            size = (512, -(-height // 32), -(-width // 32))
+        else:
+            self.network, size = _small(channels, widths, stride, height, width)
+        if head == KEYPOINTS:
+            self.head: nn.Module = SpatialSoftmax(size[0], keypoints)
+            self.size = 3 * keypoints
+        elif head == POINTS:
+            self.head, self.size = Points(size[0], keypoints, points), POINT * points
+        else:
+            grid = Grid(size[0], keypoints, *size[1:])
+            self.head, self.size = grid, grid.size
+        """Number of features."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """``(batch, channels, height, width)`` uint8 to ``(batch, size)``, keypoints relative to the image centre."""
+        height, width = (side - self.crop for side in images.shape[2:])
+        if self.crop and self.training:
+            corners = drawn(len(images), lambda n: torch.randint(self.crop + 1, (2, n, 1), device=images.device).movedim(1, 0))
+            top, left = corners.unbind(dim=1)
+            rows, columns = (first + torch.arange(side, device=images.device) for first, side in ((top, height), (left, width)))
+            every = torch.arange(len(images), device=images.device)[:, None, None]
+            images = images[every, :, rows[:, :, None], columns[:, None]].movedim(-1, 1)
+        elif self.crop:
+            middle = self.crop // 2
+            images = images[:, :, middle : middle + height, middle : middle + width]
+        out: Tensor = self.head(self.network(images.float() / 127.5 - 1))
+        return out
+
+
+class ImageEncoders(nn.Module):
+    """An :class:`ImageEncoder` for each observed image, with concatenated features.
+
+    Args:
+        observed: features by name, including the images.
+        arguments: arguments of every encoder.
+
+    Raises:
+        UserError: for invalid arguments.
+    """
+
+    def __init__(self, observed: Mapping[str, Feature], arguments: Mapping[str, Any]) -> None:
+        super().__init__()
+        self.names = [name for name, feature in observed.items() if feature.kind == "image"]
+        encoders = [from_mapping(ImageEncoder, arguments, "model.image_encoder", observed[name].shape) for name in self.names]
+        self.origins = [encoder.origin for encoder in encoders]
+        self.columns = [POINT if isinstance(encoder.head, Points) else 3 for encoder in encoders]
+        """Values per keypoint or point."""
+        for origin in self.origins:
+            if origin and (origin not in observed or observed[origin].shape != (2,)):
+                raise UserError(f"model.image_encoder.origin: expected an observed vector of 2 columns, found {short(origin)!r}")
+        self.encoders = nn.ModuleList(encoders)
+        self.sizes = [encoder.size for encoder in encoders]
+        self.size = sum(self.sizes)
+        """Number of features of all images."""
+
+    def forward(self, observed: Observed) -> Tensor:
+        """Images by name ``(batch, *shape)`` to ``(batch, size)``."""
+        return torch.cat([encoder(observed[name]) for name, encoder in zip(self.names, self.encoders, strict=True)], dim=-1)
+
+    def from_origins(self, read: Tensor, observed: Observed) -> Tensor:
+        """Shift keypoints to be relative to their origins.
+
+        Args:
+            read: features ``(batch, size)``, possibly of earlier images.
+            observed: vectors by name, including the current origins.
+        """
+        parts = []
+        for part, origin, columns in zip(read.split(self.sizes, dim=1), self.origins, self.columns, strict=True):
+            if origin:
+                count = part.shape[1] // columns
+                places, rest = part[:, : 2 * count], part[:, 2 * count :]
+                part = torch.cat((places - observed[origin].repeat_interleave(count, dim=1), rest), dim=1)
+            parts.append(part)
+        return torch.cat(parts, dim=1)

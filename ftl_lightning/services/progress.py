@@ -1,0 +1,141 @@
+"""Progress of long work: one moving bar in a terminal, a few plain lines elsewhere. Both go to standard error."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from ftl_lightning.services.printing import plain, say
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+LINES = 10
+"""Number of lines of a bar without a terminal."""
+
+
+class Advance(Protocol):
+    """Move a bar."""
+
+    def __call__(self, steps: int = 1, told: str = "") -> None:
+        """Move on by some steps; the text ``told`` beside the bar, such as a loss, stays until it is replaced."""
+
+
+@dataclass
+class _Screen:
+    """State of all bars: the number of open bars, and in a terminal their display, whose last bar is the innermost."""
+
+    depth: int = 0
+    display: "Progress | None" = None
+
+
+_SCREEN = _Screen()
+
+
+@contextmanager
+def bar(title: str, total: int | None, done: int = 0, lines: bool = True) -> Iterator[Advance]:
+    """Show the progress of work, alone or inside another bar, which keeps moving.
+
+    In a terminal the bar disappears at the end, and an outermost bar leaves a line. Elsewhere an outermost bar writes lines: at the
+    start, after each tenth, and at the end; inner bars write none.
+
+    Args:
+        title: name of the work.
+        total: number of steps; ``None`` if unknown.
+        done: number of steps done before.
+        lines: whether to write lines; otherwise the bar is visible only in a terminal.
+
+    Yields:
+        Function to call after each step.
+    """
+    current = _Bar(plain(title), total, done, lines and _SCREEN.depth == 0)
+    opened = _SCREEN.display is None and sys.stderr.isatty()
+    if opened:
+        _SCREEN.display = _display()
+        _SCREEN.display.start()
+    _SCREEN.depth += 1
+    current.show()
+    ended = False
+    try:
+        yield current.advance
+        ended = True
+    finally:
+        _SCREEN.depth -= 1
+        current.hide()
+        if opened and _SCREEN.display is not None:
+            _SCREEN.display.stop()
+            _SCREEN.display = None
+        if ended:
+            current.end()
+
+
+def _display() -> "Progress":
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[steps]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[told]}", markup=False),
+        console=Console(stderr=True, soft_wrap=True),  # printed paths stay in one line
+        transient=True,
+        # If standard output is a file, printed text must go there, not to the terminal.
+        redirect_stdout=sys.stdout.isatty(),
+    )
+
+
+@dataclass
+class _Bar:
+    """A bar, or the lines in its place."""
+
+    title: str
+    total: int | None
+    done: int
+    lines: bool
+    note: str = ""
+    start: float = field(default_factory=time.monotonic)
+    first: int = 0
+    task: int | None = None
+
+    def show(self) -> None:
+        self.first = self.done
+        if _SCREEN.display is not None:
+            self.task = _SCREEN.display.add_task(self.title, total=self.total, completed=self.done, steps=self._steps(), told="")
+        elif self.lines:
+            self._write(f"{self.title}: {self._steps()}" if self.total else self.title)
+
+    def advance(self, steps: int = 1, told: str = "") -> None:
+        before, self.done = self.done, self.done + steps
+        self.note = plain(told) or self.note
+        if _SCREEN.display is not None and self.task is not None:
+            _SCREEN.display.update(self.task, advance=steps, steps=self._steps(), told=self.note)  # type: ignore[arg-type]
+        elif self.lines and self.total and LINES * before // self.total < LINES * self.done // self.total < LINES:
+            self._write(f"{self.title}: {self._steps()}, {self._time()}{self._suffix()}")
+
+    def hide(self) -> None:
+        if _SCREEN.display is not None and self.task is not None:
+            _SCREEN.display.remove_task(self.task)  # type: ignore[arg-type]
+
+    def end(self) -> None:
+        if self.lines:
+            steps = f"{self.done - self.first} steps, " if self.total else ""
+            self._write(f"{self.title}: {steps}{self._time()}{self._suffix()}")
+
+    def _steps(self) -> str:
+        return f"{self.done}/{self.total}" if self.total else ""
+
+    def _time(self) -> str:
+        seconds = round(time.monotonic() - self.start)
+        return f"{seconds // 60}:{seconds % 60:02d}"
+
+    def _suffix(self) -> str:
+        return f", {self.note}" if self.note else ""
+
+    @staticmethod
+    def _write(line: str) -> None:
+        say(line, error=True)

@@ -1,0 +1,76 @@
+"""Shipped files: configurations (``conf/...``) and pretrained models (``pretrained/...``).
+
+Both folders are at the root of the repository; the package has links to them, which are folders in a wheel. So the documented
+paths work in a checkout and, after ``pip install``, in any folder.
+"""
+
+import difflib
+from pathlib import Path
+
+from ftl_lightning.services.errors import short
+
+FOLDERS = ("conf", "pretrained")
+"""Shipped folders."""
+_PACKAGE = Path(__file__).parent.parent
+CONFIGURATIONS = _PACKAGE / "conf"
+"""Folder of the shipped configuration files."""
+MODELS = _PACKAGE / "pretrained"
+"""Folder of the shipped models."""
+
+
+def shipped(path: str | Path) -> Path:
+    """Resolve a path: as given, or else in the shipped folders.
+
+    Args:
+        path: for example ``conf/agent.yaml`` or ``pretrained/agent``, relative to the current folder.
+
+    Returns:
+        The path; as given if neither exists, so that errors name the user's path.
+    """
+    path = Path(path)
+    if path.parts[:1] and path.parts[0] in FOLDERS and ".." not in path.parts and not path.exists():
+        inside = _PACKAGE / path
+        if inside.exists():
+            return inside
+    return path
+
+
+def shipped_models() -> list[str]:
+    """Names of the shipped models, such as ``agent``, without baselines."""
+    return sorted(path.parent.name for path in MODELS.glob("*/config.json"))
+
+
+def list_models(baselines: bool = False) -> list[str]:
+    """Names of the shipped models for ``FewShot.from_pretrained``.
+
+    Args:
+        baselines: include baselines, such as ``baseline/cvae/agent``.
+    """
+    others = sorted(str(path.parent.relative_to(MODELS)) for path in MODELS.glob("baseline/*/*/config.json"))
+    return shipped_models() + (others if baselines else [])
+
+
+def missing_model(place: str | Path) -> str:
+    """Error message for ``place`` without a model, with the nearest shipped names."""
+    place = short(str(place), 80)
+    normalised = place.lower().replace(" ", "_").replace("-", "_").removeprefix("pretrained/")
+    near = difflib.get_close_matches(normalised, list_models(baselines=True), n=2)
+    ship = f"did you mean {' or '.join(near)}? all that ship:" if near else f"{', '.join(shipped_models())} ship, see"
+    return (
+        f"{Path(place) / 'config.json'}: expected a pretrained model, found nothing; {ship} ftl_lightning.list_models(); "
+        "to make one, run: python -m ftl_lightning fit"
+    )
+
+
+def pretrained_folder(name: str | Path) -> Path:
+    """Folder of a pretrained model by its path or shipped name, such as ``agent``."""
+    for path in (Path(name), shipped(name), shipped(Path("pretrained") / name)):
+        if (path / "config.json").is_file():
+            return path
+    return Path(name)
+
+
+def shipped_name(folder: Path) -> str:
+    """Name of a shipped model, such as ``agent``, by its folder; empty for other folders."""
+    place, models = folder.resolve(), MODELS.resolve()
+    return place.relative_to(models).as_posix() if place.is_relative_to(models) and place != models else ""

@@ -1,0 +1,253 @@
+"""Checkpoints: written atomically, bound to a module class, and complete, so that a resumed run ends with the same bytes."""
+
+import io
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from packaging.version import InvalidVersion, Version
+from torch import Tensor
+
+from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.limits import expect_readable
+from ftl_lightning.services.tensor_file import atomic, expect_finite, visible
+
+_KEY = "belongs_to"
+_RANDOM = "random"
+_VERSION = "pytorch-lightning_version"
+_FORM: Mapping[str, type] = {
+    "state_dict": dict,
+    "epoch": int,
+    "global_step": int,
+    "loops": dict,
+    _VERSION: str,
+    "optimizer_states": list,
+    "lr_schedulers": list,
+    "callbacks": dict,
+    _KEY: dict,
+    _RANDOM: dict,
+}
+"""Type of each checkpoint key; only those in :data:`_NEEDED` are required."""
+_NEEDED = ("state_dict", "epoch", "global_step", "loops")
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Atomic checkpoint writes by renaming; damaged checkpoints are refused.
+
+    Lightning writes to the folder for temporary files, and a move from there to another file system is not atomic.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a checkpoint atomically.
+
+        Raises:
+            UserError: if the folder cannot be written or the disk is full.
+        """
+        if "://" in str(path):  # a store without renaming
+            super().save_checkpoint(checkpoint, path, storage_options)
+            return
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        with atomic(path) as temporary:
+            temporary.write_bytes(content.getbuffer())
+
+    def load_checkpoint(
+        self, path: str | Path, map_location: Callable[..., Any] | None = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read a checkpoint to the CPU by :func:`read_checkpoint`; ``weights_only`` is always on."""
+        if "://" in str(path):
+            return super().load_checkpoint(path, map_location, weights_only=True)
+        content = read_checkpoint(path)
+        try:
+            old = Version(content.get(_VERSION, "")) < Version("2")
+        except InvalidVersion:
+            old = True
+        if old:  # Lightning would look for missing keys
+            raise UserError(f"{path}: key {_VERSION!r}: expected 2.0 or newer, found {shown(content.get(_VERSION))}")
+        return content
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint and verify its checksums.
+
+    Raises:
+        UserError: for a damaged or foreign file, with the newest whole checkpoint of the folder.
+    """
+    try:
+        return _read(Path(path))
+    except UserError as error:
+        checkpoints = sorted(_beside(Path(path)), key=lambda checkpoint: checkpoint.stat().st_mtime, reverse=True)
+        if whole := next((checkpoint for checkpoint in checkpoints if _is_whole(checkpoint)), None):
+            raise UserError(f"{error}; go on from the newest whole one: --ckpt_path {whole}") from error.__cause__
+        raise
+
+
+def _read(path: Path) -> dict[str, Any]:
+    size = expect_readable(path, "checkpoint")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > size:
+                raise ValueError("its content is compressed, which that of a checkpoint is not")
+            damaged = archive.testzip()  # torch does not verify checksums
+        if damaged is not None:
+            raise ValueError(f"the checksum of {damaged} is another")
+        content = torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch and zipfile raise many kinds
+        raise UserError(f"{path}: expected a checkpoint, found a damaged or foreign file") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected a checkpoint, found a {type(content).__name__}")
+    for key, kind in _FORM.items():
+        part = content.get(key)
+        if (key in content or key in _NEEDED) and (not isinstance(part, kind) or isinstance(part, bool)):
+            raise UserError(f"{path}: key {key!r}: expected a checkpoint's {kind.__name__}, found {_kind(part)}")
+    for name, value in content["state_dict"].items():
+        if not (isinstance(name, str) and isinstance(value, Tensor)):
+            raise UserError(f"{path}: key 'state_dict': expected tensors by name, found {_kind(value)} as {str(name)[:50]!r}")
+    return content
+
+
+def _kind(value: object) -> str:
+    return "nothing" if value is None else f"a {type(value).__name__}"
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        _read(path)
+    except UserError:
+        return False
+    return True
+
+
+def _beside(path: Path) -> list[Path]:
+    """Other checkpoints of the folder."""
+    return [checkpoint for checkpoint in visible(path.parent, "*.ckpt") if checkpoint.name != path.name]
+
+
+def last_checkpoint(trainer: pl.Trainer) -> Path | None:
+    """The newest of the last checkpoints of the trainer's callbacks; ``None`` without any."""
+    callbacks = [callback for callback in trainer.checkpoint_callbacks if isinstance(callback, ModelCheckpoint)]
+    paths = [Path(path) for callback in callbacks for path in callback._find_last_checkpoints(trainer)]
+    return max((path for path in paths if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
+
+
+def check_parameters(found: Mapping[str, Any], module: pl.LightningModule, optional: str = "") -> None:
+    """Refuse checkpoint parameters that do not fit a module.
+
+    Args:
+        found: parameters of the checkpoint, by name.
+        module: module with its layers.
+        optional: prefix of the parameters in a checkpoint; empty for all.
+
+    Raises:
+        UserError: for the first missing, unknown or non-finite parameter, or another shape.
+    """
+    expected = {name: value for name, value in module.state_dict().items() if name.startswith(optional)}
+    for name in expected | dict(found):
+        if name not in found or name not in expected:
+            what = ("it", "nothing") if name not in found else ("nothing", "it")
+            raise UserError(f"ckpt_path: key 'state_dict', {name!r}: expected {what[0]}, found {what[1]}; it is damaged")
+        if found[name].shape != expected[name].shape:
+            shapes = f"expected shape {tuple(expected[name].shape)}, found {tuple(found[name].shape)}"
+            raise UserError(f"ckpt_path: key 'state_dict', {name!r}: {shapes}; it is damaged")
+    # Buffers of losses may still be infinite.
+    learned = [name for name, _ in module.named_parameters() if name in found] if optional else list(found)
+    expect_finite({name: found[name] for name in learned}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
+
+
+def check_restored(module: pl.LightningModule, step: int) -> None:
+    """Refuse inconsistent state that Lightning and torch accepted.
+
+    Args:
+        module: module with a starting trainer.
+        step: step of the checkpoint.
+
+    Raises:
+        UserError: for another step, an optimiser without state, or state whose shapes differ from the parameters'.
+    """
+    if module.trainer.global_step != step:
+        raise UserError(f"ckpt_path: key 'loops': expected step {step}, found {module.trainer.global_step}; it is damaged")
+    for optimizer in module.trainer.optimizers:
+        if step and not optimizer.state:
+            raise UserError("ckpt_path: key 'optimizer_states': expected the state of an optimiser, found none; it is damaged")
+        for parameter, state in optimizer.state.items():
+            for name, value in state.items():
+                if not isinstance(value, Tensor) or value.shape not in (parameter.shape, ()):
+                    shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                    raise UserError(
+                        f"ckpt_path: key 'optimizer_states', {name!r}: expected shape {tuple(parameter.shape)}, found {shape}; "
+                        "it is damaged"
+                    )
+
+
+class Random(NamedTuple):
+    """States of the global generators after a step.
+
+    Attributes:
+        cpu: state of the CPU generator.
+        cuda: state of the module's GPU generator; ``None`` on a CPU.
+        iterations: loader iterations that an unbroken run starts before its next step; each draws one number.
+    """
+
+    cpu: Tensor
+    cuda: Tensor | None
+    iterations: int
+
+    @classmethod
+    def now(cls, device: torch.device, iterations: int) -> "Random":
+        """The current states."""
+        return cls(torch.get_rng_state(), torch.cuda.get_rng_state(device) if device.type == "cuda" else None, iterations)
+
+    def restore(self, device: torch.device) -> None:
+        """Set the generators as in an unbroken run before its next step."""
+        torch.set_rng_state(self.cpu)
+        for _ in range(self.iterations):
+            torch.empty((), dtype=torch.int64).random_()
+        if self.cuda is not None and device.type == "cuda":
+            torch.cuda.set_rng_state(self.cuda, device)
+
+    def write(self, checkpoint: dict[str, Any]) -> None:
+        """Write to a checkpoint."""
+        checkpoint[_RANDOM] = self._asdict()
+
+    @classmethod
+    def read(cls, checkpoint: Mapping[str, Any]) -> "Random":
+        """Read from a checkpoint.
+
+        Raises:
+            UserError: for missing or damaged states.
+        """
+        try:
+            states = cls(**checkpoint[_RANDOM])
+            torch.Generator().set_state(states.cpu)
+        except (KeyError, TypeError, RuntimeError) as error:
+            raise UserError(f"ckpt_path: key {_RANDOM!r}: expected states of generators, found something else") from error
+        if not isinstance(states.iterations, int) or not 0 <= states.iterations <= 9 or not isinstance(states.cuda, Tensor | None):
+            raise UserError(f"ckpt_path: key {_RANDOM!r}: expected states of generators, found something else")
+        return states
+
+
+def _signature(module: pl.LightningModule, more: Mapping[str, Any]) -> dict[str, Any]:
+    return {"module_class": type(module).__name__, **more}
+
+
+def sign(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Write the module's class and the settings that must match into its checkpoint."""
+    checkpoint[_KEY] = _signature(module, more)
+
+
+def check_signature(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Refuse a checkpoint with another signature.
+
+    Raises:
+        UserError: with the first key that differs.
+    """
+    expected, signature = _signature(module, more), checkpoint.get(_KEY, {})
+    for key in expected | signature:  # a missing setting has its default
+        if (value := signature.get(key)) != (setting := expected.get(key)):
+            raise UserError(f"ckpt_path: key {key!r}: expected {setting}, found {value}; it is the checkpoint of something else")

@@ -1,0 +1,110 @@
+"""Models and concepts on the Hugging Face Hub; requires a network."""
+
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.shipped import FOLDERS
+from ftl_lightning.services.tensor_file import atomic
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.library import CONCEPT
+from ftl_lightning.training.model_config import CONFIG
+from ftl_lightning.training.model_folder import save_model
+
+MODEL_FILES = ("*.json", "*.safetensors", "*.md")
+"""Files to download from a model's repository."""
+CONCEPT_FILES = (CONCEPT, "README.md")
+"""Files to download from a concept's repository."""
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
+
+
+def is_repository(name: str) -> bool:
+    """Whether a name may be ``'owner/name'`` on the Hub; paths such as ``'./a'`` and ``'conf/a'`` never are."""
+    owner, slash, rest = name.partition("/")
+    return bool(slash) and "/" not in rest and owner not in FOLDERS and not owner.startswith((".", "~"))
+
+
+def expect_repository(repository: object) -> str:
+    """Refuse an invalid name of a repository.
+
+    Raises:
+        UserError: with an example.
+    """
+    if not isinstance(repository, str) or not _REPOSITORY.fullmatch(repository):
+        raise UserError(f"repository: expected a name on the Hub, such as 'owner/name', found {shown(repository)}")
+    return repository
+
+
+def download(
+    repository: str, files: Sequence[str] = MODEL_FILES, expected: str = "a folder, a model that ships or one on the Hub"
+) -> Path:
+    """Download the model or concept ``owner/name``, or take it from the cache, and return its folder.
+
+    Args:
+        repository: name of the repository.
+        files: patterns of the files to download.
+        expected: expected kinds of names, for messages.
+
+    Raises:
+        UserError: if the download fails.
+    """
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(repository, allow_patterns=[*files]))
+    except Exception as error:  # the Hub, the network and the cache raise kinds of their own
+        raise UserError(f"{repository}: expected {expected}, found none ({_reason(error)})") from error
+
+
+def upload(write: Callable[[Path], object], repository: str, private: bool = False) -> str:
+    """Upload a folder as ``owner/name``; needs a login.
+
+    Args:
+        write: writes the files into a folder; not called for an invalid name.
+        repository: the name.
+        private: whether a new repository is private.
+
+    Returns:
+        The address.
+
+    Raises:
+        UserError: for an invalid name, or if the upload fails.
+    """
+    expect_repository(repository)
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder))
+        from huggingface_hub import HfApi
+
+        hub = HfApi()
+        try:
+            hub.create_repo(repository, private=private, exist_ok=True)
+            return str(hub.upload_folder(repo_id=repository, folder_path=folder))
+        except Exception as error:
+            message = f"{repository}: expected a place on the Hub that you may write to, found none ({_reason(error)})"
+            raise UserError(f"{message}; log in first: hf auth login") from error
+
+
+def _reason(error: Exception) -> str:
+    return short(str(error).splitlines()[0] if str(error) else type(error).__name__, 100)
+
+
+def card(model: ConceptModel) -> str:
+    """Model card with the Hub's metadata."""
+    texts = "\n".join(f"- {text}" for text in model.config.training_concepts)
+    return (
+        "---\nlibrary_name: ftl-lightning\ntags: [few-shot-learning, diffusion, imitation-learning]\n---\n"
+        f"# {model.method.name} on {model.domain.name}\n\nHash {model.hash}; plans of {model.config.horizon} states of "
+        f"{model.config.state_dim} numbers. Text encoder: {model.config.encoder}.\n\nTraining concepts:\n\n{texts}\n\n"
+        f'    from ftl_lightning import FewShot\n    model = FewShot.from_pretrained("FOLDER OR NAME")\n\n'
+        f"Files: `{CONFIG}`, `model.safetensors` (weights in half precision).\n"
+    )
+
+
+def save_with_card(model: ConceptModel, folder: Path) -> None:
+    """Write a model's folder, and a ``README.md`` unless it exists."""
+    save_model(model, folder)
+    if not (readme := folder / "README.md").is_file():
+        with atomic(readme) as temporary:
+            temporary.write_text(card(model), encoding="utf-8")

@@ -1,0 +1,115 @@
+"""Learning concepts in several processes. Concepts do not depend on others in the batch."""
+
+import multiprocessing
+import tempfile
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.services import trust
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.printing import silence
+from ftl_lightning.services.progress import bar
+from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.training.pretrained import load_model
+
+
+@dataclass(frozen=True)
+class _Share:
+    """Work of one process.
+
+    Attributes:
+        folder: folder of the demonstrations and learned concepts.
+        model: folder or name of the pretrained model.
+        concepts: file numbers and texts of concepts.
+        settings: settings of the inversion.
+        steps: gradient steps.
+        device: device to learn on.
+        vouched: modules that the user trusts.
+    """
+
+    folder: str
+    model: str
+    concepts: tuple[tuple[int, str], ...]
+    settings: InversionSettings
+    steps: int
+    device: str
+    vouched: frozenset[str]
+
+
+def learned_in_processes(
+    model: str,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    processes: int,
+    devices: Iterable[torch.device] = (torch.device("cpu"),),
+) -> dict[str, Concept]:
+    """Learn the concepts of the demonstrations in several processes.
+
+    Equal to a single process up to rounding: sums have other numbers of rows.
+
+    Args:
+        model: folder or name of the pretrained model.
+        demonstrations: demonstrations; their concept texts name the concepts.
+        settings: settings of the inversion.
+        steps: gradient steps.
+        processes: maximum number of processes; at most one for each concept.
+        devices: devices, assigned in turn.
+
+    Raises:
+        UserError: raised by the learner, or if a process ended early.
+    """
+    names, devices = tuple(dict.fromkeys(demonstrations.concepts)), tuple(devices)
+    numbered = tuple(enumerate(names))
+    with tempfile.TemporaryDirectory() as folder:
+        demonstrations.save(Path(folder) / _DEMONSTRATIONS)
+        shares = [
+            _Share(folder, model, numbered[first::processes], settings, steps, str(devices[first % len(devices)]), trust.vouched())
+            for first in range(min(processes, len(names)))
+        ]
+        # Spawned, since a forked process would share threads and devices.
+        with (
+            ProcessPoolExecutor(len(shares), multiprocessing.get_context("spawn")) as pool,
+            bar("concepts", len(names)) as advance,
+        ):
+            running = {pool.submit(_learn, share): len(share.concepts) for share in shares}
+            try:
+                for ended in as_completed(running):
+                    if mistake := ended.result():
+                        raise UserError(mistake)
+                    advance(running[ended])
+            except BrokenProcessPool:
+                raise UserError(f"trainer.processes: expected {len(shares)} processes to the end, one was stopped") from None
+        return {name: Concept.load(_file(folder, number)) for number, name in numbered}
+
+
+_DEMONSTRATIONS = "demonstrations.safetensors"
+
+
+def _file(folder: str, number: int) -> Path:
+    return Path(folder) / f"{number}.safetensors"
+
+
+def _learn(share: _Share) -> str:
+    """Learn and write a share's concepts; return the message of a ``UserError``, or an empty string."""
+    silence()  # the first process has printed all notes
+    torch.set_num_threads(1)
+    with trust.vouching(share.vouched):
+        try:
+            model = load_model(share.model).to(share.device)
+            every = Demonstrations.load(Path(share.folder) / _DEMONSTRATIONS)
+            names = {name for _, name in share.concepts}
+            demonstrations = every.rows([row for row, name in enumerate(every.concepts) if name in names])
+            learned = model.method.learn()(model, demonstrations, share.settings, share.steps)
+            for number, name in share.concepts:
+                learned[name].save(_file(share.folder, number))
+        except UserError as error:
+            return str(error)
+    return ""

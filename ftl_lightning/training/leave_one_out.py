@@ -1,0 +1,184 @@
+"""Leave-one-out losses of concepts on left-out demonstrations."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.finding import numbered
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.training.concept_model import ConceptModel
+from ftl_lightning.training.inversion import invert
+from ftl_lightning.training.inversion_settings import PAPER, InversionSettings
+from ftl_lightning.training.relative_loss import generated_loss, relative_losses
+
+MOST = 12
+"""Maximum number of demonstrations; several concepts are learned for each."""
+SAMPLES, TOLERANCE = 16, 0.03
+"""Fast learning: noised demonstrations a step, and stopping tolerance."""
+ODD, HARMED = 1.7, 1.2
+"""Minimum ratios of an odd demonstration's left-out loss to the largest other loss, and to the unconditional loss."""
+COVERED = 0.95
+"""Relative loss below which a demonstration is explained."""
+FAR = 10.0
+"""Minimum ratio of the training loss to the loss of generated behaviour for a task far from pretraining."""
+FALLING = 0.05
+"""Minimum relative fall of the left-out loss for one more demonstration, for more to be likely to help."""
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Losses of demonstrations relative to the unconditional (empty concept's) loss on the same noise; lower is better.
+
+    Attributes:
+        left_out: left-out loss of each demonstration ``(demo,)``, under the concept learned from all others.
+        learned_from: training loss of each demonstration ``(demo,)``, the mean over concepts that leave another one out.
+        curve: mean left-out loss by the number of training demonstrations, without the odd demonstration.
+        odd: index of the demonstration that differs from the others; ``None`` without any.
+        generated: loss of generated behaviour, see :func:`~ftl_lightning.training.relative_loss.generated_loss`.
+    """
+
+    left_out: tuple[float, ...]
+    learned_from: tuple[float, ...]
+    curve: dict[int, float]
+    odd: int | None
+    generated: float
+
+    @property
+    def distance(self) -> float:
+        """Ratio of the training loss, without the odd demonstration, to the loss of generated behaviour.
+
+        The left-out loss is also large for too few demonstrations.
+        """
+        kept = [loss for row, loss in enumerate(self.learned_from) if row != self.odd]
+        return sum(kept) / len(kept) / max(self.generated, 1e-12)
+
+    @property
+    def far(self) -> bool:
+        """Whether the task is far from pretraining: concepts do not even explain their training demonstrations."""
+        return self.distance >= FAR
+
+    @property
+    def covered(self) -> int:
+        """Number of demonstrations explained by the concept learned from the others."""
+        return sum(loss < COVERED for loss in self.left_out)
+
+    @property
+    def falling(self) -> bool:
+        """Whether the last demonstrations still lowered the left-out loss."""
+        (fewer, before), (more, after) = ([(0, 1.0), *self.curve.items()])[-2:]
+        return before - after > FALLING * (more - fewer) * before
+
+    def lines(self) -> list[str]:
+        """Report, one line for each result."""
+        count = len(self.left_out)
+        out, inside = sum(self.left_out) / count, sum(self.learned_from) / count
+        summary = f"left out: the concept learned from the others explains {self.covered} of {count}"
+        missed = [row for row, loss in enumerate(self.left_out) if loss >= COVERED]
+        summary += f", not {numbered(missed)}" if 0 < len(missed) < count else ""
+        summary += f" (loss {out:.2f} of the empty"
+        summary += f" concept's, {inside:.2f} where it is learned from, too)" if count > 2 else " concept's)"
+        odd = "odd: none is explained much worse than the others"
+        if self.odd is not None:
+            others = max(loss for row, loss in enumerate(self.left_out) if row != self.odd)
+            odd = f"odd: demonstration {self.odd + 1}, loss {self.left_out[self.odd]:.2f} when it is left out (others at most"
+            odd += f" {others:.2f}); another concept, or a mistake?"
+        curve = ", ".join(f"{loss:.2f} from {size}" for size, loss in self.curve.items())
+        verdict = "still falls: more are likely to help" if self.falling else "hardly falls any more: these suffice"
+        if not self.falling and [1.0, *self.curve.values()][-1] >= COVERED:
+            verdict = "hardly falls, and those left out are not explained: look at samples"
+        more = f"more: loss of those left out {curve}; it {verdict}" if curve else ""
+        times = f"where it is learned from them, they have {self.distance:.1f} times the loss of what the model generates"
+        near = f"distance: {times} (from {FAR:.0f} on: far from anything pretrained)"
+        far = f"far: {times}: nothing pretrained is like this; look at samples, they may do something else"
+        return [summary, *([odd] if count > 2 else []), more, far if self.far else near]
+
+
+def subsets(count: int) -> list[tuple[int, ...]]:
+    """Subsets of 1, 2, 3 and ``count - 1`` demonstrations, each demonstration equally often."""
+    sizes = sorted({size for size in (1, 2, 3, count - 1) if 0 < size < count})
+    return [tuple(sorted((start + step) % count for step in range(size))) for size in sizes for start in range(count)]
+
+
+def learned_from(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    chosen: Sequence[Sequence[int]],
+    settings: InversionSettings,
+    steps: int,
+    tell: Callable[[float], None] = lambda loss: None,
+) -> Composition:
+    """Learn one set of embeddings for each subset, in one batch: ``(subset, K, ...)`` on the model's device.
+
+    Args:
+        model: the frozen model.
+        demonstrations: demonstrations of one concept or several.
+        chosen: rows of each subset.
+        settings: settings in the paper's form.
+        steps: maximum number of gradient steps.
+        tell: called with the mean loss after each step.
+    """
+    parts = [replace(demonstrations.rows(list(rows)), concepts=(f"{number}",) * len(rows)) for number, rows in enumerate(chosen)]
+    sets = list(invert(model, concatenate(parts), settings, steps, tell).values())
+    every = Composition(torch.stack([each.embeddings for each in sets]), torch.stack([each.weights for each in sets]))
+    return every.to(model.device)
+
+
+def quickly(settings: InversionSettings) -> InversionSettings:
+    """Settings for fast learning of sets that only need comparable losses."""
+    return settings.from_one_start(
+        form=PAPER,
+        modes=1,
+        adapter=0,
+        samples=min(settings.budget.samples, SAMPLES),
+        tolerance=max(settings.budget.tolerance or 0, TOLERANCE),
+        guidance_scale=1.0,  # only generation uses it
+    )
+
+
+def leave_one_out(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int,
+    tell: Callable[[float], None] = lambda loss: None,
+) -> LeaveOneOut:
+    """Learn the concept from subsets, in one batch, and measure each on the left-out demonstrations.
+
+    Args:
+        model: the frozen model.
+        demonstrations: two or more of one concept; the first :data:`MOST` are used.
+        settings: settings of the inversion; modes, adapters and restarts are ignored.
+        steps: maximum number of gradient steps.
+        tell: called with the mean loss after each step.
+    """
+    count = min(len(demonstrations), MOST)
+    used, chosen = demonstrations.rows(list(range(count))), subsets(count)
+    losses = relative_losses(model, used, learned_from(model, used, chosen, quickly(settings), steps, tell), settings)
+    without = torch.tensor([[row not in rows for row in range(count)] for rows in chosen])
+    sizes = torch.tensor([len(rows) for rows in chosen])
+    last = sizes == count - 1
+    outside = torch.where(without[last], losses[last], 0).sum(dim=0)
+    inside = torch.where(~without[last], losses[last], 0).sum(dim=0) / max(count - 1, 1)
+    odd = odd_one(outside)
+    kept = without.clone()
+    if odd is not None:
+        kept[:, odd] = False
+        kept[~without[:, odd]] = False  # concepts learned from it
+    curve = {
+        size: float(losses[sizes == size][kept[sizes == size]].mean())
+        for size in sorted(set(sizes.tolist()))
+        if kept[sizes == size].any()
+    }
+    return LeaveOneOut(tuple(outside.tolist()), tuple(inside.tolist()), curve, odd, generated_loss(model, used, settings))
+
+
+def odd_one(losses: Tensor) -> int | None:
+    """Index of the demonstration with a left-out loss ``(demo,)`` far above the others'; ``None`` without any."""
+    if len(losses) < 3:
+        return None
+    worst = int(losses.argmax())
+    others = torch.cat((losses[:worst], losses[worst + 1 :]))
+    return worst if losses[worst] > max(ODD * float(others.max()), HARMED) else None

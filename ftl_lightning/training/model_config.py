@@ -1,0 +1,106 @@
+"""Configuration of a pretrained model, its ``config.json``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ftl_lightning.domains.domain import Domain, View
+from ftl_lightning.domains.from_file import OWN
+from ftl_lightning.networks.denoiser import Sizes
+from ftl_lightning.services.errors import UserError, about, short, shown
+from ftl_lightning.services.ranges import LARGEST, expect_range
+from ftl_lightning.services.schema import expect_type, read_json
+from ftl_lightning.services.shipped import missing_model
+
+CONFIG = "config.json"
+"""File name in a model's folder."""
+VERSION = 2
+"""Version of the configuration's format."""
+LONGEST = 10_000
+"""Maximum number of states in a plan; networks over time have the same weights for any horizon."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig(Sizes):
+    """Configuration to build a model before its weights are read; each method adds options of its network.
+
+    Attributes:
+        domain: name of the domain.
+        training_concepts: texts, in the order of the model's training embeddings.
+        encoder: identity of the text encoder.
+        view: name of the domain's view; empty for none.
+        perturb: whether training perturbs the present state, see :class:`~ftl_lightning.domains.domain.View`.
+        image_encoder: arguments of the image encoders, see :class:`~ftl_lightning.networks.image_encoder.ImageEncoder`.
+        feature_dropout: dropout probability of observed vectors by name (0 after normalisation) in training.
+        metrics: metrics of plans for a user's data, see :mod:`ftl_lightning.domains.from_file`.
+        training: training options, for the record.
+
+    Raises:
+        UserError: at construction, for a size out of its range.
+    """
+
+    domain: str
+    training_concepts: tuple[str, ...]
+    encoder: str
+    view: str = ""
+    perturb: bool = False
+    image_encoder: Mapping[str, Any] = field(default_factory=dict)
+    feature_dropout: Mapping[str, float] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        expect_range("horizon", self.horizon, 1, LONGEST)
+        expect_range("state_dim", self.state_dim, 1, LARGEST)
+        expect_range("concept_dim", self.concept_dim, 1, LARGEST)
+        expect_range("observed, image_dim", self.vector_dim, 0, LARGEST)
+
+
+def find_view(domain: Domain, name: str) -> View | None:
+    """A domain's view by name; ``None`` for the empty name.
+
+    Raises:
+        UserError: for an unknown name.
+    """
+    if not name:
+        return None
+    if name not in domain.views:
+        raise UserError(f"model.view: expected one of {', '.join(map(repr, ('', *domain.views)))}, found {short(name)!r}")
+    return domain.views[name]
+
+
+def read_config(folder: str | Path) -> dict[str, Any]:
+    """Read the configuration of a pretrained model, with its ``format``, ``hash`` and ``kind``, as plain data.
+
+    Raises:
+        UserError: with the file, if it is missing or invalid.
+    """
+    path = Path(folder) / CONFIG
+    if not path.exists():
+        raise UserError(missing_model(folder))
+    content = read_json(path)
+    with about(path):
+        if not isinstance(content, dict) or content.get("format") != VERSION:
+            raise UserError(f"expected the configuration of a pretrained model, found something else (its format is not {VERSION})")
+        for key in ("kind", "hash", "domain"):
+            expect_type(content.get(key), str, key)
+        return content
+
+
+def expect_domain(config: ModelConfig, domain: Domain) -> None:
+    """Refuse sizes that differ from the domain's.
+
+    Raises:
+        UserError: with the key.
+    """
+    if config.state_dim != (columns := len(domain.plans.columns)):
+        raise UserError(f"key 'state_dim': expected {columns} (domain {domain.name}), found {config.state_dim}")
+    if config.metrics and config.domain != OWN:
+        raise UserError(f"key 'metrics': expected none, as domain {domain.name} has its own, found {shown(dict(config.metrics))}")
+    view = find_view(domain, config.view)
+    expected = domain.observed if view is None else view.features
+    for name, feature in config.observed.items():
+        if name not in expected or not feature.fits(expected[name]):
+            wanted = expected[name].words if name in expected else f"one of {', '.join(expected) or 'no features'}"
+            raise UserError(f"key 'observed.{short(name)}': expected {wanted}, found {short(feature.words)}")

@@ -1,0 +1,381 @@
+"""Pretraining of a concept-conditioned model on a domain's demonstrations, for any method."""
+
+import copy
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from torch import Tensor
+
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import Feature, Observed
+from ftl_lightning.data.normalization import Normalization
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.point import Point
+from ftl_lightning.networks.image_encoder import ImageEncoders
+from ftl_lightning.networks.text_encoder import EMPTY
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.option_groups import groups_of
+from ftl_lightning.services.processes import mean, rows_of
+from ftl_lightning.services.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
+from ftl_lightning.services.seeding import generator
+from ftl_lightning.training.checkpoint import Random
+from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
+from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.model_config import ModelConfig, find_view
+from ftl_lightning.training.model_folder import save_model
+from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.resume import ExactResume
+from ftl_lightning.training.teaching import Teaching
+
+M = TypeVar("M", bound=ConceptModel)
+
+
+class Pretraining(ExactResume, ABC, Generic[M]):
+    """Base module that fits a method's model to a domain's demonstrations.
+
+    ``model`` holds the exponential moving average (EMA) of the weights and is validated, exported and adapted; ``raw`` holds the
+    raw weights, which the published code uses. Layers are built once the data module, which decides sizes, is attached.
+
+    Args:
+        learning_rate: learning rate of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
+        warmup_steps: steps of the warm-up; 0 for none.
+        weight_decay: weight decay of AdamW.
+        ema_decay: decay of the EMA; it starts lower.
+        guidance: guidance weight omega of training concepts in evaluation.
+        view: name of the domain's view, see :class:`ftl_lightning.domains.domain.View`; empty for data as in files.
+        perturb: perturb the present state by the view, here and in inversion.
+        output: folder for the trained model; ``None`` for ``pretrained`` in the log folder.
+        seed: seed of the initial weights, and of the loss's noise as a function of the step.
+        image_encoder: arguments of the image encoders, see :class:`~ftl_lightning.networks.image_encoder.ImageEncoder`; its
+            defaults for ``None``.
+        feature_dropout: dropout probability of observed vectors by name; none for ``None``. The published code hides the end
+            effector's pose with 0.4.
+        privileged: loss weights by name: image encoders are trained to predict privileged information of training
+            demonstrations, see :class:`~ftl_lightning.domains.domain.Privileged`; none for ``None``.
+        told: share of each step's windows whose image encoding is replaced by privileged information. Such a window costs a
+            fraction of a window with an image.
+
+    Raises:
+        UserError: at construction, for a value out of its range.
+    """
+
+    model: M
+    raw: M
+    flat: ClassVar[Mapping[str, str]] = {}
+    """Grouped options ``'group.option'`` by flat name, see :mod:`ftl_lightning.services.option_groups`."""
+    form: str = ""
+    """Suffix of the method's name in tables, if it has several forms."""
+    variant: str = ""
+    """Variant of the method in tables."""
+    concepts: tuple[str, ...] = ()
+    """Names of learned concepts; pretraining learns none."""
+    unused: Tensor | None
+    """Dummy parameter for a model without learnable parameters."""
+    stride: int = 1
+    """Stride between the states of a window."""
+
+    def __init__(
+        self,
+        learning_rate: float = 6e-4,
+        warmup_steps: int = 200,
+        weight_decay: float = 0.01,
+        ema_decay: float = 0.999,
+        guidance: float = 1.0,
+        view: str = "",
+        perturb: bool = False,
+        output: str | None = None,
+        seed: int = 0,
+        image_encoder: Mapping[str, Any] | None = None,
+        feature_dropout: Mapping[str, float] | None = None,
+        privileged: Mapping[str, float] | None = None,
+        told: float = 0.0,
+    ) -> None:
+        super().__init__()
+        # Configurations without privileged information keep their hash.
+        self.save_hyperparameters(
+            ignore=[*groups_of(self.flat), *([] if privileged else ["privileged"]), *([] if told else ["told"])]
+        )
+        for name, value, most in (
+            ("learning_rate", learning_rate, LARGEST_RATE),
+            ("warmup_steps", warmup_steps, math.inf),
+            ("weight_decay", weight_decay, LARGEST_FACTOR),
+            ("ema_decay", ema_decay, 1),
+            ("seed", seed, math.inf),
+        ):
+            expect_range(f"model.{name}", value, 0, most)
+        expect_factor("model.guidance", guidance)
+        self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
+        for name, share in self.feature_dropout.items():
+            expect_range(f"model.feature_dropout.{name}", share, 0, 1)
+        self.teaching = Teaching(privileged or {}, told)
+        self.seed = seed
+        self.guidance = guidance
+        self.register_parameter("unused", None)
+        self._validated = False
+        self._random: Random | None = None
+
+    @abstractmethod
+    def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> M:
+        """Build the method's model with initial weights.
+
+        Args:
+            prepared: configuration and text embeddings; a method adds options of its network by
+                :meth:`~ftl_lightning.training.prepared.Prepared.configured`.
+            data: training data.
+        """
+
+    @abstractmethod
+    def losses(self, model: M, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Losses ``(batch,)`` of a perturbed batch; ``model`` is in training mode while fitting."""
+
+    def _perturbed_losses(self, model: M, batch: Batch, draw: torch.Generator) -> tuple[Tensor, Batch]:
+        states, observed = model.perturbed(batch.states, batch.observed, draw)
+        seen = batch._replace(states=states, observed=dict(observed))
+        return self.losses(model, seen, draw), seen
+
+    def configure_model(self) -> None:
+        """Build the layers once the data are known, and only once."""
+        if "model" not in self._modules:
+            with torch.device("cpu"):  # with the data; Lightning moves the layers afterwards
+                self._configure()
+
+    def _configure(self) -> None:
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(data, PretrainingData):
+            raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
+        concepts = data.domain.concepts.training
+        embeddings = data.encoder((EMPTY, *concepts))
+        expect_different(concepts, embeddings[1:])
+        view = find_view(data.domain, self.hparams["view"])
+        features = data.domain.observed if view is None else view.features
+        seen: Observed
+        if view is None:
+            states, seen = data.training.states, data.training.every_observation
+        else:
+            windows = data.every_window()
+            states, seen = windows.states[:, :: self.stride], view.observe(windows.observed)
+            states = view.encode(states, windows.observed)
+        with torch.device("meta"):  # for its size alone
+            image_dim = ImageEncoders(features, self.image_encoder).size
+        config = ModelConfig(
+            domain=data.domain_name,
+            horizon=data.horizon,
+            state_dim=len(data.domain.plans.columns),
+            observed=dict(features),
+            concept_dim=embeddings.shape[-1],
+            training_concepts=concepts,
+            encoder=data.encoder.identity,
+            view=self.hparams["view"],
+            perturb=self.hparams["perturb"],
+            image_dim=image_dim,
+            image_encoder=self.image_encoder,
+            feature_dropout=expect_dropout(self.feature_dropout, features),
+            plane=view.plane if view else (),
+            metrics=dict(data.metrics),
+            training={
+                "model": {key: value for key, value in self.hparams.items() if key != "output" and not key.startswith("_")},
+                # The folder of recordings does not affect the model.
+                "data": {key: value for key, value in data.hparams.items() if key != "root" and not key.startswith("_")},
+                "max_steps": self.trainer.max_steps,
+            },
+        )
+        # The initial weights depend on the seed alone.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            resolution = data.domain.plans.resolution
+            normalization = Normalization.fit(states, view.scales if view else (), resolution, config.plane)
+            beside = None
+            if config.measured_dim:
+                beside = Normalization.fit(joined_vectors(seen, features), config.entities, resolution)
+                if config.state_columns and (view is None or view.same_columns):  # else plans have another scale
+                    beside.share(config.state_columns, normalization)
+            self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
+            self.model.examples = data.examples
+            self.teaching.expect_taught(self.domain, self.model.images)
+        self.raw = copy.deepcopy(self.model)
+        self.teaching.attach(self.raw.images)
+        if not any(parameter.requires_grad for parameter in self.raw.parameters()):
+            # A model that memorises: the optimiser still needs a parameter to count steps.
+            self.unused = torch.nn.Parameter(torch.zeros(()))
+        self.model.requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Switch modes; the EMA model is always in evaluation mode."""
+        super().train(mode)
+        if "model" in self._modules:
+            self.model.eval()
+        return self
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Restore the global generators, which dropout uses, so that a resumed run equals an unbroken run.
+
+        Not earlier, since starting to iterate a loader draws from them too.
+        """
+        self._validated = False
+        if self._random is not None:
+            self._random.restore(self.device)
+            self._random = None
+
+    def on_validation_start(self) -> None:
+        """Record that later checkpoints follow a validation."""
+        self._validated = True
+
+    def training_step(self, batch: Batch) -> Tensor:
+        with rows_of(self.trainer.global_rank, self.trainer.world_size):
+            return self._training_loss(batch)
+
+    def _training_loss(self, batch: Batch) -> Tensor:
+        draw = generator(self.device, self.seed, self.global_step)
+        looked_at, unseen = self.teaching.apart(self.domain, batch)
+        losses, seen = self._perturbed_losses(self.raw, looked_at, draw)
+        if unseen is not None:
+            states, observed = self.raw.perturbed(unseen.states, unseen.observed, draw)
+            privileged = unseen._replace(states=states, observed=self.teaching.told(self.domain, observed, draw))
+            losses = torch.cat((losses, self.losses(self.raw, privileged, draw)))
+        loss = losses.mean()
+        whole = mean(loss)
+        if not whole.isfinite():
+            raise UserError(
+                f"training: the loss became {whole.item()} at step {self.global_step}; the last checkpoint before it is kept; "
+                "lower model.learning_rate"
+            )
+        self.log("train/loss", whole, prog_bar=True)
+        for name, error in self.teaching.errors(self.domain, seen.observed).items():
+            self.log(f"train/{name}", mean(error))
+            loss = loss + self.teaching.weights[name] * error
+        return loss if self.unused is None else loss + 0 * self.unused
+
+    def optimizer_step(self, *arguments: Any, **options: Any) -> None:
+        """Step and update the EMA, so that no checkpoint falls between the two."""
+        super().optimizer_step(*arguments, **options)
+        decay = min(self.hparams["ema_decay"], self.global_step / (self.global_step + 10))
+        if self.unused is None:
+            with torch.no_grad():
+                torch._foreach_lerp_(list(self.model.parameters()), list(self.raw.parameters()), 1 - decay)
+
+    def _evaluation_step(self, batch: Batch, name: str) -> None:
+        # Fixed noise, so that the curve shows the model alone. Each process evaluates the whole set.
+        loss = self._perturbed_losses(self.model, batch, generator(self.device, self.seed))[0].mean()
+        self.log(name, loss, prog_bar=True, batch_size=len(batch.states), sync_dist=True)
+
+    def validation_step(self, batch: Batch) -> None:
+        self._evaluation_step(batch, "val/loss")
+
+    def test_step(self, batch: Batch) -> None:
+        self._evaluation_step(batch, "test/loss")
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        """AdamW with warm-up and cosine decay."""
+        total = int(self.trainer.estimated_stepping_batches)
+        warmup = max(min(self.hparams["warmup_steps"], total // 10), 1)
+        optimizer = torch.optim.AdamW(
+            self.raw.parameters() if self.unused is None else [self.unused],
+            lr=self.hparams["learning_rate"],
+            weight_decay=self.hparams["weight_decay"],
+            fused=True,
+        )
+
+        def factor(step: int) -> float:
+            return min(1.0, (step + 1) / warmup) * 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
+
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_fit_end(self) -> None:
+        """Write the EMA model for ``invert`` and ``sample``."""
+        folder = self.hparams["output"] or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "pretrained"
+        if self.trainer.is_global_zero:
+            save_model(self.model, folder)
+
+    @property
+    def method(self) -> str:
+        """The method's name in tables."""
+        return self.model.method.name
+
+    @property
+    def domain(self) -> Domain:
+        """The model's domain."""
+        return self.model.domain
+
+    def composition(self, task: EvaluationTask) -> Composition | None:
+        """Composition for a task; ``None`` if it needs a learned concept."""
+        if task.learned:
+            return None
+        embeddings = torch.stack([self.model.concept(text)[None] for text in (*task.texts, *task.without)])
+        weights = [self.guidance] * len(task.texts) + [WITHOUT_WEIGHT] * len(task.without)
+        return Composition(embeddings, embeddings.new_tensor(weights))
+
+    def demonstrated(self, concept: str) -> Demonstrations | None:
+        """Demonstrations of a learned concept: ``None`` in pretraining."""
+        return None
+
+    def concept_points(self) -> list[Point]:
+        """All embeddings, for the projector."""
+        return self.model.points()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Sign the checkpoint and store the global generators' states."""
+        super().on_save_checkpoint(checkpoint)
+        loop = self.trainer.fit_loop
+        validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
+        Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another module or model configuration."""
+        super().on_load_checkpoint(checkpoint)
+        self._random = Random.read(checkpoint)
+
+    def signature(self) -> dict[str, Any]:
+        """Configuration that decides the shapes and meaning of a checkpoint's parameters."""
+        different = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
+        return {key: value for key, value in asdict(self.model.config).items() if key not in different}
+
+
+def expect_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
+    """Check and return the probabilities.
+
+    Raises:
+        UserError: for a name that is not an observed vector.
+    """
+    vectors = [name for name, feature in features.items() if feature.kind == "vector"]
+    for name in shares:
+        if name not in vectors:
+            expected = f"one of {', '.join(vectors)}" if vectors else "nothing, as no vector is observed"
+            raise UserError(f"model.feature_dropout: expected {expected}, found {name!r}")
+    return dict(shares)
+
+
+def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
+    """Refuse training concepts without demonstrations, for in-context methods.
+
+    Raises:
+        UserError: with the first such concept.
+    """
+    if absent := [text for text in concepts if text not in set(shown)]:
+        raise UserError(
+            f"data: expected a demonstration of each of {len(concepts)} training concepts, found none of {len(absent)}, such as "
+            f"{absent[0]!r}; this method cannot do without"
+        )
+
+
+def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
+    """Refuse concepts with equal text embeddings, such as texts that differ in capitals alone.
+
+    Raises:
+        UserError: with two such concepts.
+    """
+    for number, text in enumerate(concepts):
+        same = (embeddings[:number] == embeddings[number]).all(dim=1).nonzero()
+        if len(same):
+            raise UserError(
+                f"concepts: {concepts[int(same[0])]!r} and {text!r} have the same embedding; expected texts that "
+                "data.encoder tells apart: change one"
+            )

@@ -1,0 +1,78 @@
+"""Pretraining with privileged information: image encoders are trained to predict positions in training demonstrations."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.features import READ, Observed, take
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.networks.image_encoder import ImageEncoders
+from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.ranges import LARGEST_FACTOR, expect_range
+from ftl_lightning.training.data import Batch
+
+
+class Teaching:
+    """Auxiliary losses of image encodings, and replacement of encodings by privileged information.
+
+    Args:
+        weights: loss weights by name, see :class:`~ftl_lightning.domains.domain.Privileged`; empty for none.
+        share: share of each step's windows without encoded images.
+
+    Raises:
+        UserError: for a weight or share out of its range, or a share without exactly one name.
+    """
+
+    def __init__(self, weights: Mapping[str, float], share: float) -> None:
+        self.weights, self.share = dict(weights), share
+        for name, weight in self.weights.items():
+            expect_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
+        expect_range("model.told", share, 0, 1)
+        if share == 1 or (share and len(self.weights) != 1):
+            raise UserError(f"model.told: expected less than 1, and one name in model.privileged, found {share}")
+
+    def expect_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
+        """Refuse names that the domain does not provide or the encoder of ``images`` cannot predict."""
+        for name in self.weights:
+            known = domain.privileged.get(name)
+            if known is None or images is None:
+                names = ", ".join(domain.privileged) if images is not None else "none, as no image is observed"
+                raise UserError(f"model.privileged: expected {names or 'none'} (domain {domain.name}), found {short(name)!r}")
+            if images.size != known.feature.size:
+                raise UserError(
+                    f"model.privileged.{name}: expected image_encoder of {known.feature.shape[0]} points, "
+                    f"found one that reads {images.size} numbers"
+                )
+            if self.share and known.told is None:
+                raise UserError(f"model.told: expected 0, as nothing tells what is read of {name!r}, found {self.share}")
+
+    def attach(self, images: ImageEncoders | None) -> None:
+        """Keep the outputs of image encoders."""
+        if self.weights and images is not None:
+            images.register_forward_hook(self._keep)
+
+    def _keep(self, module: torch.nn.Module, inputs: Any, read: Tensor) -> None:
+        self._read = read
+
+    def errors(self, domain: Domain, observed: Observed) -> dict[str, Tensor]:
+        """Mean errors of the last image encodings by name."""
+        return {name: domain.privileged[name].error(self._read, observed[name]).mean() for name in self.weights}
+
+    def apart(self, domain: Domain, batch: Batch) -> tuple[Batch, Batch | None]:
+        """Split a batch into windows with encoded images, at least one, and windows without images."""
+        count = max(1, round((1 - self.share) * len(batch.states)))
+        if count >= len(batch.states):
+            return batch, None
+        images = [name for name, feature in domain.observed.items() if feature.kind == "image"]
+        unseen = {name: values[count:] for name, values in batch.observed.items() if name not in images}
+        first = Batch(batch.states[:count], batch.concepts[:count], take(batch.observed, slice(count)))
+        return first, Batch(batch.states[count:], batch.concepts[count:], unseen)
+
+    def told(self, domain: Domain, observed: Observed, draw: torch.Generator) -> dict[str, Tensor]:
+        """Add simulated image encodings to the observations of windows without images."""
+        (name,) = self.weights
+        tell = domain.privileged[name].told
+        assert tell is not None
+        return {**observed, READ: tell(observed[name], draw)}
