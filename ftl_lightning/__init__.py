@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Composition", "Concept", "Demonstrations", "FewShot", "__version__", "list_models"]
 _MODULES = {
-    "Composition": "concepts.composition",
-    "Concept": "concepts.concept",
-    "Demonstrations": "demonstrations.container",
-    "FewShot": "few_shot",
+    "Composition": "igm.composition",
+    "Concept": "igm.concept",
+    "Demonstrations": "data.container",
+    "FewShot": "few_shot.learner",
     "__version__": "version",
-    "list_models": "shipped",
+    "list_models": "services.shipped",
 }
 """Where each of them is."""
 

@@ -20,7 +20,7 @@ from ftl_lightning.igm import concept
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.tensor_file import file_hash
-from ftl_lightning.training.concept_check import expect_concept
+from ftl_lightning.training.concept_check import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.pretrained import load_model
 
@@ -234,7 +234,7 @@ def agent() -> ConceptModel:
 )
 def test_a_learned_concept(agent: ConceptModel, header: object, tensors: dict[str, torch.Tensor], expected: str) -> None:
     safetensors.torch.save_file(tensors, "c.safetensors", {"ftl_lightning": json.dumps(header)})
-    damaged(lambda path: expect_concept(agent, Concept.load(path), path), "c.safetensors", "c.safetensors: ", expected)
+    damaged(lambda path: check_concept(agent, Concept.load(path), path), "c.safetensors", "c.safetensors: ", expected)
 
 
 # Demonstrations

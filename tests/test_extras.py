@@ -17,7 +17,7 @@ from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
 from ftl_lightning.reporting.figures import concept_map
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.extras import EXTRAS, expect_extra
+from ftl_lightning.services.extras import EXTRAS, check_extra
 from tests.conftest import CONF, ROOT, environment, refused
 from tests.domains.test_from_file import walks
 from tests.tiny import QUIET
@@ -164,10 +164,10 @@ def test_a_simulator_that_is_not_there_is_missed_before_the_work(
 def test_extras_are_those_of_the_project_and_a_missing_package_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     for extra, packages in EXTRAS.items():
-        expect_extra(extra, "a test")  # silently, since it is installed
+        check_extra(extra, "a test")  # silently, since it is installed
         assert set(packages.values()) <= {Requirement(text).name for text in offered[extra]}
     (together,) = [one for one in map(Requirement, offered["all"]) if one.name == "ftl-lightning"]
     assert together.extras == {"driving", "navigation", "play", "tabletop"}
     monkeypatch.setitem(EXTRAS, "driving", {"no_such_module": "no-such-package"})  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"a test needs the package no-such-package.*'ftl-lightning\[driving\]'"):
-        expect_extra("driving", "a test")
+        check_extra("driving", "a test")

@@ -30,7 +30,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.services.limits import MOST_HEADER, MOST_TENSORS, VARIABLE
-from ftl_lightning.services.targets import expect_writable_file, expect_writable_folder
+from ftl_lightning.services.targets import check_writable_file, check_writable_folder
 from ftl_lightning.training.data import InversionData, PretrainingData
 from ftl_lightning.training.inversion_settings import INVERSION, InversionSettings
 from ftl_lightning.training.trainer import Trainer
@@ -342,7 +342,7 @@ PLACES = ["/proc/x/o", "/sys/o", "/dev/null/o", "/dev/full", "file/o", "a\0b"]
 
 
 @pytest.mark.parametrize("place", PLACES, ids=ascii)
-@pytest.mark.parametrize("expect", [expect_writable_file, expect_writable_folder])
+@pytest.mark.parametrize("expect", [check_writable_file, check_writable_folder])
 def test_what_cannot_be_written(expect: Callable[[str], None], place: str) -> None:
     Path("file").write_text("a file")
     not_taken(expect, place, place)

@@ -176,7 +176,7 @@ def test_a_folder_that_another_run_made_in_the_meantime_is_never_removed(tmp_pat
             (folder / "results.csv").touch()
         return found
 
-    monkeypatch.setattr(log_folder, "expect_writable_folder", lambda path: None)
+    monkeypatch.setattr(log_folder, "check_writable_folder", lambda path: None)
     monkeypatch.setattr(Path, "exists", filled)
 
     def held() -> None:

@@ -31,7 +31,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import write_text
-from ftl_lightning.training.concept_check import expect_concept
+from ftl_lightning.training.concept_check import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.pretrained import load_model
 
@@ -163,7 +163,7 @@ def table(
         for place in places:
             path = place / f"{concept.replace(' ', '_')}.safetensors"
             learned = Concept.load(path)
-            expect_concept(model, learned, path)
+            check_concept(model, learned, path)
             row = name if len(places) == 1 else f"{name}, {place.name}"
             rows[row] = generated(model, learned.composition, starts, seed)
             varied[row] = variation(model, learned.composition, starts, seed)

@@ -24,7 +24,7 @@ from ftl_lightning.domains.mocap.tasks import TEST_CONCEPTS
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.networks.text_encoder import TableEncoder
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import expect_count
+from ftl_lightning.services.ranges import check_count
 from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
 from ftl_lightning.training.text_concept_model import TextConceptModel
 
@@ -85,8 +85,8 @@ def write(options: argparse.Namespace) -> None:
     Raises:
         UserError: for a target within the project, and for what cannot be read or made.
     """
-    expect_count("count", options.count, 1)
-    expect_count("scenarios", options.scenarios, 1, options.count)
+    check_count("count", options.count, 1)
+    check_count("scenarios", options.scenarios, 1, options.count)
     if options.out.resolve().is_relative_to(PROJECT):
         raise UserError(f"out: expected a folder outside the project, as recordings are written to it, found {options.out}")
     if (options.out / "films").exists():

@@ -44,7 +44,7 @@ from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.training.checkpoint import read_checkpoint
-from ftl_lightning.training.concept_check import expect_concept
+from ftl_lightning.training.concept_check import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.pretrained import load_model
 
@@ -329,7 +329,7 @@ class Fuzz:
         """A learned concept, checked against its model and sampled from."""
         path = self._written("concept.safetensors", odd_safetensors(draw.choice(self.concepts), draw))
         found = Concept.load(path)
-        expect_concept(self.model, found, path)
+        check_concept(self.model, found, path)
         _sampled(self.model, found)
         found.save(self.folder / "again.safetensors")
 

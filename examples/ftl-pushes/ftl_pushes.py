@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations, concatenate
-from ftl_lightning.data.features import Feature, InitialStates, Observed, expect_starts
+from ftl_lightning.data.features import Feature, InitialStates, Observed, check_starts
 from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Frames, Metric, Plans, Split
 from ftl_lightning.domains.rollout import Rollout
@@ -66,7 +66,7 @@ class Expert:
 
 def arrives(goal: str, states: Tensor, starts: InitialStates | None) -> Tensor:
     """Whether plans ``(sample, 16, 2)`` end near the goal."""
-    return (states[:, -1] - goal_of(goal, expect_starts(starts).require_scenes())).norm(dim=-1) < NEAR
+    return (states[:, -1] - goal_of(goal, check_starts(starts).require_scenes())).norm(dim=-1) < NEAR
 
 
 class PushEnvironment(gymnasium.Env[Any, Any]):
@@ -99,7 +99,7 @@ def film(rollout: Rollout, plans: Tensor) -> Frames:
 
 def random_target(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
     """A trivial policy: straight to a target at random."""
-    world = expect_starts(starts).require_scenes()
+    world = check_starts(starts).require_scenes()
     red = torch.rand(count, generator=generator("cpu", seed)) < 0.5
     return torch.where(red[:, None, None], straight("go to red", world), straight("go to blue", world))
 

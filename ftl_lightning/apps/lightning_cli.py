@@ -25,7 +25,7 @@ from ftl_lightning.services.configuration import configurations, expanded, parts
 from ftl_lightning.services.errors import UserError, mistake_behind, short
 from ftl_lightning.services.inputs import options
 from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training import process_group
 from ftl_lightning.training.checkpoint import last_checkpoint, read_checkpoint
 from ftl_lightning.training.trainer import Trainer
@@ -58,7 +58,7 @@ class CommandLine(LightningCLI):
             _expect_values(key, (self.config[verb] if verb else self.config).get(key), [option for option, _ in options(args)])
         seed = (self.config[verb] if verb else self.config).get("seed_everything")
         if isinstance(seed, int) and not isinstance(seed, bool):
-            expect_range("seed_everything", seed, 0, 2**32 - 1)
+            check_range("seed_everything", seed, 0, 2**32 - 1)
 
     @staticmethod
     def _expect_keys(known: Namespace, arguments: Sequence[str]) -> None:
@@ -95,7 +95,7 @@ class CommandLine(LightningCLI):
         domain = options.get("domain")
         if not isinstance(domain, str) or ":" not in domain:
             return []
-        trust.expect_module(domain, "data.domain")
+        trust.check_module(domain, "data.domain")
         return [domain]
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
@@ -258,7 +258,7 @@ def run(arguments: list[str]) -> None:
 def build(verb: str, options: list[str]) -> CommandLine:
     """Parse the options of ``fit`` or ``invert`` and build trainer, model and data without running anything."""
     line = _command_line(_Inversion if verb == "invert" else _Fit, verb, options, run=False)
-    process_group.expect_alone(line.trainer, "what another program runs")  # other processes would repeat its command line
+    process_group.check_alone(line.trainer, "what another program runs")  # other processes would repeat its command line
     return line
 
 
@@ -281,7 +281,7 @@ def _expect_trusted(verb: str, arguments: list[str]) -> None:
     packages = set(PACKAGES)
     sources = [(str(path), keys) for given in configurations(arguments) for path, keys in parts(given, verb)]
     for where, keys in (*sources, ("options", dict(options(arguments)))):
-        trust.expect_classes(keys, where)
+        trust.check_classes(keys, where)
         packages |= trust.allowed(keys)
     trust.allow_classes(packages)
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)

@@ -5,7 +5,7 @@ from typing import Literal
 
 from ftl_lightning.apps.ablation import Stage
 from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import expect_count
+from ftl_lightning.services.ranges import check_count
 
 MOST_WORKERS = 1000
 """Maximum number of parallel cells."""
@@ -46,7 +46,7 @@ class AblateOptions:
     sbatch: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        expect_count("workers", self.workers, 0, MOST_WORKERS)
+        check_count("workers", self.workers, 0, MOST_WORKERS)
 
 
 def ablate(options: AblateOptions) -> None:

@@ -161,12 +161,12 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.apps.benchmark.submission import Submission, machine
     from ftl_lightning.apps.benchmark.suite import SEEDS, load_suite
     from ftl_lightning.services.representation import counted
-    from ftl_lightning.services.targets import expect_writable_file
+    from ftl_lightning.services.targets import check_writable_file
     from ftl_lightning.training.methods import code_hash, load_method
 
     out = Path(options.out)
     work = out.with_name(f"{out.stem}.work")
-    expect_writable_file(options.out, "out")
+    check_writable_file(options.out, "out")
     method = load_method(options.method)
     names = _chosen(options)
     begun = Submission(
@@ -215,13 +215,13 @@ def _resumed(known: "Submission", begun: "Submission", out: Path) -> "Submission
 
 
 def _check(options: BenchmarkOptions) -> None:
-    from ftl_lightning.apps.benchmark.check import expect_submission, recompute
+    from ftl_lightning.apps.benchmark.check import check_submission, recompute
     from ftl_lightning.services.representation import counted
 
     path = Path(options.check)
     if (options.salt or options.recompute != BenchmarkOptions.recompute) and not options.method:
         raise UserError("recompute: expected the installed method, too: ftl-lightning benchmark METHOD --check FILE, found none")
-    submission, suites = expect_submission(path)
+    submission, suites = check_submission(path)
     rows = sum(len(run.rows) for run in submission.runs)
     counts = f"{counted(len(suites), 'suite')}, {counted(len(submission.runs), 'run')}, {counted(rows, 'row')}"
     say(line(f"{path}: {submission.name}, {counts}: whole, and its numbers agree"))

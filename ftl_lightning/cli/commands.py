@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.ranges import expect_count, expect_range
+from ftl_lightning.services.ranges import check_count, check_range
 
 MOST_DEMONSTRATIONS, MOST_WORKERS = 1_000_000, 1000
 """Maximum number of demonstrations drawn by a command, and of worker processes."""
@@ -34,16 +34,16 @@ def generate(
     """
     from ftl_lightning.domains.registry import load_domain
 
-    expect_count("count", count, 1, MOST_DEMONSTRATIONS)
-    expect_range("seed", seed, 0)
-    expect_count("workers", workers, 1, MOST_WORKERS)
+    check_count("count", count, 1, MOST_DEMONSTRATIONS)
+    check_range("seed", seed, 0)
+    check_count("workers", workers, 1, MOST_WORKERS)
     loaded = load_domain(domain)
     source = loaded.source(Path(root) if root else None)
     try:
         demonstrations = source.draw(task, count, seed, workers) if task else source.split("train", count, seed)
     except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
         if task:
-            loaded.expect_goal(task, "task")
+            loaded.check_goal(task, "task")
         raise
     demonstrations.save(out)
     say(f"{out}: {len(demonstrations)} demonstrations of {task or f'{len(loaded.concepts.training)} training concepts'}")
@@ -105,14 +105,14 @@ def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> No
         plain: list the training concepts alone.
     """
     from ftl_lightning.services.errors import about
-    from ftl_lightning.services.schema import expect_type
+    from ftl_lightning.services.schema import check_type
     from ftl_lightning.services.shipped import pretrained_folder
     from ftl_lightning.training.model_config import CONFIG, read_config
 
     place = pretrained_folder(pretrained)
     content = read_config(place)
     with about(place / CONFIG):
-        texts = expect_type(content.get("training_concepts"), Sequence[str], "training_concepts")
+        texts = check_type(content.get("training_concepts"), Sequence[str], "training_concepts")
     if not plain:
         from ftl_lightning.training.library import library, table
 
@@ -138,13 +138,13 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     from ftl_lightning.igm.concept import Concept
     from ftl_lightning.igm.explanation import explain as explained
     from ftl_lightning.services.shipped import MODELS
-    from ftl_lightning.training.concept_check import expect_concept
+    from ftl_lightning.training.concept_check import check_concept
     from ftl_lightning.training.pretrained import find_model, load_model
 
-    expect_count("nearest", nearest, 1)
+    check_count("nearest", nearest, 1)
     learned = Concept.load(concept)
     model = load_model(pretrained or find_model(learned.origin.pretrained, (Path("pretrained"), Path("logs"), MODELS)))
-    expect_concept(model, learned, concept)
+    check_concept(model, learned, concept)
     names = model.config.training_concepts
     say(f"{learned.origin.name}: learned from {learned.origin.count} demonstrations of {learned.origin.domain}")
     if learned.modes is not None:
@@ -211,9 +211,9 @@ class StudyOptions:
     consent: str = ""
 
     def __post_init__(self) -> None:
-        expect_range("seed", self.seed, 0)
+        check_range("seed", self.seed, 0)
         for name, least in (("scenarios", 1), ("repeats", 0), ("still", 0)):
-            expect_count(name, getattr(self, name), least)
+            check_count(name, getattr(self, name), least)
 
 
 def study(options: StudyOptions) -> None:

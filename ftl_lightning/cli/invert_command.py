@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.ranges import LARGEST_STEP, expect_count, expect_range
+from ftl_lightning.services.ranges import LARGEST_STEP, check_count, check_range
 
 if TYPE_CHECKING:
     from ftl_lightning.few_shot.learned_concept import LearnedConcept
@@ -39,8 +39,8 @@ class InvertOptions:
     settings: str = ""
 
     def __post_init__(self) -> None:
-        expect_count("steps", self.steps, 0, LARGEST_STEP)
-        expect_range("seed", self.seed, 0)
+        check_count("steps", self.steps, 0, LARGEST_STEP)
+        check_range("seed", self.seed, 0)
 
 
 def invert(options: InvertOptions) -> None:
@@ -49,7 +49,7 @@ def invert(options: InvertOptions) -> None:
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.igm.concept import file_name
     from ftl_lightning.services.errors import UserError, about, short
-    from ftl_lightning.services.targets import expect_writable_file
+    from ftl_lightning.services.targets import check_writable_file
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     demos = read_own(options.demonstrations)
@@ -60,7 +60,7 @@ def invert(options: InvertOptions) -> None:
     if len(set(paths)) < len(paths):
         raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(names), 150)}")
     for path in paths:
-        expect_writable_file(path, "out")
+        check_writable_file(path, "out")
     changes = {"form": options.form} if options.form else {}
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always", UserWarning)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 
 if TYPE_CHECKING:
     from ftl_lightning.apps.play.workspace import Workspace
@@ -41,7 +41,7 @@ class PlayOptions:
     def __post_init__(self) -> None:
         from ftl_lightning.services.errors import UserError
 
-        expect_range("port", self.port, 0, LARGEST_PORT)
+        check_range("port", self.port, 0, LARGEST_PORT)
         if self.pairs and not self.static:
             raise UserError("pairs: expected --static FOLDER beside it, found none")
         if bad := [pair for pair in self.pairs if len(pair.split(" + ")) != 2]:
@@ -50,10 +50,10 @@ class PlayOptions:
 
 def play(options: PlayOptions) -> None:
     """Serve the page until Ctrl-C."""
-    from ftl_lightning.services.extras import expect_extra
+    from ftl_lightning.services.extras import check_extra
     from ftl_lightning.services.shipped import shipped_models
 
-    expect_extra("play", "play: its server")
+    check_extra("play", "play: its server")
     from ftl_lightning.apps.play.application import Desk, playing
     from ftl_lightning.apps.play.server import Place, serve
 
@@ -109,14 +109,14 @@ class ViewOptions:
     browser: bool = True
 
     def __post_init__(self) -> None:
-        expect_range("port", self.port, 0, LARGEST_PORT)
+        check_range("port", self.port, 0, LARGEST_PORT)
 
 
 def view(options: ViewOptions) -> None:
     """Serve the page until Ctrl-C."""
-    from ftl_lightning.services.extras import expect_extra
+    from ftl_lightning.services.extras import check_extra
 
-    expect_extra("play", "view: its server")
+    check_extra("play", "view: its server")
     from ftl_lightning.apps.play.application import reading, viewing
     from ftl_lightning.apps.play.server import Place, serve
     from ftl_lightning.apps.play.viewer import holds_results, results_page, viewed

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import expect_count, expect_range
+from ftl_lightning.services.ranges import check_count, check_range
 
 if TYPE_CHECKING:
     from ftl_lightning.data.features import InitialStates
@@ -69,10 +69,10 @@ class SampleOptions:
         for name, path, endings in (("animation", self.animation, (".gif",)), ("figure", self.figure, (".png", ".svg", ".pdf"))):
             if path and Path(path).suffix not in endings:
                 raise UserError(f"{name}: expected a name that ends in {' or '.join(endings)}, found {path!r}")
-        expect_range("seed", self.seed, 0)
-        expect_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
-        expect_count("steps", self.steps, 0)
-        expect_count("replan", self.replan, 0)
+        check_range("seed", self.seed, 0)
+        check_count("count", self.count, 1, MOST_DRAWN if self.figure else MOST_SAMPLES)
+        check_count("steps", self.steps, 0)
+        check_count("replan", self.replan, 0)
 
 
 def sample(options: SampleOptions) -> None:
@@ -132,7 +132,7 @@ def _check_sample(options: SampleOptions, domain: "Domain") -> None:
     from ftl_lightning.services.errors import UserError
 
     if options.goal:
-        domain.expect_goal(options.goal)
+        domain.check_goal(options.goal)
     if options.animation and options.execute and domain.closed_loop and domain.closed_loop.film is None:
         raise UserError(f"animation: expected a domain that films episodes, found {domain.name}")
     if options.export and Path(options.export).suffix not in domain.show.exports:
@@ -157,14 +157,14 @@ def _export_files(export: str, count: int) -> list[Path]:
     Raises:
         UserError: before sampling, if an existing path is not a file.
     """
-    from ftl_lightning.services.targets import expect_file
+    from ftl_lightning.services.targets import check_file
 
     if not export:
         return []
     path, digits = Path(export), len(str(count - 1))
     files = [path.with_stem(f"{path.stem}_{number:0{digits}}") for number in range(count)] if count > 1 else [path]
     for file in files:
-        expect_file(file, "export")
+        check_file(file, "export")
     return files
 
 

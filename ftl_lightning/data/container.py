@@ -13,7 +13,7 @@ from ftl_lightning.data.formats.file_format import read, write
 from ftl_lightning.data.formats.file_keys import KIND, OBSERVED
 from ftl_lightning.services.data_names import written_to
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.extras import check_extra
 from ftl_lightning.services.representation import Shown, counted
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 
@@ -209,7 +209,7 @@ class Demonstrations(Shown):
         """
         kind, name = written_to(str(path))
         if kind != "file":
-            expect_extra(kind, f"{path}: this data set")
+            check_extra(kind, f"{path}: this data set")
         if kind == "minari":
             from ftl_lightning.data.formats.minari import write_minari
 

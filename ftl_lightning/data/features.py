@@ -87,7 +87,7 @@ def joined(parts: Sequence[Observed]) -> dict[str, Tensor]:
     return {name: torch.cat([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
 
-def expect_features(observed: Observed, expected: Mapping[str, Feature]) -> None:
+def check_features(observed: Observed, expected: Mapping[str, Feature]) -> None:
     """Refuse observations that lack a feature, or hold it with another shape or type (bytes or numbers).
 
     Raises:
@@ -138,7 +138,7 @@ class InitialStates(Shown):
         return self.scenes
 
 
-def expect_starts(starts: InitialStates | None) -> InitialStates:
+def check_starts(starts: InitialStates | None) -> InitialStates:
     """Return initial states.
 
     Raises:

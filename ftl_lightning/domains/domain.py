@@ -408,7 +408,7 @@ class Domain(Shown):
             _expect(f"domain {self.name}, outcome {name!r}", values, ((len(rollout.failed),),))
         return dict(outcomes)
 
-    def expect_goal(self, goal: str, key: str = "goal") -> None:
+    def check_goal(self, goal: str, key: str = "goal") -> None:
         """Refuse a goal that the domain cannot read.
 
         Raises:

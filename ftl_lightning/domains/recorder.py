@@ -68,7 +68,7 @@ class Recorder:
         hint: instruction in a sentence.
         scene: ``(task or '', seed) -> scene``; deterministic.
         record: ``(scene, path (step, piece, 2) in the film's unit, seconds (step,)) -> demonstration`` without a text. Raises
-            :class:`~ftl_lightning.services.errors.UserError` for an unusable path. Arguments are validated by :func:`expect_path`.
+            :class:`~ftl_lightning.services.errors.UserError` for an unusable path. Arguments are validated by :func:`check_path`.
         tasks: tasks with different scenes; empty if scenes do not depend on the task.
     """
 
@@ -79,7 +79,7 @@ class Recorder:
     tasks: tuple[str, ...] = ()
 
 
-def expect_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]:
+def check_path(scene: Scene, path: Any, seconds: Any) -> tuple[Numbers, Numbers]:
     """Validate a recorded path.
 
     Args:

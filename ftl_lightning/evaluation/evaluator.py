@@ -23,7 +23,7 @@ from ftl_lightning.evaluation.rows import config_hash, configuration, rows
 from ftl_lightning.evaluation.tensorboard import log_projector, log_test, own_rows, setting_means
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import say
-from ftl_lightning.services.ranges import expect_count
+from ftl_lightning.services.ranges import check_count
 from ftl_lightning.training.checkpoint import Random
 from ftl_lightning.training.data import InversionData, PretrainingData
 
@@ -62,7 +62,7 @@ class Evaluator(pl.Callback):
         **generation: Any,
     ) -> None:
         self.generation = Generation(**generation)
-        expect_count("evaluation.figures", figures, 0, 1000)
+        check_count("evaluation.figures", figures, 0, 1000)
         self.suites = None if suites is None else tuple(suites)
         self.closed_loop = closed_loop
         self.figures = figures

@@ -17,7 +17,7 @@ from ftl_lightning.evaluation.summary import OWN
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import MOST_TOGETHER, expect_count, expect_range
+from ftl_lightning.services.ranges import MOST_TOGETHER, check_count, check_range
 from ftl_lightning.services.seeding import EVALUATION_SEED, generator, task_key
 
 
@@ -55,9 +55,9 @@ class Generation:
         for key, value in (("samples", self.samples), ("replan", self.replan)):
             if value < 1:
                 raise UserError(f"evaluation.{key}: expected 1 or more, found {value}")
-        expect_count("evaluation.samples", self.samples, 1, MOST_TOGETHER)
-        expect_count("evaluation.replan", self.replan, 1)
-        expect_range("evaluation.seed", self.seed, 0)
+        check_count("evaluation.samples", self.samples, 1, MOST_TOGETHER)
+        check_count("evaluation.replan", self.replan, 1)
+        check_range("evaluation.seed", self.seed, 0)
 
     @property
     def sampling(self) -> Sampling:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.features import InitialStates, expect_starts
+from ftl_lightning.data.features import InitialStates, check_starts
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
@@ -56,7 +56,7 @@ def _planned(
     behaviour = TaskResult.of(task, plans, starts, domain)
     if loop is None:
         return behaviour
-    initial = expect_starts(starts)
+    initial = check_starts(starts)
     for place in ("", *environments):
         if (*key, "executed", place) not in _KNOWN:
             follower = PlanFollower(fixed_plans(plans), loop.act, loop.steps)
@@ -75,7 +75,7 @@ def _acted(
     environments: Sequence[str],
 ) -> TaskResult | None:
     """Run a policy that acts step by step from the initial states of ``like``; ``None`` if it would take too long."""
-    task, starts = like.task, expect_starts(like.starts)
+    task, starts = like.task, check_starts(like.starts)
     demonstrations, behaviour = demonstrations_of(task, demonstrated), like
     for place in ("", *environments):
         key = (name, domain.name, task.goal, demonstrations.hash if demonstrations else "", _hash(starts), seed, place)

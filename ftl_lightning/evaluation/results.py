@@ -11,7 +11,7 @@ import pandas as pd
 
 from ftl_lightning.evaluation.row import METHOD, REFERENCE, Row, label
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_TEXT, expect_readable
+from ftl_lightning.services.limits import MOST_TEXT, check_readable
 from ftl_lightning.services.tensor_file import alone, atomic, visible
 
 FOLDER = r"\w[\w .+-]{0,99}"
@@ -104,7 +104,7 @@ def _read(file: Path) -> pd.DataFrame:
 
 
 def _table(file: Path, kinds: Any) -> pd.DataFrame:
-    expect_readable(file, "results", MOST_TEXT)
+    check_readable(file, "results", MOST_TEXT)
     try:
         return pd.read_csv(file.absolute(), dtype=kinds, keep_default_na=False, compression=None)
     except (OSError, ValueError, OverflowError, MemoryError, csv.Error) as error:

@@ -39,7 +39,7 @@ def demonstrations_of(
         UserError: for arrays that do not fit the domain.
     """
     if isinstance(states, Demonstrations):
-        expect_of_domain("states", states, domain)
+        check_of_domain("states", states, domain)
         return states.fitted(domain.observed).named(name)
     whole, lengths = _padded("states", states)
     columns = len(domain.plans.columns)
@@ -92,7 +92,7 @@ def mended_states(
     return [path[:length].numpy() for path, length in zip(whole, lengths.tolist(), strict=True)], findings
 
 
-def expect_of_domain(key: str, plans: object, domain: Domain) -> None:
+def check_of_domain(key: str, plans: object, domain: Domain) -> None:
     """Refuse behaviour of another domain.
 
     Raises:

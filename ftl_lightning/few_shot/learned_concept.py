@@ -12,7 +12,7 @@ from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import Explanation, explain
-from ftl_lightning.services.arguments import expect_whole
+from ftl_lightning.services.arguments import check_whole
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import upload
@@ -78,7 +78,7 @@ class LearnedConcept(Composition):
         Raises:
             UserError: for another number.
         """
-        expect_whole("nearest", nearest, 1)
+        check_whole("nearest", nearest, 1)
         embedding = self.concept.weighted_sum.mean(dim=0)
         return explain(embedding, self.model.config.training_concepts, self.model.training_embeddings.cpu(), nearest)
 

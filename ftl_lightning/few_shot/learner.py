@@ -20,8 +20,8 @@ from ftl_lightning.evaluation.closed_loop import reset
 from ftl_lightning.evaluation.execution import Execution, episodes
 from ftl_lightning.few_shot.arrays import (
     Start,
+    check_of_domain,
     demonstrations_of,
-    expect_of_domain,
     mended_states,
     of_one_concept,
     scenes_of,
@@ -35,7 +35,7 @@ from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.services.arguments import changed, device_named, expect_path, expect_text, expect_whole
+from ftl_lightning.services.arguments import changed, check_path, check_text, check_whole, device_named
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.ranges import LARGEST_STEP
@@ -43,7 +43,7 @@ from ftl_lightning.services.representation import Shown
 from ftl_lightning.services.seeding import EVALUATION_SEED
 from ftl_lightning.services.shipped import pretrained_folder, shipped_models, shipped_name
 from ftl_lightning.services.trust import vouching
-from ftl_lightning.training.concept_check import expect_concept, expect_sizes
+from ftl_lightning.training.concept_check import check_concept, check_sizes
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.demonstration_check import Check, check_with, warnings_of
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
@@ -103,9 +103,9 @@ class FewShot(Shown):
         Raises:
             UserError: with the place, if there is no model, or it requires untrusted code.
         """
-        expect_path("name", name, f"the name of a model, such as {', '.join(shipped_models())}, or its folder")
+        check_path("name", name, f"the name of a model, such as {', '.join(shipped_models())}, or its folder")
         if settings is not None:
-            expect_path("settings", settings, "a configuration file of invert")
+            check_path("settings", settings, "a configuration file of invert")
         folder, place = pretrained_folder(name), device_named(device)
         known_as = ""
         if not folder.is_dir() and is_repository(str(name)):
@@ -171,7 +171,7 @@ class FewShot(Shown):
             UserError: for a path that is not a folder.
         """
         for folder in folders:
-            expect_path("folder", folder, "a folder of learned concepts")
+            check_path("folder", folder, "a folder of learned concepts")
         return library(self.model.hash, self.training_concepts, self.folder, folders)
 
     def load(self, path: str | Path) -> LearnedConcept:
@@ -186,13 +186,13 @@ class FewShot(Shown):
         Raises:
             UserError: with the file, if it is not a concept or belongs to another model.
         """
-        expect_path("path", path, "the file of a learned concept, its folder or 'owner/name' on the Hub")
+        check_path("path", path, "the file of a learned concept, its folder or 'owner/name' on the Hub")
         name, file = str(path), Path(path)
         if not os.path.lexists(file) and is_repository(name) and not name.endswith(".safetensors"):
             file = download(name, CONCEPT_FILES, "a concept's file, its folder or one on the Hub")
         whole = os.path.isdir(file)  # noqa: PTH112 (False for a name that is too long)
         concept = read_folder(file, name, self._space) if whole else Concept.load(file)
-        expect_concept(self.model, concept, path)
+        check_concept(self.model, concept, path)
         return self._learned(concept)
 
     def compose(self, text: str) -> Composition:
@@ -207,7 +207,7 @@ class FewShot(Shown):
         Raises:
             UserError: for an unknown or ambiguous concept, or an empty text.
         """
-        expect_text("compose", text, f"{self.training_concepts[0]}:1.2 + learned.safetensors")
+        check_text("compose", text, f"{self.training_concepts[0]}:1.2 + learned.safetensors")
         parts = [self._part(part) for part in parse_composition(text)]
         if not parts:
             raise UserError("concept, compose: expected a learned concept, training concepts or both, found neither")
@@ -262,7 +262,7 @@ class FewShot(Shown):
         Raises:
             UserError: if the arrays do not fit the model.
         """
-        expect_text("name", name, "go to red bowl")
+        check_text("name", name, "go to red bowl")
         return demonstrations_of(self.domain, states, observed, name)
 
     def learn(
@@ -320,7 +320,7 @@ class FewShot(Shown):
         """
         if not isinstance(demonstrations, Demonstrations):
             raise UserError(f"learn_all: expected Demonstrations, such as of Demonstrations.load, found {shown(demonstrations)}")
-        expect_of_domain("demonstrations", demonstrations, self.domain)
+        check_of_domain("demonstrations", demonstrations, self.domain)
         if not demonstrations.concepts or not all(demonstrations.concepts):
             raise UserError("demonstrations: expected a text for each, which names its concept, found none; use learn, with name")
         fitted = demonstrations.fitted(self.domain.observed)
@@ -340,11 +340,11 @@ class FewShot(Shown):
         """Learn the concepts of fitted demonstrations, in order, for a public method called by the user (``stacklevel`` 3)."""
         names = tuple(dict.fromkeys(fitted.concepts))
         title = f"learning {names[0]!r}" if len(names) == 1 else f"learning {len(names)} concepts"
-        expect_whole("seed", seed, 0, None)
+        check_whole("seed", seed, 0, None)
         chosen = changed(call, self.tuned.inversion, changes, ("steps", "seed", "progress", "watch"), INVERSION)
         settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()) and not {"modes", "adapter"} & {*changes})
-        self.model.method.expect_settings(changes if watch is None else {**changes, "watch": watch})
-        total = self.tuned.learning_steps if steps is None else expect_whole("steps", steps, 1, LARGEST_STEP)
+        self.model.method.check_settings(changes if watch is None else {**changes, "watch": watch})
+        total = self.tuned.learning_steps if steps is None else check_whole("steps", steps, 1, LARGEST_STEP)
         if note := longer_than_plans(fitted, self.model):
             warnings.warn(note, stacklevel=3)
         for name in names:
@@ -355,7 +355,7 @@ class FewShot(Shown):
             watched = {} if watch is None else {"watch": self._watched(names[0], watch)}
             learned = learn(self.model, fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), **watched)
         for name in names:
-            expect_sizes(self.model, learned[name])
+            check_sizes(self.model, learned[name])
             self._examples.append(fitted.select(name))
         judging = self.judging
         return [replace(self._learned(learned[name]), demonstrations=fitted.select(name), judging=judging) for name in names]
@@ -397,12 +397,12 @@ class FewShot(Shown):
         Raises:
             UserError: in domains without initial states.
         """
-        expect_text("goal", goal, self.training_concepts[0])
-        count, seed = expect_whole("count", count, 1), expect_whole("seed", seed, 0, None)
+        check_text("goal", goal, self.training_concepts[0])
+        count, seed = check_whole("count", count, 1), check_whole("seed", seed, 0, None)
         try:
             states = self.domain.source(None).starts(goal, count, EVALUATION_SEED + seed)
         except (KeyError, ValueError, IndexError):  # a source that does not check the text itself
-            self.judging.expect_goal(goal)
+            self.judging.check_goal(goal)
             raise
         if states is None:
             raise UserError(f"starts: expected a domain with initial states, found {self.domain.name}")
@@ -439,8 +439,8 @@ class FewShot(Shown):
         concept, sampling = self._own("sample", concept), self._sampling("sample", changes)
         starts = starts_of(self.domain, observed)
         count = count if starts is None else len(starts)
-        count, seed = expect_whole("count", count, 1), expect_whole("seed", seed, 0, None)
-        size = None if batch_size is None else expect_whole("batch_size", batch_size, 1)
+        count, seed = check_whole("count", count, 1), check_whole("seed", seed, 0, None)
+        size = None if batch_size is None else check_whole("batch_size", batch_size, 1)
         seen = {} if starts is None else moved(starts.observed, self.device)
         states = sampled(self.model, concept, count, sampling, seed, seen, size, progress).cpu()
         provenance = {"pretrained": self.model.hash, "seed": seed, "temperature": sampling.temperature}
@@ -458,7 +458,7 @@ class FewShot(Shown):
         Raises:
             UserError: for plans of another domain, a goal that the domain cannot judge, or a domain without metrics.
         """
-        expect_of_domain("evaluate", plans, self.domain)
+        check_of_domain("evaluate", plans, self.domain)
         return judged(self.judging, plans, goal)
 
     @property
@@ -468,7 +468,7 @@ class FewShot(Shown):
 
     def render(self, plans: Demonstrations, goal: str = "") -> "Figure":
         """Draw plans; with a goal, right plans are framed green and wrong plans red."""
-        expect_of_domain("render", plans, self.domain)
+        check_of_domain("render", plans, self.domain)
         return picture(self.judging, plans, goal)
 
     def execute(
@@ -501,10 +501,10 @@ class FewShot(Shown):
             raise UserError(f"environment: expected {' or '.join(loop.others) or 'none'}, found {shown(environment)}")
         loop = loop.inside(environment)
         if goal:
-            self.judging.expect_goal(goal)
-        every = self.tuned.replan if replan is None else expect_whole("replan", replan, 1)
+            self.judging.check_goal(goal)
+        every = self.tuned.replan if replan is None else check_whole("replan", replan, 1)
         concept, sampling = self._own("execute", concept), self._sampling("execute", changes)
-        seed = expect_whole("seed", seed, 0, None)
+        seed = check_whole("seed", seed, 0, None)
         starts = scenes if isinstance(scenes, InitialStates) else reset(loop, scenes_of(scenes))
         rollout, followed = episodes(self.model, loop, concept, starts, sampling, every, seed)
         return Execution(self.domain, goal, rollout, followed)

@@ -39,7 +39,7 @@ class LowRank:
         up, down = (factor.to(weight.device) for factor in self.factors[name])
         return weight + (up @ down).reshape(weight.shape)
 
-    def expect_fits(self, network: nn.Module) -> None:
+    def check_fits(self, network: nn.Module) -> None:
         """Check that every factor fits a weight of a network.
 
         Raises:

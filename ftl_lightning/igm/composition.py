@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ftl_lightning.igm.branches import Denoiser
 from ftl_lightning.igm.modes import Modes
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.representation import Shown, counted, numbers
 
 
@@ -133,7 +133,7 @@ class Composition(Shown):
         """
         if not isinstance(factor, Real | Tensor) or isinstance(factor, bool):
             raise UserError(f"compose: expected a number to multiply a concept with, found {shown(factor)}")
-        expect_range("compose: weight", float(factor))
+        check_range("compose: weight", float(factor))
         alone = self.alone and self.alone * factor
         return self._with(weights=factor * self.weights, modes=self.modes and self.modes * factor, alone=alone)
 

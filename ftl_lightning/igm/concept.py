@@ -13,11 +13,11 @@ from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.modes import STRETCH, Modes
 from ftl_lightning.igm.point import Part
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.ranges import LARGEST_FACTOR, expect_factor, expect_range
+from ftl_lightning.services.ranges import LARGEST_FACTOR, check_factor, check_range
 from ftl_lightning.services.representation import Shown, counted, numbers
-from ftl_lightning.services.schema import expect_type, from_mapping
+from ftl_lightning.services.schema import check_type, from_mapping
 from ftl_lightning.services.shipped import shipped
-from ftl_lightning.services.tensor_file import expect_finite, load_tensors, save_tensors
+from ftl_lightning.services.tensor_file import check_finite, load_tensors, save_tensors
 
 KIND = "concept"
 VERSION = 5
@@ -96,9 +96,9 @@ class QualityRecord:
 
     def __post_init__(self) -> None:
         for name in ("novelty", "spread", "roughness"):
-            expect_range(f"key 'quality.{name}'", getattr(self, name), 0)
+            check_range(f"key 'quality.{name}'", getattr(self, name), 0)
         if self.right is not None:
-            expect_range("key 'quality.right'", self.right, 0, 1)
+            check_range("key 'quality.right'", self.right, 0, 1)
 
 
 @dataclass(frozen=True, repr=False)
@@ -201,13 +201,13 @@ class Concept(Shown):
         """Embeddings ``(n,)`` of a component ``(knots, n)`` by name suffix: empty for a single knot, else ', knot 3'."""
         return {"" if self.knots == 1 else f", knot {knot}": embedding for knot, embedding in enumerate(component, start=1)}
 
-    def expect_finite(self, where: str) -> None:
+    def check_finite(self, where: str) -> None:
         """Check that all tensors and the loss are finite and the tensors not too large.
 
         Raises:
             UserError: naming ``where`` and the first offending value.
         """
-        expect_finite(self.numbers, where, "lower model.budget.learning_rate")
+        check_finite(self.numbers, where, "lower model.budget.learning_rate")
         for name, value in self.numbers.items():
             if name != "loss" and value.numel() and not value.abs().max() <= LARGEST_FACTOR:
                 raise UserError(f"{where}: expected numbers up to {LARGEST_FACTOR:g}, found larger ones in {short(name)!r}")
@@ -227,7 +227,7 @@ class Concept(Shown):
         Raises:
             UserError: for non-finite or too large values.
         """
-        self.expect_finite(str(path))
+        self.check_finite(str(path))
         header = {**asdict(self.origin), "components": len(self.weights)}
         if self.modes is not None:
             header |= {"mixed": self.modes.mixed}
@@ -264,11 +264,11 @@ class Concept(Shown):
             if unknown := set(tensors) - set(names) - {f"{ADAPTER}{name}" for name in factors}:
                 raise UserError(f"expected the tensors {', '.join(names)}, found {short(', '.join(sorted(unknown)))} too")
             _expect_shapes({name: tensors[name] for name in names})
-            everywhere = expect_type(header.get("everywhere", False), bool, "everywhere")
+            everywhere = check_type(header.get("everywhere", False), bool, "everywhere")
             adapter = LowRank.from_tensors(factors, everywhere) if factors else None
-            mixed = expect_type(header.get("mixed", False), bool, "mixed")
-            stretch = expect_type(header.get("stretch", STRETCH), float, "stretch")
-            expect_factor("key 'stretch'", stretch, 0)
+            mixed = check_type(header.get("mixed", False), bool, "mixed")
+            stretch = check_type(header.get("stretch", STRETCH), float, "stretch")
+            check_factor("key 'stretch'", stretch, 0)
             modes = Modes(tensors[MODES[0]], tensors[MODES[1]], mixed, stretch) if several else None
             origin = from_mapping(Origin, {key: header[key] for key in keys}, "")
             choice = from_mapping(Choice, header["choice"], "choice") if header.get("choice") else None
@@ -277,7 +277,7 @@ class Concept(Shown):
             concept = cls(tensors["embeddings"], tensors["weights"], origin, modes, adapter, choice, composing, quality)
             if header.get("components", len(concept.weights)) != len(concept.weights):
                 raise UserError(f"key 'components': expected {len(concept.weights)}, found {shown(header['components'])}")
-            concept.expect_finite("content")
+            concept.check_finite("content")
             return concept
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ftl_lightning.igm.schedule import clean_from_epsilon
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import expect_count, expect_factor
+from ftl_lightning.services.ranges import check_count, check_factor
 
 Epsilon = Callable[[Tensor, Tensor], Tensor]
 Noise = Callable[[], Tensor]
@@ -119,8 +119,8 @@ class Sampling:
             raise UserError(f"steps: expected 1 or more, found {self.steps}")
         if not 0 <= self.temperature < math.inf:
             raise UserError(f"temperature: expected 0 or more, found {self.temperature}")
-        expect_factor("temperature", self.temperature, 0)
-        expect_count("steps", self.steps, 1)
+        check_factor("temperature", self.temperature, 0)
+        check_count("steps", self.steps, 1)
 
     def run(self, epsilon: Epsilon, noise: Noise, alpha_bar: Tensor) -> Tensor:
         """Sample clean normalised plans ``(batch, horizon, state)``; arguments as in :class:`Sampler`."""

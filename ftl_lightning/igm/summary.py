@@ -8,7 +8,7 @@ from ftl_lightning.igm.concept import ADAPTER, KIND, MODES, VERSION, Origin, Qua
 from ftl_lightning.services.errors import UserError, about
 from ftl_lightning.services.representation import counted
 from ftl_lightning.services.schema import from_mapping
-from ftl_lightning.services.tensor_file import expect_kind, load_header
+from ftl_lightning.services.tensor_file import check_kind, load_header
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -42,7 +42,7 @@ def summary(path: str | Path) -> Summary | None:
     if isinstance(header, dict) and isinstance(header.get("kind"), str) and header["kind"] != KIND:
         return None
     with about(path):
-        keys = expect_kind(header, KIND, VERSION)
+        keys = check_kind(header, KIND, VERSION)
         names = [field.name for field in fields(Origin)]
         if missing := [*(key for key in names if key not in keys), *({"embeddings", "weights"} - set(shapes))]:
             raise UserError(f"expected the keys of a concept, found none of {', '.join(missing)}")

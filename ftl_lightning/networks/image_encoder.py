@@ -12,7 +12,7 @@ from torch.nn import functional
 from ftl_lightning.data.features import Feature, Observed
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.schema import from_mapping
 
 MOST_POINTS = 1000
@@ -190,13 +190,13 @@ class ImageEncoder(nn.Module):
         if len(shape) != 3 or not 0 < math.prod(shape) <= MOST_PIXELS:
             raise UserError(f"key 'observed': expected images of shape (channels, height, width), found {shown(tuple(shape))}")
         channels, height, width = shape
-        expect_range("model.image_encoder.keypoints", keypoints, 1)
-        expect_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
+        check_range("model.image_encoder.keypoints", keypoints, 1)
+        check_range("model.image_encoder.crop", crop, 0, min(height, width) - 1)
         if (points > 0) != (head == POINTS):
             raise UserError(
                 f"model.image_encoder.points: expected {'1 or more' if head == POINTS else 0} for {head}, found {points}"
             )
-        expect_range("model.image_encoder.points", points, 0, MOST_POINTS)
+        check_range("model.image_encoder.points", points, 0, MOST_POINTS)
         if origin and head == GRID:
             raise UserError(f"model.image_encoder.origin: expected none for a head without keypoints, found {origin!r}")
         self.crop, self.origin = crop, origin

@@ -11,7 +11,7 @@ from ftl_lightning.networks.conditions import condition_encoder, turned
 from ftl_lightning.networks.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.processes import Dropout
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 
 FEW = 8
 """Minimum number of rows in a product: with fewer, libraries sum in another order."""
@@ -60,8 +60,8 @@ class MLPDenoiser(nn.Module):
             ("condition_dim", condition_dim),
             ("initial_dim", initial_dim),
         ):
-            expect_range(f"denoiser_args.{name}", value, 1)
-        expect_range("denoiser_args.dropout", dropout, 0, 1)
+            check_range(f"denoiser_args.{name}", value, 1)
+        check_range("denoiser_args.dropout", dropout, 0, 1)
         self.time_dim, self.plane = time_dim, sizes.plane
         self.time = nn.Sequential(nn.Linear(time_dim, time_dim), nn.SiLU(), nn.Linear(time_dim, time_dim), nn.SiLU())
         self.concept = nn.Sequential(nn.Linear(sizes.concept_dim, condition_dim), nn.SiLU())

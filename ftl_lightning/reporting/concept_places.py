@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.extras import check_extra
 from ftl_lightning.training.concept_model import ConceptModel
 
 
@@ -41,7 +41,7 @@ def concept_places(model: ConceptModel, concepts: Sequence[Concept], seed: int =
     Raises:
         UserError: if scikit-learn is missing.
     """
-    expect_extra("notebooks", "concept_map")
+    check_extra("notebooks", "concept_map")
     from sklearn.manifold import TSNE
 
     learned = [

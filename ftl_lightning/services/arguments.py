@@ -13,7 +13,7 @@ import torch
 
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.option_groups import groups_of, replaced
-from ftl_lightning.services.ranges import LARGEST, expect_count, expect_range
+from ftl_lightning.services.ranges import LARGEST, check_count, check_range
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -43,7 +43,7 @@ MOST_NAMES = 8
 """Maximum number of settings listed in an error message."""
 
 
-def expect_whole(key: str, value: object, least: int, most: int | None = LARGEST) -> int:
+def check_whole(key: str, value: object, least: int, most: int | None = LARGEST) -> int:
     """Check and return a whole number.
 
     Args:
@@ -58,13 +58,13 @@ def expect_whole(key: str, value: object, least: int, most: int | None = LARGEST
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise UserError(f"{key}: expected a whole number, {least} or more, found {shown(value)}")
     if most is None:
-        expect_range(key, int(value), least)
+        check_range(key, int(value), least)
     else:
-        expect_count(key, int(value), least, most)
+        check_count(key, int(value), least, most)
     return int(value)
 
 
-def expect_text(key: str, value: object, example: str) -> None:
+def check_text(key: str, value: object, example: str) -> None:
     """Refuse a value that is not a text.
 
     Raises:
@@ -74,7 +74,7 @@ def expect_text(key: str, value: object, example: str) -> None:
         raise UserError(f"{key}: expected a text, such as {shown(example, 40)}, found {shown(value)}")
 
 
-def expect_path(key: str, value: object, what: str) -> None:
+def check_path(key: str, value: object, what: str) -> None:
     """Refuse a value that is not a path.
 
     Raises:

@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import expect_readable
+from ftl_lightning.services.limits import check_readable
 from ftl_lightning.services.shipped import shipped
 
 DEFAULTS = "defaults"
@@ -136,7 +136,7 @@ def _relative(path: Path) -> Path:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    expect_readable(path, "configuration", LONGEST)
+    check_readable(path, "configuration", LONGEST)
     try:
         keys = _parsed(path.read_text("utf-8"))
     except (

@@ -30,6 +30,22 @@ def shown(value: object, most: int = 60) -> str:
         return f"a very large {type(value).__name__}"
 
 
+def require(condition: object, place: str, expected: str, found: object) -> None:
+    """Check a condition of the input.
+
+    Args:
+        condition: true for valid input.
+        place: file, key or argument.
+        expected: description of valid input.
+        found: the invalid input; a string is printed as it is, any other value by :func:`shown`.
+
+    Raises:
+        UserError: ``'place: expected ..., found ...'`` unless the condition holds.
+    """
+    if not condition:
+        raise UserError(f"{place}: expected {expected}, found {found if isinstance(found, str) else shown(found)}")
+
+
 @contextmanager
 def about(where: str | Path) -> Iterator[None]:
     """Put the name of a file before an error in its content.

@@ -22,7 +22,7 @@ EXTRAS: Mapping[str, Mapping[str, str]] = {
 """Late-imported modules and their packages, by extra."""
 
 
-def expect_extra(extra: str, user: str) -> None:
+def check_extra(extra: str, user: str) -> None:
     """Require an extra's packages; nothing is imported.
 
     Args:

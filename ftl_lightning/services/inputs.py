@@ -7,10 +7,10 @@ from typing import Any
 from ftl_lightning.services.configuration import configurations, load
 from ftl_lightning.services.data_names import INFO, read_from, written_to
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.extras import expect_extra
-from ftl_lightning.services.limits import MOST_TEXT, expect_readable
+from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.limits import MOST_TEXT, check_readable
 from ftl_lightning.services.shipped import missing_model, pretrained_folder, shipped
-from ftl_lightning.services.targets import expect_new_folder, expect_writable_file, expect_writable_folder
+from ftl_lightning.services.targets import check_new_folder, check_writable_file, check_writable_folder
 
 Check = Callable[[str], None]
 """Raises a :class:`UserError` for an invalid path."""
@@ -25,29 +25,29 @@ def _checkpoint(path: str) -> None:
     if path == "last":
         return
     with about("ckpt_path"):
-        expect_readable(path, "checkpoint")
+        check_readable(path, "checkpoint")
 
 
 def _demonstrations(path: str) -> None:
     kind, name = read_from(path)
     if kind == "lerobot":
-        expect_readable(Path(name) / INFO, "LeRobot info", MOST_TEXT)
+        check_readable(Path(name) / INFO, "LeRobot info", MOST_TEXT)
     elif kind == "file":
-        expect_readable(name, "demonstrations")
+        check_readable(name, "demonstrations")
 
 
 def _concept(path: str) -> None:
-    expect_readable(shipped(path), "concept")
+    check_readable(shipped(path), "concept")
 
 
 def _file(kind: str, most: int | None = None) -> Check:
     def check(path: str) -> None:
-        expect_readable(path, kind, most)
+        check_readable(path, kind, most)
 
     return check
 
 
-def _written(key: str, expect: Callable[[str, str], None] = expect_writable_file) -> Check:
+def _written(key: str, expect: Callable[[str, str], None] = check_writable_file) -> Check:
     def check(path: str) -> None:
         expect(path, key)
 
@@ -57,17 +57,17 @@ def _written(key: str, expect: Callable[[str, str], None] = expect_writable_file
 def _written_demonstrations(path: str) -> None:
     kind, name = written_to(path)
     if kind == "file":
-        return expect_writable_file(name, "out")
-    expect_extra(kind, f"out: {short(path)}: this data set")
+        return check_writable_file(name, "out")
+    check_extra(kind, f"out: {short(path)}: this data set")
     if kind == "lerobot":
-        expect_new_folder(name, "out")
-        expect_writable_folder(name, "out")
+        check_new_folder(name, "out")
+        check_writable_folder(name, "out")
 
 
 def _table(path: str) -> None:
     if path.endswith(".npz"):
         raise UserError(f"out: expected a name that ends in .safetensors, which is what is written, found {path!r}")
-    expect_writable_file(path, "out")
+    check_writable_file(path, "out")
 
 
 def _added(key: str) -> Check:
@@ -76,7 +76,7 @@ def _added(key: str) -> Check:
     def check(path: str) -> None:
         _written(key)(path)
         if Path(path).exists():
-            expect_readable(path, "results", MOST_TEXT)
+            check_readable(path, "results", MOST_TEXT)
 
     return check
 
@@ -85,14 +85,14 @@ TRAINER: Mapping[str, Check] = {
     "model.pretrained": _model,
     "data.demonstrations": _demonstrations,
     "ckpt_path": _checkpoint,
-    "model.output": _written("model.output", expect_writable_folder),
+    "model.output": _written("model.output", check_writable_folder),
     "evaluation.results": _added("evaluation.results"),
     "evaluation.films": _written("evaluation.films"),
 }
 """Checks of verbs with a trainer, by option without ``init_args``, as on the command line."""
 _COMMANDS: Mapping[str, Check] = {"pretrained": _model, "concept": _concept, "initial": _demonstrations}
 _OUT: Mapping[str, Check] = {"out": _written_demonstrations}
-_FOLDER: Mapping[str, Check] = {"out": _written("out", expect_writable_folder)}
+_FOLDER: Mapping[str, Check] = {"out": _written("out", check_writable_folder)}
 _WRITTEN: Mapping[str, Mapping[str, Check]] = {
     "generate": _OUT,
     "check": {"figure": _written("figure")},
@@ -104,10 +104,10 @@ _WRITTEN: Mapping[str, Mapping[str, Check]] = {
         "out": _written("out"),
         "check": _file("submission", MOST_TEXT),
         "leaderboard": _written("leaderboard"),
-        "data": _written("data", expect_writable_folder),
+        "data": _written("data", check_writable_folder),
     },
     "report": {**_FOLDER, "readme": _file("Markdown", MOST_TEXT), "html": _written("html")},
-    "play": {"demonstrations": _file("demonstrations"), "static": _written("static", expect_writable_folder)},
+    "play": {"demonstrations": _file("demonstrations"), "static": _written("static", check_writable_folder)},
     "prepare": _FOLDER,
     "study": {**_FOLDER, "consent": _file("text", MOST_TEXT)},
 }

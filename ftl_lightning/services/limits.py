@@ -41,7 +41,7 @@ def raised(most: int) -> int:
     return int(most * max(1, most_bytes() / MOST_BYTES))
 
 
-def expect_readable(path: str | Path, kind: str, most: int | None = None) -> int:
+def check_readable(path: str | Path, kind: str, most: int | None = None) -> int:
     """Refuse anything but a regular file of bounded size. The file is not opened: a pipe would wait for ever.
 
     Args:
@@ -69,7 +69,7 @@ def expect_readable(path: str | Path, kind: str, most: int | None = None) -> int
     return status.st_size
 
 
-def expect_unpacked(size: int, packed: int, what: str) -> None:
+def check_unpacked(size: int, packed: int, what: str) -> None:
     """Refuse compressed content that unpacks to far more than honest content does.
 
     Args:
@@ -88,9 +88,9 @@ def read_text(path: str | Path, kind: str, most: int = MOST_TEXT, encoding: str 
     """Read a text file.
 
     Raises:
-        UserError: naming the file, as :func:`expect_readable`, or if it cannot be read or is in another encoding.
+        UserError: naming the file, as :func:`check_readable`, or if it cannot be read or is in another encoding.
     """
-    expect_readable(path, kind, most)
+    check_readable(path, kind, most)
     try:
         return Path(path).read_text(encoding=encoding)
     except UnicodeDecodeError as error:

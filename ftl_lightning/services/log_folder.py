@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.targets import expect_writable_folder
+from ftl_lightning.services.targets import check_writable_folder
 
 LOCK = ".running"
 """File in the folder of an active run, which locks it."""
@@ -86,7 +86,7 @@ def _numbered(name: str) -> Iterator[str]:
 def _claimed(folder: Path, new: bool) -> bool:
     """Claim a folder for this run; return whether it was free."""
     current, lock = _run.get(), folder / LOCK
-    expect_writable_folder(folder)
+    check_writable_folder(folder)
     while True:
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         try:

@@ -16,7 +16,7 @@ LARGEST_FACTOR = 1e6
 """Maximum of weights, temperatures and powers; larger values exhaust the precision of float32."""
 
 
-def expect_range(key: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
+def check_range(key: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
     """Refuse a number that is out of range or not finite.
 
     Args:
@@ -37,13 +37,13 @@ def expect_range(key: str, value: float, least: float = -math.inf, most: float =
     raise UserError(f"{key}: expected {expected}, found {shown(value)}")
 
 
-def expect_count(key: str, value: int, least: int, most: int = LARGEST) -> None:
+def check_count(key: str, value: int, least: int, most: int = LARGEST) -> None:
     """Check a count; report the upper bound only when it is exceeded."""
-    expect_range(key, value, least)
-    expect_range(key, value, least, most)
+    check_range(key, value, least)
+    check_range(key, value, least, most)
 
 
-def expect_factor(key: str, value: float, least: float = -LARGEST_FACTOR, most: float = LARGEST_FACTOR) -> None:
+def check_factor(key: str, value: float, least: float = -LARGEST_FACTOR, most: float = LARGEST_FACTOR) -> None:
     """Check a weight, a temperature or another factor."""
-    expect_range(key, value, -math.inf if least == -LARGEST_FACTOR else least)
-    expect_range(key, value, least, most)
+    check_range(key, value, -math.inf if least == -LARGEST_FACTOR else least)
+    check_range(key, value, least, most)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_TEXT, expect_readable
+from ftl_lightning.services.limits import MOST_TEXT, check_readable
 from ftl_lightning.services.ranges import LARGEST
 
 FLOAT32 = 3.4e38
@@ -33,7 +33,7 @@ def read_json(path: Path, kind: str = "JSON") -> Any:
         UserError: naming the file, as :func:`parse_json`; also if it is missing, too long, a device or a pipe.
         OSError: if it cannot be read.
     """
-    expect_readable(path, kind.removeprefix("a ").removesuffix(" file"), MOST_TEXT)
+    check_readable(path, kind.removeprefix("a ").removesuffix(" file"), MOST_TEXT)
     with about(path):
         return parse_json(path.read_bytes(), kind)
 
@@ -105,7 +105,7 @@ def from_mapping(kind: Callable[..., T], content: object, key: str, *given: obje
     for name in names:
         if name in needed and name not in content:
             raise UserError(f"{_named(_joined(key, name))}: expected a value, found none")
-    return kind(*given, **{name: expect_type(value, hints[name], _joined(key, name)) for name, value in content.items()})
+    return kind(*given, **{name: check_type(value, hints[name], _joined(key, name)) for name, value in content.items()})
 
 
 @functools.cache
@@ -117,7 +117,7 @@ def _arguments(kind: Callable[..., Any]) -> tuple[dict[str, Any], frozenset[str]
     return {name: hints.get(name, Any) for name in parameters}, frozenset(needed)
 
 
-def expect_type(value: Any, kind: Any, key: str) -> Any:
+def check_type(value: Any, kind: Any, key: str) -> Any:
     """Convert a value of JSON or YAML to its annotation: lists to tuples, mappings to dataclasses.
 
     Raises:
@@ -131,7 +131,7 @@ def expect_type(value: Any, kind: Any, key: str) -> Any:
             return None
         for option in (option for option in arguments if option is not type(None)):
             try:
-                return expect_type(value, option, key)
+                return check_type(value, option, key)
             except UserError as error:
                 mistake = error
         raise mistake
@@ -141,11 +141,11 @@ def expect_type(value: Any, kind: Any, key: str) -> Any:
     elif origin in (dict, collections.abc.Mapping):
         if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
             raise _mistake(key, "a mapping", value)
-        return {name: expect_type(item, arguments[1], _joined(key, name)) for name, item in value.items()}
+        return {name: check_type(item, arguments[1], _joined(key, name)) for name, item in value.items()}
     elif origin in _LISTS:
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise _mistake(key, "a list", value)
-        every = (expect_type(item, arguments[0], f"{key}[{index}]") for index, item in enumerate(value))
+        every = (check_type(item, arguments[0], f"{key}[{index}]") for index, item in enumerate(value))
         return tuple(every) if origin is tuple else list(every)
     elif kind is int:
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:

@@ -8,7 +8,7 @@ from pathlib import Path
 from ftl_lightning.services.errors import UserError, short
 
 
-def expect_file(path: str | Path, key: str = "") -> None:
+def check_file(path: str | Path, key: str = "") -> None:
     """Refuse an existing path that is no regular file: a folder, a device, a pipe, a socket, or a link to one.
 
     Args:
@@ -21,35 +21,35 @@ def expect_file(path: str | Path, key: str = "") -> None:
     _expect(path, key, "file")
 
 
-def expect_folder(path: str | Path, key: str = "") -> None:
-    """Refuse an existing path that is no folder, as :func:`expect_file`."""
+def check_folder(path: str | Path, key: str = "") -> None:
+    """Refuse an existing path that is no folder, as :func:`check_file`."""
     _expect(path, key, "folder")
 
 
-def expect_writable_file(path: str | Path, key: str = "") -> None:
-    """As :func:`expect_file`, and refuse an invalid name or an unwritable place.
+def check_writable_file(path: str | Path, key: str = "") -> None:
+    """As :func:`check_file`, and refuse an invalid name or an unwritable place.
 
     The place is tested by an unnamed file in the nearest existing folder, before long work.
     """
-    expect_file(path, key)
+    check_file(path, key)
     _expect_place(Path(path).absolute().parent, Path(path), key)
 
 
-def expect_new_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`expect_folder`, and refuse a folder that is not empty.
+def check_new_folder(path: str | Path, key: str = "") -> None:
+    """As :func:`check_folder`, and refuse a folder that is not empty.
 
     Raises:
         UserError: naming the path and its key.
     """
-    expect_folder(path, key)
+    check_folder(path, key)
     if Path(path).is_dir() and any(Path(path).iterdir()):
         name = short(f"{key}: {path}" if key else str(path), 150)
         raise UserError(f"{name}: expected an empty folder or nothing there, found one with files; choose another name")
 
 
-def expect_writable_folder(path: str | Path, key: str = "") -> None:
-    """As :func:`expect_folder`, and refuse an invalid name or an unwritable place."""
-    expect_folder(path, key)
+def check_writable_folder(path: str | Path, key: str = "") -> None:
+    """As :func:`check_folder`, and refuse an invalid name or an unwritable place."""
+    check_folder(path, key)
     _expect_place(Path(path).absolute(), Path(path), key)
 
 

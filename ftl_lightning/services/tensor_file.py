@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_HEADER, MOST_TENSORS, expect_readable, raised
+from ftl_lightning.services.limits import MOST_HEADER, MOST_TENSORS, check_readable, raised
 from ftl_lightning.services.schema import parse_json
-from ftl_lightning.services.targets import expect_file
+from ftl_lightning.services.targets import check_file
 
 _HEADER = "ftl_lightning"
 FORMAT = 1
@@ -45,7 +45,7 @@ def atomic(path: str | Path) -> Iterator[Path]:
     Raises:
         UserError: if the folder cannot be written, the disk is full, or ``path`` exists and is no file.
     """
-    expect_file(path)
+    check_file(path)
     path = Path(path).resolve() if Path(path).is_symlink() else Path(path)
     temporary: Path | None = None
     handle = -1
@@ -165,11 +165,11 @@ def load_tensors(path: str | Path, kind: str, version: int = FORMAT) -> tuple[di
     with _opened(Path(path), kind) as (file, text):
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
     with about(path):
-        return tensors, expect_kind(parse_json(text), kind, version)
+        return tensors, check_kind(parse_json(text), kind, version)
 
 
 def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]], Any]:
-    """Read the header and the shapes of a file of tensors, without the tensors and without the checks of :func:`expect_kind`.
+    """Read the header and the shapes of a file of tensors, without the tensors and without the checks of :func:`check_kind`.
 
     Args:
         path: the file.
@@ -190,7 +190,7 @@ def load_header(path: str | Path, kind: str) -> tuple[dict[str, tuple[int, ...]]
 @contextmanager
 def _opened(path: Path, kind: str) -> Iterator[tuple[Any, str]]:
     """Open a file of tensors; yield it with the text of its header."""
-    expect_header(path, kind, expect_readable(path, kind))
+    check_header(path, kind, check_readable(path, kind))
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             yield file, (file.metadata() or {}).get(_HEADER, "{}")
@@ -198,7 +198,7 @@ def _opened(path: Path, kind: str) -> Iterator[tuple[Any, str]]:
         raise UserError(f"{path}: expected a {kind} file, found a damaged or foreign file ({short(str(error), 100)})") from error
 
 
-def expect_kind(header: object, kind: str, version: int = FORMAT) -> dict[str, Any]:
+def check_kind(header: object, kind: str, version: int = FORMAT) -> dict[str, Any]:
     """Refuse the header of a file of another kind or version.
 
     Raises:
@@ -226,7 +226,7 @@ def kind_of(content: bytes) -> str:
         return ""
 
 
-def expect_header(path: Path, kind: str, size: int) -> None:
+def check_header(path: Path, kind: str, size: int) -> None:
     """Refuse a safetensors file whose header is too long or names too many tensors: reading it takes minutes.
 
     Args:
@@ -248,7 +248,7 @@ def expect_header(path: Path, kind: str, size: int) -> None:
             raise UserError(f"{path}: expected a {kind} file of at most {MOST_TENSORS} tensors, found {tensors}")
 
 
-def expect_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
+def check_finite(tensors: Mapping[str, Tensor], where: str, advice: str) -> None:
     """Refuse tensors with numbers that are not finite.
 
     Raises:

@@ -154,7 +154,7 @@ def _named(arguments: Sequence[str]) -> set[str]:
     return names
 
 
-def expect_classes(keys: object, where: str) -> None:
+def check_classes(keys: object, where: str) -> None:
     """Refuse a configuration with a class of a module that is neither installed nor trusted.
 
     Args:
@@ -167,10 +167,10 @@ def expect_classes(keys: object, where: str) -> None:
     for key, value in leaves(keys):
         if key.rpartition(".")[2] == "class_path" and _CLASS.fullmatch(value):
             with about(where):
-                expect_module(value.rpartition(".")[0], key)
+                check_module(value.rpartition(".")[0], key)
 
 
-def expect_module(reference: str, key: str) -> None:
+def check_module(reference: str, key: str) -> None:
     """Refuse a module, or ``module:ATTRIBUTE``, that is neither installed nor trusted.
 
     Raises:

@@ -18,7 +18,7 @@ from ftl_lightning.igm.point import NEW_COMPONENT, Point
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import say
-from ftl_lightning.services.targets import expect_writable_file
+from ftl_lightning.services.targets import check_writable_file
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.demonstration_check import warnings_of
@@ -96,7 +96,7 @@ class Adaptation(pl.LightningModule, ABC):
         if len({file_name(name) for name in self.concepts}) < len(self.concepts):
             raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(self.concepts), 150)}")
         for name in self.concepts:
-            expect_writable_file(self._file(name), "concepts")
+            check_writable_file(self._file(name), "concepts")
         self._found = {}
         expected, columns = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
         if columns != expected:

@@ -15,8 +15,8 @@ from packaging.version import InvalidVersion, Version
 from torch import Tensor
 
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.limits import expect_readable
-from ftl_lightning.services.tensor_file import atomic, expect_finite, visible
+from ftl_lightning.services.limits import check_readable
+from ftl_lightning.services.tensor_file import atomic, check_finite, visible
 
 _KEY = "belongs_to"
 _RANDOM = "random"
@@ -89,7 +89,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    size = expect_readable(path, "checkpoint")
+    size = check_readable(path, "checkpoint")
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(member.file_size for member in archive.infolist()) > size:
@@ -157,7 +157,7 @@ def check_parameters(found: Mapping[str, Any], module: pl.LightningModule, optio
             raise UserError(f"ckpt_path: key 'state_dict', {name!r}: {shapes}; it is damaged")
     # Buffers of losses may still be infinite.
     learned = [name for name, _ in module.named_parameters() if name in found] if optional else list(found)
-    expect_finite({name: found[name] for name in learned}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
+    check_finite({name: found[name] for name in learned}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
 
 
 def check_restored(module: pl.LightningModule, step: int) -> None:

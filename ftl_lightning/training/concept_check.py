@@ -7,7 +7,7 @@ from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.training.concept_model import ConceptModel
 
 
-def expect_concept(model: ConceptModel, concept: Concept, path: str | Path) -> None:
+def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> None:
     """Refuse a learned concept of another model.
 
     Args:
@@ -25,10 +25,10 @@ def expect_concept(model: ConceptModel, concept: Concept, path: str | Path) -> N
                 f"{path}: key {key!r}: expected {expected!r} (the pretrained model's), found {short(value)!r}; learn it again"
             )
     with about(path):
-        expect_sizes(model, concept)
+        check_sizes(model, concept)
 
 
-def expect_sizes(model: ConceptModel, concept: Concept) -> None:
+def check_sizes(model: ConceptModel, concept: Concept) -> None:
     """Refuse a concept whose sizes do not fit a model.
 
     Raises:
@@ -39,4 +39,4 @@ def expect_sizes(model: ConceptModel, concept: Concept) -> None:
     if concept.knots > 1 and not model.over_time:
         raise UserError(f"key 'embeddings': expected 1 knot for this model, found {concept.knots}")
     if concept.adapter is not None:
-        model.expect_adapter(concept.adapter)
+        model.check_adapter(concept.adapter)

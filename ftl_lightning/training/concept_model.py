@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.features import READ, Feature, Observed, expect_features
+from ftl_lightning.data.features import READ, Feature, Observed, check_features
 from ftl_lightning.igm.adapter import LowRank
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.point import EMPTY_CONCEPT, TRAINING_CONCEPT, Point
@@ -181,7 +181,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Weights that an adapter can change, see :func:`ftl_lightning.igm.adapter.adaptable`; none without adapters."""
         return {}
 
-    def expect_adapter(self, adapter: LowRank) -> None:
+    def check_adapter(self, adapter: LowRank) -> None:
         """Refuse an adapter that does not fit.
 
         Raises:
@@ -236,9 +236,9 @@ class ConceptModel(Shown, nn.Module, ABC):
     def _seen(self, observed: Observed) -> Observed:
         read = READ in observed
         if self.view is not None:
-            expect_features(observed, _unread(self.domain.observed, read))
+            check_features(observed, _unread(self.domain.observed, read))
             observed = self.view.observe(observed)
-        expect_features(observed, _unread(self.config.observed, read))
+        check_features(observed, _unread(self.config.observed, read))
         return observed
 
     def _dropped(self, vectors: Tensor) -> Tensor:

@@ -15,14 +15,14 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from ftl_lightning.data.container import Demonstrations, concatenate
-from ftl_lightning.data.features import expect_features
+from ftl_lightning.data.features import check_features
 from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain, recorded_name
 from ftl_lightning.networks.text_encoder import Encoder, load_encoder
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.processes import drawn, rows_of
-from ftl_lightning.services.ranges import LARGEST, LARGEST_STEP, MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.services.ranges import LARGEST, LARGEST_STEP, MOST_TOGETHER, check_count, check_factor, check_range
 from ftl_lightning.services.seeding import DEMONSTRATION_SEED, generator
 
 
@@ -131,7 +131,7 @@ class PretrainingData(pl.LightningDataModule):
         self.start_exponent = plans.exponent(self.horizon) if chosen.start_exponent is None else chosen.start_exponent
         if self.start_exponent < 1:
             raise UserError(f"data.start_exponent: expected 1 or more, found {chosen.start_exponent}")
-        expect_factor("data.start_exponent", self.start_exponent, 1)
+        check_factor("data.start_exponent", self.start_exponent, 1)
         counts = {
             "batch_size": (batch_size, MOST_TOGETHER),
             "steps_per_epoch": (steps_per_epoch, LARGEST_STEP),
@@ -140,9 +140,9 @@ class PretrainingData(pl.LightningDataModule):
             "validation_per_concept": (validation_per_concept, MOST_TOGETHER),
         }
         for name, (value, most) in counts.items():
-            expect_count(f"data.{name}", value, 1, most)
-        expect_range("data.seed", seed, 0)
-        expect_count("data.recoveries", recoveries, 0, LARGEST)
+            check_count(f"data.{name}", value, 1, most)
+        check_range("data.seed", seed, 0)
+        check_count("data.recoveries", recoveries, 0, LARGEST)
         self.recoveries, self.more = recoveries, more
         self.balance = chosen.balance
         if self.balance is not None and not 0 <= self.balance <= 1:
@@ -175,7 +175,7 @@ class PretrainingData(pl.LightningDataModule):
         # Evaluation draws initial states: check them before training.
         starts = source.starts(self.domain.concepts.training[0], 1, self.seed) if self.domain.observed else None
         if starts is not None:
-            expect_features(starts.observed, self.domain.observed)
+            check_features(starts.observed, self.domain.observed)
 
     def _read_more(self, path: str) -> Demonstrations:
         demonstrations = read_demonstrations(path, self.domain)
@@ -332,9 +332,9 @@ class InversionData(pl.LightningDataModule):
         if steps < 1 or demonstrations_per_concept < 1:
             given = f"{steps} and {demonstrations_per_concept}"
             raise UserError(f"data.steps, data.demonstrations_per_concept: expected 1 or more, found {given}")
-        expect_count("data.steps", steps, 1, LARGEST_STEP)
-        expect_count("data.demonstrations_per_concept", demonstrations_per_concept, 1, MOST_TOGETHER)
-        expect_range("data.seed", seed, 0)
+        check_count("data.steps", steps, 1, LARGEST_STEP)
+        check_count("data.demonstrations_per_concept", demonstrations_per_concept, 1, MOST_TOGETHER)
+        check_range("data.seed", seed, 0)
         self.seed = seed
         self.steps = steps
         self.root = None if root is None else Path(root)

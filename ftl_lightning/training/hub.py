@@ -26,7 +26,7 @@ def is_repository(name: str) -> bool:
     return bool(slash) and "/" not in rest and owner not in FOLDERS and not owner.startswith((".", "~"))
 
 
-def expect_repository(repository: object) -> str:
+def check_repository(repository: object) -> str:
     """Refuse an invalid name of a repository.
 
     Raises:
@@ -72,7 +72,7 @@ def upload(write: Callable[[Path], object], repository: str, private: bool = Fal
     Raises:
         UserError: for an invalid name, or if the upload fails.
     """
-    expect_repository(repository)
+    check_repository(repository)
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         from huggingface_hub import HfApi

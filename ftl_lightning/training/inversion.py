@@ -293,7 +293,7 @@ class Inversion(nn.Module):
                 Modes(embeddings[modes].cpu(), weights[modes].cpu(), mixed) if modes else None,
                 adapter.copied() if (adapter := self.adapter(self._adapter_of(whole))) else None,
             )
-            concepts[name].expect_finite(f"inversion: concept {name!r}")
+            concepts[name].check_finite(f"inversion: concept {name!r}")
         return concepts
 
     def _final(self, embeddings: Tensor, weights: Tensor) -> Tensor:

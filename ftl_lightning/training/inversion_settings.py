@@ -9,7 +9,7 @@ from ftl_lightning.igm.prediction import LOSSES
 from ftl_lightning.igm.schedule import LARGEST_POWER
 from ftl_lightning.services.errors import UserError, shown
 from ftl_lightning.services.option_groups import replaced
-from ftl_lightning.services.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.services.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range
 
 EXPLAINED = 0.4
 """Minimum gain of one set of embeddings, as a share of the modes' gain, to use mixtures; chosen on validation suites."""
@@ -75,8 +75,8 @@ class EmbeddingOptions:
     start: str = MEAN
 
     def __post_init__(self) -> None:
-        expect_count("model.embeddings.knots", self.knots, 1, MOST)
-        expect_factor("model.embeddings.initial_spread", self.initial_spread, 0)
+        check_count("model.embeddings.knots", self.knots, 1, MOST)
+        check_factor("model.embeddings.initial_spread", self.initial_spread, 0)
         if self.start not in STARTS:
             raise UserError(f"model.embeddings.start: expected {' or '.join(STARTS)}, found {shown(self.start)}")
         if not 0 <= self.off_span <= 1:
@@ -102,11 +102,11 @@ class WeightOptions:
     training: float | None = None
 
     def __post_init__(self) -> None:
-        expect_factor("model.weights.initial", self.initial)
-        expect_factor("model.weights.learning_rate", self.learning_rate, 0, LARGEST_RATE)
-        expect_factor("model.weights.scale", self.scale, 0)
+        check_factor("model.weights.initial", self.initial)
+        check_factor("model.weights.learning_rate", self.learning_rate, 0, LARGEST_RATE)
+        check_factor("model.weights.scale", self.scale, 0)
         if self.training is not None:
-            expect_factor("model.weights.training", self.training)
+            check_factor("model.weights.training", self.training)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +129,8 @@ class ModeOptions:
         if isinstance(self.sets, str) and self.sets not in ("each", "auto"):
             raise UserError(f"model.modes.sets: expected a number, 'each' or 'auto', found {self.sets!r}")
         if isinstance(self.sets, int):
-            expect_count("model.modes.sets", self.sets, 1, MOST_TOGETHER)
-        expect_count("model.modes.samples", self.samples, 1, MOST_TOGETHER)
+            check_count("model.modes.sets", self.sets, 1, MOST_TOGETHER)
+        check_count("model.modes.samples", self.samples, 1, MOST_TOGETHER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,8 +153,8 @@ class AdapterOptions:
             raise UserError(f"model.adapter.scope: expected concept or all, found {self.scope!r}")
         if self.rank < 0:
             raise UserError(f"model.adapter.rank: expected 0 (none) or a rank, found {self.rank}")
-        expect_count("model.adapter.rank", self.rank, 0, MOST)
-        expect_factor("model.adapter.learning_rate", self.learning_rate, 0, LARGEST_RATE)
+        check_count("model.adapter.rank", self.rank, 0, MOST)
+        check_factor("model.adapter.learning_rate", self.learning_rate, 0, LARGEST_RATE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,10 +183,10 @@ class BudgetOptions:
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
 
     def __post_init__(self) -> None:
-        expect_count("model.budget.samples", self.samples, 1, MOST_TOGETHER)
-        expect_count("model.budget.restarts", self.restarts, 1, MOST)
-        expect_count("model.budget.screening", self.screening, 0, LARGEST)
-        expect_factor("model.budget.learning_rate", self.learning_rate, 0, LARGEST_RATE)
+        check_count("model.budget.samples", self.samples, 1, MOST_TOGETHER)
+        check_count("model.budget.restarts", self.restarts, 1, MOST)
+        check_count("model.budget.screening", self.screening, 0, LARGEST)
+        check_factor("model.budget.learning_rate", self.learning_rate, 0, LARGEST_RATE)
         if self.tolerance is not None and not 0 <= self.tolerance < 1:
             raise UserError(f"model.budget.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
         if self.precision not in PRECISIONS:
@@ -211,7 +211,7 @@ class LossOptions:
     def __post_init__(self) -> None:
         if self.kind not in LOSSES:
             raise UserError(f"model.loss.kind: expected one of {', '.join(LOSSES)}, found {self.kind!r}")
-        expect_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
+        check_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,10 +249,10 @@ class InversionSettings:
     def __post_init__(self) -> None:
         if self.form not in FORMS:
             raise UserError(f"model.form: expected one of {', '.join(FORMS[1:])}, found {self.form!r}")
-        expect_count("model.components", self.components, 1, MOST)
-        expect_range("model.seed", self.seed, 0)
+        check_count("model.components", self.components, 1, MOST)
+        check_range("model.seed", self.seed, 0)
         if self.omega != "learned":
-            expect_factor("model.omega", self.omega)
+            check_factor("model.omega", self.omega)
         if self.form in (UNSAID, PAPER) and self.adapter.rank and self.budget.tolerance is not None:
             raise UserError("model.adapter.rank: expected model.budget.tolerance null beside it, found a number")
 

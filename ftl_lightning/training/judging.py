@@ -31,7 +31,7 @@ def judged(domain: Domain, plans: Demonstrations, goal: str) -> dict[str, float]
     """
     if not domain.metrics:
         raise UserError(f"evaluate: expected a domain that judges plans, found {domain.name}; execute them")
-    domain.expect_goal(goal)
+    domain.check_goal(goal)
     measured = domain.measure(goal, plans.states, plans.initial_states)
     return {name: float(values.float().mean()) for name, values in measured.items()}
 
@@ -44,7 +44,7 @@ def picture(domain: Domain, plans: Demonstrations, goal: str = "") -> "Figure":
     """
     starts, right = plans.initial_states, None
     if goal:
-        domain.expect_goal(goal)
+        domain.check_goal(goal)
         measured = domain.measure(goal, plans.states, starts).values()
         right = next((values.tolist() for values in measured if values.dtype == torch.bool and values.dim()), None)
     return domain.show.picture(plans.states, right, goal or "samples", starts if domain.observed else None)

@@ -59,7 +59,7 @@ class Method:
     configurations: str = ""
     suits: str = ""
 
-    def expect_settings(self, names: Iterable[str]) -> None:
+    def check_settings(self, names: Iterable[str]) -> None:
         """Refuse inversion settings for a method without gradient descent.
 
         Raises:
@@ -85,7 +85,7 @@ class Method:
         """The learner without a trainer."""
         return self._named(self.learner)
 
-    def expect_domain(self, domain: "Domain") -> None:
+    def check_domain(self, domain: "Domain") -> None:
         """Refuse an unsupported domain.
 
         Raises:

@@ -9,8 +9,8 @@ from ftl_lightning.domains.domain import Domain, View
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.networks.denoiser import Sizes
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.ranges import LARGEST, expect_range
-from ftl_lightning.services.schema import expect_type, read_json
+from ftl_lightning.services.ranges import LARGEST, check_range
+from ftl_lightning.services.schema import check_type, read_json
 from ftl_lightning.services.shipped import missing_model
 
 CONFIG = "config.json"
@@ -51,10 +51,10 @@ class ModelConfig(Sizes):
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        expect_range("horizon", self.horizon, 1, LONGEST)
-        expect_range("state_dim", self.state_dim, 1, LARGEST)
-        expect_range("concept_dim", self.concept_dim, 1, LARGEST)
-        expect_range("observed, image_dim", self.vector_dim, 0, LARGEST)
+        check_range("horizon", self.horizon, 1, LONGEST)
+        check_range("state_dim", self.state_dim, 1, LARGEST)
+        check_range("concept_dim", self.concept_dim, 1, LARGEST)
+        check_range("observed, image_dim", self.vector_dim, 0, LARGEST)
 
 
 def find_view(domain: Domain, name: str) -> View | None:
@@ -84,11 +84,11 @@ def read_config(folder: str | Path) -> dict[str, Any]:
         if not isinstance(content, dict) or content.get("format") != VERSION:
             raise UserError(f"expected the configuration of a pretrained model, found something else (its format is not {VERSION})")
         for key in ("kind", "hash", "domain"):
-            expect_type(content.get(key), str, key)
+            check_type(content.get(key), str, key)
         return content
 
 
-def expect_domain(config: ModelConfig, domain: Domain) -> None:
+def check_domain(config: ModelConfig, domain: Domain) -> None:
     """Refuse sizes that differ from the domain's.
 
     Raises:

@@ -13,10 +13,10 @@ from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.schema import from_mapping
-from ftl_lightning.services.tensor_file import alone, expect_finite, file_hash, load_tensors, save_tensors, write_text
+from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
 from ftl_lightning.training.concept_model import KIND, ConceptModel
-from ftl_lightning.training.model_config import CONFIG, VERSION, expect_domain, read_config
-from ftl_lightning.training.model_weights import WEIGHTS, at_most, expect_weights
+from ftl_lightning.training.model_config import CONFIG, VERSION, check_domain, read_config
+from ftl_lightning.training.model_weights import WEIGHTS, at_most, check_weights
 from ftl_lightning.training.prepared import blank
 
 M = TypeVar("M", bound=ConceptModel)
@@ -31,7 +31,7 @@ def save_model(model: ConceptModel, folder: str | Path) -> None:
         UserError: before writing, for weights that are not finite or too large for half precision.
     """
     folder, stored = Path(folder), model.stored()
-    expect_finite(stored, str(folder), "nothing was written; train it anew")
+    check_finite(stored, str(folder), "nothing was written; train it anew")
     header = {"format": VERSION, "hash": model.hash, "kind": model.method.kind}
     with alone(folder):  # concurrent writes do not mix
         save_tensors(folder / WEIGHTS, KIND, stored, {"domain": model.config.domain})
@@ -74,12 +74,12 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
             domain = own_domain(examples, config.training_concepts, config.horizon, config.metrics)
         elif domain is None:
             domain = domain_of_file(config.domain)
-        expect_domain(config, domain)
+        check_domain(config, domain)
         # First on the meta device: a small file can name sizes beyond any memory.
         with torch.device("meta"), at_most(sum(value.numel() for value in tensors.values())):
             expected = kind(blank(config, domain)).state_dict()
     with about(weights):
-        expect_weights(tensors, expected)
+        check_weights(tensors, expected)
     model = kind(blank(config, domain))
     model.examples = examples
     model.load_state_dict(tensors)

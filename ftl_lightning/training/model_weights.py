@@ -45,7 +45,7 @@ def at_most(numbers: int) -> Iterator[None]:
         handle.remove()
 
 
-def expect_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+def check_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
     """Refuse tensors that do not fit a model or are not finite.
 
     Raises:

@@ -24,7 +24,7 @@ from ftl_lightning.networks.text_encoder import EMPTY
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.option_groups import groups_of
 from ftl_lightning.services.processes import mean, rows_of
-from ftl_lightning.services.ranges import LARGEST_FACTOR, LARGEST_RATE, expect_factor, expect_range
+from ftl_lightning.services.ranges import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.training.checkpoint import Random
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
@@ -110,11 +110,11 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             ("ema_decay", ema_decay, 1),
             ("seed", seed, math.inf),
         ):
-            expect_range(f"model.{name}", value, 0, most)
-        expect_factor("model.guidance", guidance)
+            check_range(f"model.{name}", value, 0, most)
+        check_factor("model.guidance", guidance)
         self.image_encoder, self.feature_dropout = dict(image_encoder or {}), dict(feature_dropout or {})
         for name, share in self.feature_dropout.items():
-            expect_range(f"model.feature_dropout.{name}", share, 0, 1)
+            check_range(f"model.feature_dropout.{name}", share, 0, 1)
         self.teaching = Teaching(privileged or {}, told)
         self.seed = seed
         self.guidance = guidance
@@ -153,7 +153,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             raise UserError(f"data.class_path: expected a domain's pretraining data, found {type(data).__name__}")
         concepts = data.domain.concepts.training
         embeddings = data.encoder((EMPTY, *concepts))
-        expect_different(concepts, embeddings[1:])
+        check_different(concepts, embeddings[1:])
         view = find_view(data.domain, self.hparams["view"])
         features = data.domain.observed if view is None else view.features
         seen: Observed
@@ -177,7 +177,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
             perturb=self.hparams["perturb"],
             image_dim=image_dim,
             image_encoder=self.image_encoder,
-            feature_dropout=expect_dropout(self.feature_dropout, features),
+            feature_dropout=check_dropout(self.feature_dropout, features),
             plane=view.plane if view else (),
             metrics=dict(data.metrics),
             training={
@@ -199,7 +199,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
                     beside.share(config.state_columns, normalization)
             self.model = self.build(Prepared(config, data.domain, normalization, embeddings, beside), data)
             self.model.examples = data.examples
-            self.teaching.expect_taught(self.domain, self.model.images)
+            self.teaching.check_taught(self.domain, self.model.images)
         self.raw = copy.deepcopy(self.model)
         self.teaching.attach(self.raw.images)
         if not any(parameter.requires_grad for parameter in self.raw.parameters()):
@@ -339,7 +339,7 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         return {key: value for key, value in asdict(self.model.config).items() if key not in different}
 
 
-def expect_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
+def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:
     """Check and return the probabilities.
 
     Raises:
@@ -353,7 +353,7 @@ def expect_dropout(shares: Mapping[str, float], features: Mapping[str, Feature])
     return dict(shares)
 
 
-def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
+def check_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
     """Refuse training concepts without demonstrations, for in-context methods.
 
     Raises:
@@ -366,7 +366,7 @@ def expect_shown(concepts: Sequence[str], shown: Sequence[str]) -> None:
         )
 
 
-def expect_different(concepts: Sequence[str], embeddings: Tensor) -> None:
+def check_different(concepts: Sequence[str], embeddings: Tensor) -> None:
     """Refuse concepts with equal text embeddings, such as texts that differ in capitals alone.
 
     Raises:

@@ -146,7 +146,7 @@ def take_over(trainer: pl.Trainer) -> None:
         trainer.strategy._ddp_kwargs.setdefault("gradient_as_bucket_view", True)
 
 
-def expect_alone(trainer: pl.Trainer, verb: str) -> None:
+def check_alone(trainer: pl.Trainer, verb: str) -> None:
     """Refuse several processes for a verb that runs in one process.
 
     Raises:
@@ -157,7 +157,7 @@ def expect_alone(trainer: pl.Trainer, verb: str) -> None:
         raise UserError(f"trainer.devices: expected 1 for {verb}, found {processes}; {instead}")
 
 
-def expect_exact(trainer: pl.Trainer) -> None:
+def check_exact(trainer: pl.Trainer) -> None:
     """Refuse several processes unless each is started separately and holds all weights.
 
     Raises:

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import lightning.pytorch as pl
 
-from ftl_lightning.services.tensor_file import expect_finite
+from ftl_lightning.services.tensor_file import check_finite
 from ftl_lightning.training.checkpoint import check_parameters, check_restored, check_signature, sign
 
 
@@ -40,7 +40,7 @@ class ExactResume(pl.LightningModule, ABC):
         # Buffers of losses may still be infinite: with a prefix, only parameters are checked.
         learned = dict(self.named_parameters()) if self.prefix else state
         learned = {name: value for name, value in learned.items() if name in state}
-        expect_finite(learned, f"{self.doing}: step {self.global_step}", "nothing was saved of it; lower the learning rate")
+        check_finite(learned, f"{self.doing}: step {self.global_step}", "nothing was saved of it; lower the learning rate")
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another module or with other parameters."""

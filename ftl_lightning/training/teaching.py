@@ -10,7 +10,7 @@ from ftl_lightning.data.features import READ, Observed, take
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.ranges import LARGEST_FACTOR, expect_range
+from ftl_lightning.services.ranges import LARGEST_FACTOR, check_range
 from ftl_lightning.training.data import Batch
 
 
@@ -28,12 +28,12 @@ class Teaching:
     def __init__(self, weights: Mapping[str, float], share: float) -> None:
         self.weights, self.share = dict(weights), share
         for name, weight in self.weights.items():
-            expect_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
-        expect_range("model.told", share, 0, 1)
+            check_range(f"model.privileged.{name}", weight, 0, LARGEST_FACTOR)
+        check_range("model.told", share, 0, 1)
         if share == 1 or (share and len(self.weights) != 1):
             raise UserError(f"model.told: expected less than 1, and one name in model.privileged, found {share}")
 
-    def expect_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
+    def check_taught(self, domain: Domain, images: ImageEncoders | None) -> None:
         """Refuse names that the domain does not provide or the encoder of ``images`` cannot predict."""
         for name in self.weights:
             known = domain.privileged.get(name)

@@ -14,7 +14,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import silence
-from ftl_lightning.services.ranges import expect_count, expect_range
+from ftl_lightning.services.ranges import check_count, check_range
 from ftl_lightning.training import process_group
 from ftl_lightning.training.adaptation import Adaptation
 from ftl_lightning.training.checkpoint import WholeCheckpoints
@@ -115,13 +115,13 @@ class Trainer(pl.Trainer):
     verb = "fit"
 
     def __init__(self, *arguments: Any, processes: int = 1, **options: Any) -> None:
-        expect_count("trainer.processes", processes, 1, MOST_PROCESSES)
+        check_count("trainer.processes", processes, 1, MOST_PROCESSES)
         self.processes = processes
         for name, (least, most) in RANGES.items():
             value = options.get(name)
             value = int(value) if isinstance(value, str) and value.isdecimal() else value  # devices may be a string
             if isinstance(value, int | float) and not isinstance(value, bool):
-                expect_range(f"trainer.{name}", value, least, most)
+                check_range(f"trainer.{name}", value, least, most)
         for name, words in LIMITS.items():
             value = options.get(name)
             if isinstance(value, int | float) and not (0 <= value <= 1 or (value > 1 and value == int(value))):
@@ -137,7 +137,7 @@ class Trainer(pl.Trainer):
         except Exception as error:  # of many types, by accelerators, strategies and plugins
             raise UserError(f"trainer: {short(str(error), 200)}") from error
         if isinstance(self.accelerator, CPUAccelerator):
-            expect_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
+            check_range("trainer.devices", self.num_devices, 1, os.cpu_count() or 1)
         known = inspect.signature(pl.Trainer.__init__).parameters
         usual = {name: parameter.default for name, parameter in known.items()} | USUAL
         self.unusual = {
@@ -159,7 +159,7 @@ class Trainer(pl.Trainer):
                 raise UserError(f"trainer.{key}: expected 1 or more, or -1 for no limit, found 0, with which nothing is learned")
         if self.limit_train_batches == 0:
             raise UserError("trainer.limit_train_batches: expected more than 0, found 0, with which nothing is learned")
-        process_group.expect_exact(self)
+        process_group.check_exact(self)
         if self.global_rank:
             silence()
         with self._restoring():
@@ -173,13 +173,13 @@ class Trainer(pl.Trainer):
 
     def validate(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``validate``, in one process."""
-        process_group.expect_alone(self, "validate")
+        process_group.check_alone(self, "validate")
         with self._restoring():
             return super().validate(*arguments, **options)
 
     def test(self, *arguments: Any, **options: Any) -> Any:
         """Lightning's ``test``, in one process."""
-        process_group.expect_alone(self, self.verb if self.verb == "invert" else "test")
+        process_group.check_alone(self, self.verb if self.verb == "invert" else "test")
         with self._restoring():
             return super().test(*arguments, **options)
 
@@ -211,7 +211,7 @@ class Trainer(pl.Trainer):
         if ckpt_path and not model.learns:
             raise UserError(f"ckpt_path: expected none for {model.method}, which learns nothing, found {ckpt_path}")
         self.verb = "invert"
-        process_group.expect_alone(self, self.verb)
+        process_group.check_alone(self, self.verb)
         if self.processes > 1:
             self._expect_plain(model, ckpt_path)
         elif model.learns:

@@ -48,7 +48,7 @@ class StepConfig(ModelConfig):
         return min(self.horizon, 2)
 
 
-def expect_present(domain: Domain) -> None:
+def check_present(domain: Domain) -> None:
     """Refuse domains without observations.
 
     Raises:
@@ -58,17 +58,17 @@ def expect_present(domain: Domain) -> None:
         raise UserError(f"domain: expected one with observed features, found {domain.name}: there is no present to go on from")
 
 
-def expect_present_or_moment(domain: Domain) -> None:
+def check_present_or_moment(domain: Domain) -> None:
     """Refuse domains without observations, unless plans are single states.
 
     Raises:
         UserError: with the domain.
     """
     if domain.plans.horizon > 1:
-        expect_present(domain)
+        check_present(domain)
 
 
-def expect_window(config: StepConfig, data: "PretrainingData") -> None:
+def check_window(config: StepConfig, data: "PretrainingData") -> None:
     """Refuse windows that are not a transition.
 
     Raises:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ftl_lightning.data.features import Feature, InitialStates, expect_features, expect_starts, join, joined, moved, take
+from ftl_lightning.data.features import Feature, InitialStates, check_features, check_starts, join, joined, moved, take
 from ftl_lightning.services.errors import UserError
 
 
@@ -36,9 +36,9 @@ def test_samples_are_taken_joined_and_moved_feature_by_feature() -> None:
     ],
 )
 def test_features_that_are_missing_or_of_another_shape_are_told(features: dict[str, Feature], message: str) -> None:
-    expect_features(observed(2), {"place": Feature((2,)), "photo": Feature((3, 2, 2), "image")})
+    check_features(observed(2), {"place": Feature((2,)), "photo": Feature((3, 2, 2), "image")})
     with pytest.raises(UserError, match=message):
-        expect_features(observed(2), features)
+        check_features(observed(2), features)
 
 
 def test_initial_states_are_counted_by_what_there_is_and_are_taken_and_joined() -> None:
@@ -66,6 +66,6 @@ def test_scenes_and_initial_states_that_are_missing_are_told_where_nothing_goes_
     starts = InitialStates(observed(2))
     with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), what an environment is reset with, found none"):
         starts.require_scenes()
-    assert expect_starts(starts) is starts
+    assert check_starts(starts) is starts
     with pytest.raises(UserError, match="starts: expected initial states, found none; give what is observed where plans start"):
-        expect_starts(None)
+        check_starts(None)

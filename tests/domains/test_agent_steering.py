@@ -16,7 +16,7 @@ from ftl_lightning.domains.agent.expert import LENGTH, SPEED
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.rendering import SEEN
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
-from ftl_lightning.domains.recorder import Scene, expect_path
+from ftl_lightning.domains.recorder import Scene, check_path
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.services.errors import UserError
 
@@ -41,7 +41,7 @@ def led(scene: Scene, to: NDArray[np.float64], bow: float = 0.0, trembling: floa
     aside = np.array([-(to - start)[1], (to - start)[0]]) / np.linalg.norm(to - start)
     way = start + share * (to - start) + bow * np.sin(np.pi * share) * aside
     way = np.rint((way + np.random.default_rng(0).normal(0, trembling, way.shape)) / 0.005) * 0.005
-    return RECORDER.record(scene, *expect_path(scene, way[:, None].tolist(), np.linspace(0, 3, count).tolist()))
+    return RECORDER.record(scene, *check_path(scene, way[:, None].tolist(), np.linspace(0, 3, count).tolist()))
 
 
 def as_rollout(drive: Demonstrations) -> Rollout:
@@ -112,15 +112,15 @@ def test_a_long_way_ends_within_a_demonstrations_length_at_rest_and_in_sight_and
     start = np.array(scene.pieces[0].at)
     angle = np.linspace(0, 40, 2000)
     spiral = start + 0.02 * angle[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    drive = RECORDER.record(scene, *expect_path(scene, spiral[:, None], np.arange(2000.0)))
+    drive = RECORDER.record(scene, *check_path(scene, spiral[:, None], np.arange(2000.0)))
     assert int(drive.lengths[0]) <= LENGTH
     assert torch.linalg.vector_norm(drive.states[0, -1, 7:10]) < 0.02
-    outside = RECORDER.record(scene, *expect_path(scene, [[[start[0], 3.0]]], [0.0]))
+    outside = RECORDER.record(scene, *check_path(scene, [[[start[0], 3.0]]], [0.0]))
     (_, (_, high)) = SEEN
     assert outside.states[0, :, 2].max() < high + 0.02
     x, z = start
     with pytest.raises(UserError, match="lead the agent further"):
-        RECORDER.record(scene, *expect_path(scene, [[[x, z]], [[x + 0.05, z]]], [0.0, 1.0]))
+        RECORDER.record(scene, *check_path(scene, [[[x, z]], [[x + 0.05, z]]], [0.0, 1.0]))
 
 
 def test_scenes_are_those_of_their_task_and_move_the_agent_alone_and_need_the_simulator(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,4 +47,4 @@ def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> No
 
 def test_a_misspelt_goal_is_told_with_goals_that_are_near() -> None:
     with pytest.raises(UserError, match="goal: expected a task of agent, such as 'go to red bowl'"):
-        load_domain("agent").expect_goal("go to red bowll")
+        load_domain("agent").check_goal("go to red bowll")

@@ -12,7 +12,7 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, TRAINING_RELATIONS, holds, overlap
-from ftl_lightning.domains.recorder import AROUND, MOST_STEPS, Recorder, Scene, expect_path
+from ftl_lightning.domains.recorder import AROUND, MOST_STEPS, Recorder, Scene, check_path
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.vector_film import VectorFilm, still
 from ftl_lightning.services.errors import LONGEST, UserError
@@ -37,7 +37,7 @@ def drawn(horizon: int = 40) -> Recorder:
 
 def shown(recorder: Recorder, path: Any, seconds: Any = None) -> Demonstrations:
     scene = recorder.scene("", 0)
-    return recorder.record(scene, *expect_path(scene, path, list(range(len(path))) if seconds is None else seconds))
+    return recorder.record(scene, *check_path(scene, path, list(range(len(path))) if seconds is None else seconds))
 
 
 def as_hand(line: np.ndarray, rng: np.random.Generator, pixel: float) -> list[Any]:
@@ -67,11 +67,11 @@ def test_a_path_that_is_none_is_one_plain_line_and_one_near_what_is_in_sight_is_
         ([[[5 + 10 * (AROUND + 0.51), 5]]], [0], "near what is in sight"),
     ):
         with pytest.raises(UserError) as error:
-            expect_path(EMPTY, path, seconds)
+            check_path(EMPTY, path, seconds)
         assert expected in str(error.value)
         assert "\n" not in str(error.value)
         assert len(str(error.value)) <= LONGEST
-    places, times = expect_path(EMPTY, [[[-3, 12]], [[4, 5.5]], [[4, 5.5]]], [0, 0.1, 0.1])
+    places, times = check_path(EMPTY, [[[-3, 12]], [[4, 5.5]], [[4, 5.5]]], [0, 0.1, 0.1])
     assert places.tolist() == [[[-3, 12]], [[4, 5.5]], [[4, 5.5]]]
     assert times.tolist() == [0, 0.1, 0.1]
 
@@ -140,14 +140,14 @@ def test_shapes_are_put_where_they_belong_and_judged_as_any_scene() -> None:
         (number,) = piece.shapes
         assert np.allclose(scene.film.shapes[number].points[0].mean(axis=0), piece.at, atol=1e-5)
     path = [[[4.5, 2.0], [0.5, 0.4], [-0.7, 5.9]]]
-    found = ARRANGED.record(scene, *expect_path(scene, path, [0]))
+    found = ARRANGED.record(scene, *check_path(scene, path, [0]))
     before, after = states[0].reshape(3, 7), found.states[0, 0].reshape(3, 7)
     assert torch.equal(after[:, 2:], before[:, 2:])
     assert torch.allclose(after[:, :2], torch.tensor([[4.5, 2.0], [0.5, 0.4], [0.0, EXTENT]]))
     assert found.state_names == SHAPES.plans.columns
     assert found.concepts == ("",)
     scene = ARRANGED.scene("", 1)
-    found = ARRANGED.record(scene, *expect_path(scene, [[[4.5, 1.0], [2.5, 4.5], [1.0, 1.0]]], [0]))
+    found = ARRANGED.record(scene, *check_path(scene, [[[4.5, 1.0], [2.5, 4.5], [1.0, 1.0]]], [0]))
     found.save("one.safetensors")
     states = Demonstrations.load("one.safetensors").states
     assert SHAPES.metrics["accuracy"].measure("circle right of square", states, None).all()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.shipped import pretrained_folder
-from ftl_lightning.services.trust import expect_module
+from ftl_lightning.services.trust import check_module
 
 if TYPE_CHECKING:
     from ftl_lightning.training.adaptation import Adaptation
@@ -49,7 +49,7 @@ def _check(cell: Cell, made: set[str]) -> None:
         files = ", ".join(cell.configs)
         raise UserError(f"verb: {files}: expected the configuration of an adaptation (invert), found that of a pretraining (fit)")
     if ":" in data["domain"]:
-        expect_module(data["domain"], "data.domain")
+        check_module(data["domain"], "data.domain")
     domain = load_domain(data["domain"])
     for key, names in (("evaluation.suites", config["evaluation"]["suites"] or ()), ("data.suite", [data["suite"]])):
         if unknown := set(names) - set(domain.concepts.suites):

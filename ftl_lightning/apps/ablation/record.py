@@ -14,7 +14,7 @@ from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.evaluation.summary import literal
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.printing import line
-from ftl_lightning.services.schema import expect_type, read_json
+from ftl_lightning.services.schema import check_type, read_json
 from ftl_lightning.services.tensor_file import alone, write_text
 
 KIND = "cells of an ablation"
@@ -62,7 +62,7 @@ def read_record(results: str | Path) -> dict[str, Entry]:
         kind, version = (content.get("kind"), content.get("format")) if isinstance(content, dict) else (None, None)
         if (kind, version) != (KIND, FORMAT):
             raise UserError(f"expected {KIND} of format {FORMAT}, found another file; remove it, it holds no results")
-        entries: dict[str, Entry] = expect_type(content.get("cells"), dict[str, Entry], "cells")
+        entries: dict[str, Entry] = check_type(content.get("cells"), dict[str, Entry], "cells")
         return entries
 
 

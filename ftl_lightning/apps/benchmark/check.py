@@ -27,7 +27,7 @@ ERRORS = 3
 LEAST, MOST = 0.0, 1.0
 
 
-def expect_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
+def check_submission(path: Path) -> tuple[Submission, dict[str, BenchmarkSuite]]:
     """Read a submission and check its completeness and its agreement with itself and the frozen suites.
 
     Returns:

@@ -34,7 +34,7 @@ def write_data(suite: BenchmarkSuite, seeds: Sequence[int], folder: Path, form: 
         raise UserError(f"format: expected one of {', '.join(FORMATS)}, found {form!r}")
     place, known = folder / suite.name, {}
     for seed in seeds:
-        suite.expect_data(seed, root, PARTS)
+        suite.check_data(seed, root, PARTS)
         for part in PARTS:
             drawn, name = suite.drawn(part, seed, root), f"{part}-seed{seed}"
             target = _target(place, suite.name, name, form)

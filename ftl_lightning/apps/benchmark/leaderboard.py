@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from ftl_lightning.apps.benchmark.check import expect_submission
+from ftl_lightning.apps.benchmark.check import check_submission
 from ftl_lightning.apps.benchmark.run import references_of
 from ftl_lightning.apps.benchmark.submission import GIVEN, Row, Run, Score, Submission, score
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite, load_suite, suite_names
@@ -50,7 +50,7 @@ def read_submissions(folder: Path) -> list[Submission]:
         raise UserError(f"{folder}: expected a folder of submissions (.json), found none")
     known: dict[str, Submission] = {}
     for path in files:
-        submission, _ = expect_submission(path)
+        submission, _ = check_submission(path)
         if submission.name in known:
             raise UserError(f"{path}: expected one submission of {submission.name!r}, found two; remove one")
         known[submission.name] = submission

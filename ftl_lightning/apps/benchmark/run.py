@@ -169,7 +169,7 @@ class Entry:
             UserError: if the data differ from the frozen data, or the method cannot be run.
         """
         parts = ASKED if self.model else (TRAINING, *ASKED)
-        if not suite.expect_data(seed, self.root, parts):
+        if not suite.check_data(seed, self.root, parts):
             say(f"note: suite {suite.name}, seed {seed}: this processor rounds the data in another way", error=True)
         fit, invert = self.cells(suite, seed)
         start = time.monotonic()
@@ -285,7 +285,7 @@ def missing_of(suite: BenchmarkSuite, root: Path | None, method: str = "") -> st
         domain = suite.loaded()
         if method:
             with about(f"suite {suite.name}"):
-                load_method(method).expect_domain(domain)
+                load_method(method).check_domain(domain)
     except UserError as error:
         return str(error)
     return ""

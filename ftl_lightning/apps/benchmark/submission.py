@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ftl_lightning.apps.benchmark.suite import BenchmarkSuite
 from ftl_lightning.services.errors import about
-from ftl_lightning.services.limits import expect_readable
+from ftl_lightning.services.limits import check_readable
 from ftl_lightning.services.schema import from_mapping, read_json
 from ftl_lightning.services.tensor_file import content_hash, write_text
 from ftl_lightning.version import __version__
@@ -129,7 +129,7 @@ class Submission:
         Raises:
             UserError: for an invalid file, naming file and key.
         """
-        expect_readable(path, "submission", MOST)
+        check_readable(path, "submission", MOST)
         with about(path):
             return from_mapping(cls, read_json(path, "a submission"), "")
 

@@ -183,7 +183,7 @@ class BenchmarkSuite:
         """Distinct new concepts, in the order of the domain's suite."""
         return load_domain(self.domain).concepts.suites[self.test_suite].learned
 
-    def expect_data(self, seed: int, root: Path | None, parts: Sequence[str]) -> bool:
+    def check_data(self, seed: int, root: Path | None, parts: Sequence[str]) -> bool:
         """Compare data with the frozen suite. Parts without a fingerprint are skipped.
 
         Returns:

@@ -10,7 +10,7 @@ from ftl_lightning.apps.play.films import Json, film, films
 from ftl_lightning.data.check import check
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Source
-from ftl_lightning.domains.recorder import Recorder, Scene, expect_path
+from ftl_lightning.domains.recorder import Recorder, Scene, check_path
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.training.demonstration_check import fit_findings
@@ -126,7 +126,7 @@ class Demonstrating:
         recorder = self._recorder()
         if (scene := self._scenes.get(asked.scene)) is None:
             raise UserError(f"scene: expected one that was asked for, found {asked.scene}; reload the page")
-        self.add(recorder.record(scene, *expect_path(scene, asked.path, asked.seconds)))
+        self.add(recorder.record(scene, *check_path(scene, asked.path, asked.seconds)))
 
     def draw(self, asked: requests.Drawn) -> None:
         """Add demonstrations of the library: an expert's, or recordings.
@@ -134,7 +134,7 @@ class Demonstrating:
         Raises:
             UserError: for a task without demonstrations.
         """
-        self._domain.expect_goal(asked.task, "task")
+        self._domain.check_goal(asked.task, "task")
         self._count += 1
         self.add(self._source.draw(asked.task, asked.count, self._count))
         self.task = asked.task

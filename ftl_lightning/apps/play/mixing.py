@@ -115,7 +115,7 @@ def samples(model: FewShot, mixture: Mixture, asked: Sample, tasks: Sequence[str
     """
     judge = judge_of(model, mixture.examples)
     if asked.task:
-        judge.expect_goal(asked.task, "task")
+        judge.check_goal(asked.task, "task")
     how = sampling_of(model, asked.temperature)
     task, starts = starts_of(model, (asked.task, *tasks), asked.count, asked.seed)
     goal = goal_of(judge, mixture.names, asked.task)

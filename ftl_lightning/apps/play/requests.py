@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import expect_count, expect_factor, expect_range
+from ftl_lightning.services.ranges import check_count, check_factor, check_range
 
 MOST_SAMPLES, MOST_DRAWN, MOST_PARTS, MOST_NAME = 64, 20, 12, 100
 """Maximum number of samples and of drawn demonstrations per request, of concepts in a mixture, and of letters in a name."""
 MOST_TEMPERATURE = 4.0
 
 
-def expect_name(name: str) -> None:
+def check_name(name: str) -> None:
     """Refuse an invalid name.
 
     Raises:
@@ -58,7 +58,7 @@ class Drawn:
     count: int = 5
 
     def __post_init__(self) -> None:
-        expect_count("count", self.count, 1, MOST_DRAWN)
+        check_count("count", self.count, 1, MOST_DRAWN)
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Renamed:
     name: str
 
     def __post_init__(self) -> None:
-        expect_name(self.name)
+        check_name(self.name)
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Learn:
     quick: bool = True
 
     def __post_init__(self) -> None:
-        expect_name(self.name)
+        check_name(self.name)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Mixed:
     groups: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        expect_factor(f"weight of {self.id}", self.weight)
+        check_factor(f"weight of {self.id}", self.weight)
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,8 @@ class Sample:
     task: str = field(default="")
 
     def __post_init__(self) -> None:
-        expect_count("parts", len(self.parts), 1, MOST_PARTS)
-        expect_count("count", self.count, 1, MOST_SAMPLES)
-        expect_range("seed", self.seed, 0)
+        check_count("parts", len(self.parts), 1, MOST_PARTS)
+        check_count("count", self.count, 1, MOST_SAMPLES)
+        check_range("seed", self.seed, 0)
         if self.temperature is not None and not 0 <= self.temperature <= MOST_TEMPERATURE:
             raise UserError(f"temperature: expected 0 to {MOST_TEMPERATURE:g}, found {self.temperature}")

@@ -124,7 +124,7 @@ def contents(found: Sequence[Episode], told: Beside) -> Contents:
     }
 
 
-def expect_names(demonstrations: Demonstrations, taken: str, where: str) -> None:
+def check_names(demonstrations: Demonstrations, taken: str, where: str) -> None:
     """Refuse names of observed features that another format cannot hold.
 
     Args:

@@ -13,8 +13,8 @@ from ftl_lightning.data.formats.images import compressed, decompressed_images
 from ftl_lightning.data.formats.npz import read_npz, write_npz
 from ftl_lightning.services.data_names import read_from
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.extras import expect_extra
-from ftl_lightning.services.schema import expect_type
+from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.schema import check_type
 from ftl_lightning.services.tensor_file import load_tensors, save_tensors
 
 VERSION = 4
@@ -66,12 +66,12 @@ def read(path: str | Path) -> Contents:
     """
     kind, name = read_from(str(path))
     if kind == "lerobot":
-        expect_extra("lerobot", f"{path}: a LeRobot data set")
+        check_extra("lerobot", f"{path}: a LeRobot data set")
         from ftl_lightning.data.formats.lerobot import read_contents
 
         return read_contents(name)
     if kind == "minari":
-        expect_extra("minari", f"{path}: expected a file, found none; a Minari data set of this name")
+        check_extra("minari", f"{path}: expected a file, found none; a Minari data set of this name")
         from ftl_lightning.data.formats.minari import read_contents as read_data_set
 
         return read_data_set(name)
@@ -91,14 +91,14 @@ def read(path: str | Path) -> Contents:
         return {
             "states": states,
             "lengths": tensors.get("lengths", torch.full((demos,), time)),
-            "domain": expect_type(header.get("domain", ""), str, "domain"),
+            "domain": check_type(header.get("domain", ""), str, "domain"),
             "state_names": texts.get("state_names", tuple(map(str, range(columns)))),
             "state_units": texts.get("state_units", ("",) * columns),
             "concepts": texts.get("concepts", ("",) * demos),
             "observed": observed,
             "per_step": per_step,
             "scenes": scenes,
-            "provenance": expect_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
+            "provenance": check_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
         }
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.data.formats.file_keys import OBSERVED
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import expect_unpacked
+from ftl_lightning.services.limits import check_unpacked
 
 MOST_SHRUNK = 1032
 """Maximum compression ratio of zlib."""
@@ -52,7 +52,7 @@ def decompressed_images(tensors: Mapping[str, Tensor], shapes: object, per_step:
                 f"found the shape {shown(shape)} in the header; the file is damaged"
             )
         with about(f"key {short(key)!r}"):
-            expect_unpacked(math.prod(shape), len(packed), "images")
+            check_unpacked(math.prod(shape), len(packed), "images")
         content = _decompressed(key, packed.numpy().tobytes(), math.prod(shape))
         images[key] = torch.from_numpy(np.frombuffer(content, dtype=np.uint8)).reshape(shape)
     return images

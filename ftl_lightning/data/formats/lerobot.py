@@ -27,9 +27,9 @@ from ftl_lightning.data.formats.episodes import Beside, Episode, contents
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.services.data_names import INFO
 from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_TENSORS, MOST_TEXT, expect_readable, expect_unpacked, read_text
+from ftl_lightning.services.limits import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked, read_text
 from ftl_lightning.services.printing import line, say
-from ftl_lightning.services.schema import expect_type, from_mapping, parse_json, read_json
+from ftl_lightning.services.schema import check_type, from_mapping, parse_json, read_json
 from ftl_lightning.services.tensor_file import visible
 
 STATE = "observation.state"
@@ -149,27 +149,27 @@ def _info(root: Path) -> _Info:
     path = root / INFO
     content = read_json(path, "a LeRobot info file")
     with about(path):
-        content = expect_type(content, Mapping[str, Any], "")
-        version = expect_type(content.get("codebase_version"), str, "codebase_version")
+        content = check_type(content, Mapping[str, Any], "")
+        version = check_type(content.get("codebase_version"), str, "codebase_version")
         if version not in VERSIONS:
             advice = "convert it with LeRobot's own tools"
             raise UserError(f"key 'codebase_version': expected {' or '.join(VERSIONS)}, found {shown(version)}; {advice}")
-        data = expect_type(content.get("data_path"), str, "data_path")
+        data = check_type(content.get("data_path"), str, "data_path")
         if not data.startswith("data/") or ".." in Path(data).parts:
             raise UserError(f"key 'data_path': expected files in the folder 'data', found {shown(data)}")
         features = {
-            key: _feature(key, value) for key, value in expect_type(content.get("features"), Mapping[str, Any], "features").items()
+            key: _feature(key, value) for key, value in check_type(content.get("features"), Mapping[str, Any], "features").items()
         }
-        return _Info(version, expect_type(content.get("total_episodes"), int, "total_episodes"), features)
+        return _Info(version, check_type(content.get("total_episodes"), int, "total_episodes"), features)
 
 
 def _feature(key: str, content: object) -> _Feature:
-    fields = expect_type(content, Mapping[str, Any], f"features.{short(key)}")
-    dtype = expect_type(fields.get("dtype"), str, f"features.{short(key)}.dtype")
+    fields = check_type(content, Mapping[str, Any], f"features.{short(key)}")
+    dtype = check_type(fields.get("dtype"), str, f"features.{short(key)}.dtype")
     # Features that are not read, such as images, may have any shape.
     if not (feature := _Feature(dtype)).numeric:
         return feature
-    shape = expect_type(fields.get("shape"), tuple[int, ...], f"features.{short(key)}.shape")
+    shape = check_type(fields.get("shape"), tuple[int, ...], f"features.{short(key)}.shape")
     names = fields.get("names")
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as in older data sets
         (names,) = names.values()
@@ -229,7 +229,7 @@ def _lengths(root: Path, info: _Info) -> dict[int, int]:
         columns = _columns(root, "meta/episodes/*/*.parquet", {EPISODE: _Feature("int64"), LENGTH: _Feature("int64")})
         return dict(zip(columns[EPISODE].tolist(), columns[LENGTH].tolist(), strict=True))
     return {
-        expect_type(row.get(EPISODE), int, EPISODE): expect_type(row.get(LENGTH), int, LENGTH)
+        check_type(row.get(EPISODE), int, EPISODE): check_type(row.get(LENGTH), int, LENGTH)
         for row in _lines(root / "meta" / "episodes.jsonl")
     }
 
@@ -238,11 +238,11 @@ def _tasks(root: Path, info: _Info) -> dict[int, str]:
     """Task texts by number."""
     if info.old:
         return {
-            expect_type(row.get(TASK), int, TASK): expect_type(row.get("task"), str, "task")
+            check_type(row.get(TASK), int, TASK): check_type(row.get("task"), str, "task")
             for row in _lines(root / "meta" / "tasks.jsonl")
         }
     path = root / "meta" / "tasks.parquet"
-    expect_readable(path, "tasks", MOST_TEXT)
+    check_readable(path, "tasks", MOST_TEXT)
     with _reading(path), pq.ParquetFile(path) as file:
         unpacked = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
         if max(unpacked, file.metadata.num_rows) > MOST_TEXT:
@@ -262,7 +262,7 @@ def _lines(path: Path) -> Iterator[Mapping[str, Any]]:
     for number, text in enumerate(read_text(path, "LeRobot").splitlines()):
         if text.strip():
             with about(path):
-                yield expect_type(parse_json(text), Mapping[str, Any], f"line {number + 1}")
+                yield check_type(parse_json(text), Mapping[str, Any], f"line {number + 1}")
 
 
 def _columns(root: Path, pattern: str, wanted: Mapping[str, _Feature]) -> dict[str, NDArray[Any]]:
@@ -274,14 +274,14 @@ def _columns(root: Path, pattern: str, wanted: Mapping[str, _Feature]) -> dict[s
     paths = visible(root, pattern)
     if not 1 <= len(paths) <= MOST_TENSORS:
         raise UserError(f"{root}: expected Parquet files {pattern}, at most {MOST_TENSORS}, found {len(paths)}")
-    packed = sum(expect_readable(path, "Parquet") for path in paths)
+    packed = sum(check_readable(path, "Parquet") for path in paths)
     rows = 0
     for path in paths:
         with _reading(path), pq.ParquetFile(path) as file:
             _expect_columns(path, file, wanted)
             rows += file.metadata.num_rows
     with about(root):
-        expect_unpacked(rows * sum(spec.size * (1 if spec.dtype == "uint8" else 8) for spec in wanted.values()), packed, "frames")
+        check_unpacked(rows * sum(spec.size * (1 if spec.dtype == "uint8" else 8) for spec in wanted.values()), packed, "frames")
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in wanted}
     for path in paths:
         with _reading(path), pq.ParquetFile(path) as file:

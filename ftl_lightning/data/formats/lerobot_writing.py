@@ -15,11 +15,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.formats.episodes import Episode, beside, episodes, expect_names
+from ftl_lightning.data.formats.episodes import Episode, beside, check_names, episodes
 from ftl_lightning.data.formats.lerobot import ACTION, BESIDE, EPISODE, LENGTH, OBSERVED, SCENE, STATE, TASK, VERSIONS
 from ftl_lightning.services.data_names import INFO
 from ftl_lightning.services.errors import UserError, shown
-from ftl_lightning.services.targets import expect_new_folder
+from ftl_lightning.services.targets import check_new_folder
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _DATA = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -43,7 +43,7 @@ def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int =
     """
     if not isinstance(fps, int) or fps < 1:
         raise UserError(f"fps: expected a whole number from 1, found {shown(fps)}")
-    expect_names(demonstrations, STATE.removeprefix(OBSERVED), str(folder))
+    check_names(demonstrations, STATE.removeprefix(OBSERVED), str(folder))
     texts = {text: number for number, text in enumerate(dict.fromkeys(demonstrations.concepts))}
     frames = [_frame_columns(episode, index, texts[episode.concept], fps) for index, episode in enumerate(episodes(demonstrations))]
     first = 0
@@ -193,7 +193,7 @@ def _statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder, which is renamed to ``folder`` on success and removed on failure."""
-    expect_new_folder(folder)
+    check_new_folder(folder)
     temporary: Path | None = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

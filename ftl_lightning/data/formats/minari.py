@@ -21,7 +21,7 @@ from minari.data_collector import EpisodeBuffer
 from numpy.typing import NDArray
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.formats.episodes import Beside, Episode, beside, contents, episodes, expect_names
+from ftl_lightning.data.formats.episodes import Beside, Episode, beside, check_names, contents, episodes
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.data.observations import PART, feature_parts, states_part
 from ftl_lightning.services.errors import UserError, about, short
@@ -102,7 +102,7 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     """
     if int(demonstrations.lengths.min()) < 2:
         raise UserError(f"{name}: expected demonstrations of two states or more, found one of 1, which makes no step")
-    expect_names(demonstrations, PART, name)
+    check_names(demonstrations, PART, name)
     space: gymnasium.Space[Any] = Box(-np.inf, np.inf, demonstrations.states.shape[2:], np.float32)
     if demonstrations.observed:
         parts = {key: _space(feature.kind == "image", feature.shape) for key, feature in demonstrations.features.items()}

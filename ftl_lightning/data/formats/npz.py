@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ftl_lightning.data.formats.file_keys import OBSERVED, TEXTS
 from ftl_lightning.services.errors import UserError, about, short
-from ftl_lightning.services.limits import MOST_TENSORS, expect_readable, expect_unpacked
+from ftl_lightning.services.limits import MOST_TENSORS, check_readable, check_unpacked
 from ftl_lightning.services.tensor_file import atomic
 
 _DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError)
@@ -29,9 +29,9 @@ def read_npz(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         UserError: naming the file, if it is missing, damaged, holds objects, or an array of another type than its key requires.
     """
-    size = expect_readable(path, "demonstrations")
+    size = check_readable(path, "demonstrations")
     try:
-        expect_arrays(path, size)
+        check_arrays(path, size)
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: np.asarray(archive[name]) for name in archive.files}
             texts = {name: array.tolist() for name, array in arrays.items() if array.dtype.kind == "U"}
@@ -79,7 +79,7 @@ def write_npz(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[s
         np.savez(file, **arrays)
 
 
-def expect_arrays(path: Path, size: int) -> None:
+def check_arrays(path: Path, size: int) -> None:
     """Refuse an archive that is much larger than its file, or an array whose header contradicts its size in bytes.
 
     Raises:
@@ -90,7 +90,7 @@ def expect_arrays(path: Path, size: int) -> None:
         if len(members) > MOST_TENSORS:
             raise ValueError(f"{len(members)} arrays")
         with about(path):
-            expect_unpacked(sum(member.file_size for member in members), size, "arrays")
+            check_unpacked(sum(member.file_size for member in members), size, "arrays")
         for member in members:
             with archive.open(member) as file:
                 version = np.lib.format.read_magic(file)

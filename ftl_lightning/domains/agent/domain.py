@@ -9,10 +9,10 @@ from torch import Tensor
 
 from ftl_lightning.data.cache import cached
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.features import InitialStates, Observed, expect_starts
+from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.agent import dynamics, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
-from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, MAX_STEPS, expect_simulator
+from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, MAX_STEPS, check_simulator
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.published import PUBLISHED
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
@@ -116,7 +116,7 @@ def environment() -> "AgentEnvironment":
     Raises:
         UserError: without the simulator, or if it does not start.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
     return AgentEnvironment()
@@ -148,19 +148,19 @@ def _straight(world: Tensor, chosen: Tensor) -> Tensor:
 
 
 def _nearest(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    world = expect_starts(starts).observed[OBSERVED]
+    world = check_starts(starts).observed[OBSERVED]
     away = torch.linalg.vector_norm(object_positions(world) - world[:, None, :3], dim=-1)
     return _straight(world, away.argmin(dim=1))
 
 
 def _random(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    world = expect_starts(starts).observed[OBSERVED]
+    world = check_starts(starts).observed[OBSERVED]
     draw = torch.Generator().manual_seed(seed)
     return _straight(world, torch.randint(2, (len(world),), generator=draw))
 
 
 def _oracle(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
-    env, world = environment(), expect_starts(starts).observed[OBSERVED]
+    env, world = environment(), check_starts(starts).observed[OBSERVED]
     drives = [
         torch.from_numpy(expert.demonstrate(env, state, chosen))
         for state, chosen in zip(world.numpy(), target(goal, world).tolist(), strict=True)
@@ -207,7 +207,7 @@ DOMAIN = Domain(
         judge=reached,
         film=deferred(f"{RENDERING}:film"),
         vector_film=deferred(f"{RENDERING}:vector_film"),
-        expect=expect_simulator,
+        expect=check_simulator,
     ),
     distance=distance,
     paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),

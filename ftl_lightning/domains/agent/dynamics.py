@@ -1,7 +1,7 @@
 """Constants of the physics."""
 
 from ftl_lightning.domains.agent.scenes import HEIGHT
-from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.extras import check_extra
 
 STEP = 0.05
 """Seconds between states."""
@@ -22,10 +22,10 @@ MARGIN = 0.001
 """Gap in metres that the simulator keeps between cone and ground; the ground is lowered by it to avoid hopping."""
 
 
-def expect_simulator() -> None:
+def check_simulator() -> None:
     """Check that pybullet is installed.
 
     Raises:
         UserError: with the command that installs it.
     """
-    expect_extra("navigation", "domain agent: its simulator")
+    check_extra("navigation", "domain agent: its simulator")

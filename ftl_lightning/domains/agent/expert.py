@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, STEP, expect_simulator
+from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, STEP, check_simulator
 from ftl_lightning.domains.agent.scenes import INITIAL, OBSERVED, PLANE, object_positions, scenes, target
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def demonstrations(task: str, count: int, seed: int, progress: Callable[[], None
         Observations ``(count, 150, 52)``, padded with the last, and lengths ``(count,)``.
     """
     initial = scenes(task, count, seed)
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
     observations = torch.empty(count, LENGTH, INITIAL)

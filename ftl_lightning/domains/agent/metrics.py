@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.features import InitialStates, expect_starts
+from ftl_lightning.data.features import InitialStates, check_starts
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
 from ftl_lightning.domains.rollout import Rollout
 
@@ -36,7 +36,7 @@ def progressed(goal: str, states: Tensor, starts: InitialStates | None) -> Tenso
     Returns:
         ``(scene,)`` of bool; false where a plan is not finite.
     """
-    world = expect_starts(starts).observed[OBSERVED]
+    world = check_starts(starts).observed[OBSERVED]
     to_target, _ = _to_each(goal, torch.cat((world[:, None, :3], states[:, -1:, :3]), dim=1), world)
     return to_target[:, -1] < to_target[:, 0]
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.features import InitialStates, expect_starts
-from ftl_lightning.domains.agent.dynamics import expect_simulator
+from ftl_lightning.data.features import InitialStates, check_starts
+from ftl_lightning.domains.agent.dynamics import check_simulator
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, regular, some, still
@@ -41,7 +41,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
     figure.suptitle(figure_text(title), fontsize=9)
     frames = ["#8a8a8a"] * len(states) if right is None else ["#2e9e46" if good else "#d03a3a" for good in right]
     grid = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, plan, initial, frame in zip(grid, states, expect_starts(starts).observed[OBSERVED], frames, strict=False):
+    for axes, plan, initial, frame in zip(grid, states, check_starts(starts).observed[OBSERVED], frames, strict=False):
         _scene(axes, plan, initial, frame)
     for axes in figure.axes[len(states) :]:
         axes.set_axis_off()
@@ -74,7 +74,7 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
 
     Plans are not drawn: the simulator renders the frames.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.agent.environment import AgentEnvironment
 
     observations = rollout.observed[OBSERVED][0]
@@ -103,7 +103,7 @@ def vector_film(rollout: Rollout) -> VectorFilm:
 
 def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
     """Top-view film of a plan or demonstration ``(time, 13)``, until nothing moves any more."""
-    return from_above(expect_starts(starts).observed[OBSERVED][0], states)
+    return from_above(check_starts(starts).observed[OBSERVED][0], states)
 
 
 def from_above(world: Tensor, states: Tensor) -> VectorFilm:

@@ -5,7 +5,7 @@ import torch
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.agent.domain import NAME, drives, environment, initial_states
-from ftl_lightning.domains.agent.dynamics import STEP, expect_simulator
+from ftl_lightning.domains.agent.dynamics import STEP, check_simulator
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED, STOP, Plane, follow
 from ftl_lightning.domains.agent.rendering import SEEN, STEPS_A_SECOND, from_above
 from ftl_lightning.domains.agent.scenes import OBSERVED, PLANE, object_positions, scenes
@@ -36,7 +36,7 @@ def scene(task: str, seed: int) -> Scene:
     Raises:
         UserError: without the simulator, or for an invalid task.
     """
-    expect_simulator()
+    check_simulator()
     world = scenes(task or COMPOSITIONS[0], 1, seed)
     film = from_above(world[0], world[:, :3])
     x, z = world[0, list(PLANE)].tolist()

@@ -30,9 +30,9 @@ from ftl_lightning.domains.driving.traffic import (
     STATE_NAMES,
     STATE_UNITS,
     STEP,
+    check_scenario,
+    check_simulator,
     episode_seed,
-    expect_scenario,
-    expect_simulator,
     initial_states,
     scene,
 )
@@ -62,8 +62,8 @@ class Expert:
         return training_set(name, count, self.root)
 
     def draw(self, task: str, count: int, seed: int, workers: int = 1) -> Demonstrations:
-        expect_scenario(task)
-        expect_simulator()
+        check_scenario(task)
+        check_simulator()
         from ftl_lightning.domains.driving.expert import BLIND, SEARCH
         from ftl_lightning.domains.driving.generation import demonstrations
         from ftl_lightning.domains.driving.scenarios import scenario
@@ -82,8 +82,8 @@ class Expert:
 
     def starts(self, task: str, count: int, seed: int) -> InitialStates:
         """Initial states of new episodes, scenes ``(count, 37)``."""
-        expect_scenario(task)
-        expect_simulator()
+        check_scenario(task)
+        check_simulator()
         from ftl_lightning.domains.driving.scenarios import make, observe
 
         env = make(task)
@@ -102,7 +102,7 @@ def environment(veto: str = BELIEF) -> "DrivingEnvironment":
     Raises:
         UserError: without the simulator, or for an unknown veto.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.driving.environment import DrivingEnvironment
 
     return DrivingEnvironment(veto)
@@ -160,7 +160,7 @@ DOMAIN = Domain(
         vector_film=deferred(f"{RENDERING}:vector_film"),
         less_is_better=("crash",),
         policies=policies.POLICIES,
-        expect=expect_simulator,
+        expect=check_simulator,
     ),
     distance=distance,
     fresh=False,  # the expert takes about four seconds per episode

@@ -13,7 +13,7 @@ from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving.motion import drive
 from ftl_lightning.domains.driving.shipped import training_set
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
-from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, expect_simulator, origin
+from ftl_lightning.domains.driving.traffic import STATE, TRAFFIC, check_simulator, origin
 from ftl_lightning.domains.driving.views import VIEWS
 from ftl_lightning.services.seeding import generator
 
@@ -28,7 +28,7 @@ MLP_STEPS = 400
 
 def _made(goal: str) -> "AbstractEnv":
     """Environment of the scenario, for its names of decisions."""
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.driving.scenarios import make
 
     return make(goal)
@@ -119,7 +119,7 @@ def _expert(goal: str, starts: InitialStates, demonstrations: Demonstrations | N
     """Next state of the expert; not in training scenarios, where it takes minutes (see the data card for its rates)."""
     if goal in TRAINING_CONCEPTS:
         return None
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.driving.generation import episode
 
     drives = [torch.from_numpy(episode(*origin(start))[0][:, 0]) for start in starts.require_scenes().numpy()]

@@ -12,8 +12,8 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.features import InitialStates, expect_starts, take
-from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, decision_seconds, expect_simulator
+from ftl_lightning.data.features import InitialStates, check_starts, take
+from ftl_lightning.domains.driving.traffic import NAMES, SCENARIO, TRAFFIC, VEHICLES, check_simulator, decision_seconds
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
 from ftl_lightning.services.escape import figure_text
@@ -45,7 +45,7 @@ LEGEND = (
 @functools.cache
 def _lanes(name: str) -> tuple[NDArray[np.float64], ...]:
     """Centre lines ``(points, 2)`` of a scenario's lanes."""
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.driving.scenarios import make
 
     env = make(name)
@@ -100,7 +100,7 @@ def render(states: Tensor, right: Sequence[bool] | None, title: str, starts: Ini
         title: title above the grid.
         starts: initial states of the scenes.
     """
-    starts = expect_starts(starts)
+    starts = check_starts(starts)
     shown = states[:MAX_PANELS].numpy()
     windows = [_window(plan[:, 1:3]) for plan in shown]
     sizes = np.array([high - low for low, high in windows]).max(axis=0)
@@ -195,7 +195,7 @@ def plan_film(states: Tensor, starts: InitialStates | None) -> VectorFilm:
     Raises:
         UserError: without the simulator, which provides the roads.
     """
-    seen = take(expect_starts(starts).observed, 0)
+    seen = take(check_starts(starts).observed, 0)
     vehicles = seen[TRAFFIC].unflatten(0, (VEHICLES, -1)).numpy()
     ego = states.numpy().copy()
     ego[:, 0] = 1

@@ -20,7 +20,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
 from ftl_lightning.domains.driving.fast import FastVehicle, accelerate
-from ftl_lightning.domains.driving.traffic import FEATURES, VEHICLES, expect_scenario
+from ftl_lightning.domains.driving.traffic import FEATURES, VEHICLES, check_scenario
 
 OBSERVATION = {
     "type": "Kinematics",
@@ -192,7 +192,7 @@ def scenario(name: str) -> Scenario:
     Raises:
         UserError: for an unknown name.
     """
-    return SCENARIOS[expect_scenario(name)]
+    return SCENARIOS[check_scenario(name)]
 
 
 def make(name: str, fast: bool = True) -> AbstractEnv:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.extras import check_extra
 
 NAME = "driving"
 HORIZON = 8
@@ -53,16 +53,16 @@ NAMES = tuple(DECISIONS)
 """Scenario names; scenes contain the index."""
 
 
-def expect_simulator() -> None:
+def check_simulator() -> None:
     """Check that highway-env is installed.
 
     Raises:
         UserError: with the command that installs it.
     """
-    expect_extra("driving", f"domain {NAME}: its simulator")
+    check_extra("driving", f"domain {NAME}: its simulator")
 
 
-def expect_scenario(name: str) -> str:
+def check_scenario(name: str) -> str:
     """Return the name if it is a scenario's.
 
     Raises:
@@ -79,7 +79,7 @@ def decision_seconds(name: str) -> float:
     Raises:
         UserError: for an unknown name.
     """
-    return 1 / DECISIONS[expect_scenario(name)]
+    return 1 / DECISIONS[check_scenario(name)]
 
 
 def episode_seed(seed: int, number: int) -> int:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ftl_lightning.data.features import InitialStates, expect_starts
+from ftl_lightning.data.features import InitialStates, check_starts
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
 from ftl_lightning.domains.mocap.actions import TESTED, action, judged
@@ -24,7 +24,7 @@ _KINEMATIC = ("rule", "level", "strides", "rise", "feet in time", "amplitude of 
 
 def _frozen(goal: str, count: int, starts: InitialStates | None, seed: int) -> Tensor:
     """Plans without motion."""
-    return expect_starts(starts).observed[POSE][:, None].repeat(1, HORIZON, 1)
+    return check_starts(starts).observed[POSE][:, None].repeat(1, HORIZON, 1)
 
 
 DOMAIN = Domain(

@@ -19,7 +19,7 @@ from ftl_lightning.domains.mocap.features import extremes
 from ftl_lightning.domains.mocap.judge import PARTS, WHOLE, Judge, shipped_judge
 from ftl_lightning.domains.mocap.skeleton import BONES, RIGID, SHOULDERS, WRISTS, as_joints, bone_lengths
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.extras import check_extra
 
 POSE = "pose"
 """Observed feature of the initial pose."""
@@ -180,7 +180,7 @@ def learned_elsewhere(generated: Mapping[str, Tensor], real: Mapping[str, Tensor
     Raises:
         UserError: for different classes, or fewer than two; without scikit-learn.
     """
-    expect_extra("mocap", "learned_elsewhere")
+    check_extra("mocap", "learned_elsewhere")
     from sklearn.linear_model import LogisticRegression  # a second to import
 
     names = sorted(generated)

@@ -22,7 +22,7 @@ from ftl_lightning.domains.mocap.skeleton import HORIZON, JOINTS, RIGID
 from ftl_lightning.domains.mocap.source import glitches, left_out, pieces, too_short
 from ftl_lightning.domains.mocap.tasks import HELD_OUT, TRAINING_CONCEPTS, cleaned
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import MOST_TEXT, expect_readable
+from ftl_lightning.services.limits import MOST_TEXT, check_readable
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.representation import counted
 from ftl_lightning.services.tensor_file import write_text
@@ -251,7 +251,7 @@ def _index(root: Path) -> dict[str, str]:
             f"{root}: expected the index of descriptions, {INDEXES[0]} or {INDEXES[1]}, found neither; it comes with B. Hahne's "
             "conversion of the database (cgspeed.com)"
         )
-    expect_readable(path, "text", MOST_TEXT)
+    check_readable(path, "text", MOST_TEXT)
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     rows = csv.reader(lines) if path.suffix == ".csv" else (line.split("\t") for line in lines)
     descriptions = {row[0].strip(): cleaned(row[1]) for row in rows if len(row) > 1 and _TRIAL.fullmatch(row[0].strip())}

@@ -14,12 +14,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.data.formats.npz import expect_arrays
+from ftl_lightning.data.formats.npz import check_arrays
 from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.tasks import cleaned
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.limits import expect_readable
+from ftl_lightning.services.limits import check_readable
 from ftl_lightning.services.tensor_file import atomic
 
 FILE = "recordings.npz"
@@ -85,9 +85,9 @@ class Recordings:
         Raises:
             UserError: with path and key, for a file that is damaged or of other content.
         """
-        size = expect_readable(path, "recordings")
+        size = check_readable(path, "recordings")
         try:
-            expect_arrays(path, size)
+            check_arrays(path, size)
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files if name in _KEYS}
         except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:

@@ -20,7 +20,7 @@ from ftl_lightning.domains.tabletop.interface import (
     STATE_NAMES,
     STATE_UNITS,
     WIDE_NAME,
-    expect_simulator,
+    check_simulator,
 )
 from ftl_lightning.domains.tabletop.policies import POLICIES
 from ftl_lightning.domains.tabletop.scenes import OBJECTS
@@ -43,7 +43,7 @@ def source(root: Path | None) -> "Expert":
     Raises:
         UserError: without the simulator.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.tabletop.source import Expert
 
     return Expert()
@@ -55,7 +55,7 @@ def wide_source(root: Path | None) -> "Expert":
     Raises:
         UserError: without the simulator.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.tabletop.source import Expert
 
     return Expert(WIDE_CONCEPTS, WIDE_NAME, begun_anew=WIDE_CONCEPTS)
@@ -67,7 +67,7 @@ def environment() -> "TableTopEnvironment":
     Raises:
         UserError: without the simulator, or if it does not start.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
     return TableTopEnvironment()
@@ -79,7 +79,7 @@ def wide_environment() -> "TableTopEnvironment":
     Raises:
         UserError: as :func:`environment`.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
     return TableTopEnvironment(ends_at=OBJECTS)
@@ -110,7 +110,7 @@ _LOOP = ClosedLoop(
     keeps=(POSE,),
     less_is_better=("book moved",),
     policies=POLICIES,
-    expect=expect_simulator,
+    expect=check_simulator,
 )
 DOMAIN = Domain(
     name=NAME,

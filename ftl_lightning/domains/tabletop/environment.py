@@ -22,7 +22,7 @@ from ftl_lightning.domains.tabletop.scenes import (
     gap,
     outline,
 )
-from ftl_lightning.domains.tabletop.tasks import PUSH, expect_task
+from ftl_lightning.domains.tabletop.tasks import PUSH, check_task
 from ftl_lightning.domains.tabletop.world import ARM, FASTEST, FINGERS, FRONT, OVERHEAD, REST, TIP, Bodies, build, downward, turned
 from ftl_lightning.services.errors import UserError
 
@@ -109,7 +109,7 @@ class TableTopEnvironment(gymnasium.Env[Seen, NDArray[np.float32]]):
         super().reset(seed=seed)
         options = options or {}
         if (given := options.get("scene")) is None:
-            given = draw_scene(expect_task(options.get("task", PUSH)), self.np_random)
+            given = draw_scene(check_task(options.get("task", PUSH)), self.np_random)
         self.scene = check(given).copy()
         if self._built == RECYCLE:
             self.client.disconnect()

@@ -2,7 +2,7 @@
 
 from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.tabletop.world import OVERHEAD
-from ftl_lightning.services.extras import expect_extra
+from ftl_lightning.services.extras import check_extra
 
 NAME, WIDE_NAME = "tabletop", "tabletop_wide"
 STATE_NAMES = ("hand.x", "hand.y", "hand.z", "gripper.opening")
@@ -25,10 +25,10 @@ OPEN, THRESHOLD = 0.08, 0.06
 """Opening of an open gripper in metres, and threshold above which an action opens the gripper instead of closing it."""
 
 
-def expect_simulator() -> None:
+def check_simulator() -> None:
     """Require pybullet.
 
     Raises:
         UserError: with the command that installs it.
     """
-    expect_extra("tabletop", f"domain {NAME}: its simulator")
+    check_extra("tabletop", f"domain {NAME}: its simulator")

@@ -11,8 +11,8 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform
-from ftl_lightning.domains.tabletop.interface import ACTION, expect_simulator
-from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, expect_task
+from ftl_lightning.domains.tabletop.interface import ACTION, check_simulator
+from ftl_lightning.domains.tabletop.tasks import PUSH, PUSH_ON_BOOK, TASKS, check_task
 from ftl_lightning.services.errors import UserError
 
 _LOG = logging.getLogger(__name__)
@@ -29,9 +29,9 @@ def _repeated(tasks: tuple[str, ...], height: float | None = None, feedback: boo
     """
 
     def make(goal: str, starts: InitialStates, known: Demonstrations | None, seed: int) -> Policy | None:
-        if expect_task(goal) not in tasks:
+        if check_task(goal) not in tasks:
             return None
-        expect_simulator()
+        check_simulator()
         from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
         actions: list[Tensor] = []

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.tabletop.interface import HERTZ, POSE, THRESHOLD, expect_simulator
+from ftl_lightning.domains.tabletop.interface import HERTZ, POSE, THRESHOLD, check_simulator
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, OBJECTS, SIGHT, WHITE, outline, outlines, support
 from ftl_lightning.domains.tabletop.world import ARM, COLOUR, FINGERS, FRONT, TABLE_COLOUR
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, some, still
@@ -67,7 +67,7 @@ def film(rollout: Rollout, plans: Tensor) -> list[NDArray[np.uint8]]:
         rollout: rollout of a single episode.
         plans: ``(step, horizon, 4)``; blue for an open gripper, red for a closed gripper.
     """
-    expect_simulator()
+    check_simulator()
     from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 
     trace = rollout.infos[0].get("trace", [])

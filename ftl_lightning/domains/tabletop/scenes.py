@@ -25,7 +25,7 @@ from ftl_lightning.domains.tabletop.tasks import (
     PUSHES,
     TO_BOOK,
     TO_WHITE,
-    expect_task,
+    check_task,
 )
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import task_key
@@ -326,6 +326,6 @@ def scenes(task: str, count: int, seed: int) -> Tensor:
     Raises:
         UserError: for an unknown task.
     """
-    expect_task(task)
+    check_task(task)
     drawn = [draw_scene(task, np.random.default_rng([seed, task_key(task), number])) for number in range(count)]
     return torch.from_numpy(np.stack(drawn))

@@ -19,7 +19,7 @@ from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, led_astray, perform
 from ftl_lightning.domains.tabletop.interface import FEATURES, IMAGE, NAME, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.scenes import draw_scene, scenes
-from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, expect_task
+from ftl_lightning.domains.tabletop.tasks import PUSH, PUSHES, TRAINING_CONCEPTS, check_task
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import VALIDATION_SEED, task_key
 
@@ -183,7 +183,7 @@ class Expert:
         self, task: str, count: int, seed: int, workers: int = 1, scatter: bool = False, elsewhere: bool = False
     ) -> Demonstrations:
         """``count`` demonstrations of a task, see :func:`demonstrations`."""
-        settings = {"domain": NAME, "task": expect_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
+        settings = {"domain": NAME, "task": check_task(task), "count": count, "seed": seed, "experts": FORM, **_SETTINGS}
         settings |= {"scatter": scatter, "elsewhere": elsewhere}
         made = cached(settings, count, lambda progress: demonstrations(task, count, seed, workers, progress, scatter, elsewhere))
         return made if made.domain == self.domain else replace(made, domain=self.domain)

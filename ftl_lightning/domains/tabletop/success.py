@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tabletop.scenes import BOOK, CIRCLE, COLUMNS, HEIGHT, TARGET, TRIANGLE, WHITE, outline, support, within
-from ftl_lightning.domains.tabletop.tasks import BESIDE, PUSH_ON_BOOK, PUSHES, TO_BOOK, expect_task
+from ftl_lightning.domains.tabletop.tasks import BESIDE, PUSH_ON_BOOK, PUSHES, TO_BOOK, check_task
 
 BOOK_MOVED = 0.02
 """Displacement in metres above which the book counts as moved."""
@@ -33,7 +33,7 @@ def judged(task: str, scene: NDArray[np.float32], told: Mapping[str, Any]) -> bo
         scene: ``(24,)``, initial scene.
         told: info of the environment's last step; empty if there was none.
     """
-    expect_task(task)
+    check_task(task)
     if not told:
         return False
     circle = told["circle"]

@@ -42,7 +42,7 @@ WIDE_SUITES = {
 """``pairs``: a verb and an object that pretraining shows separately."""
 
 
-def expect_task(task: str) -> str:
+def check_task(task: str) -> str:
     """Return a known task.
 
     Raises:

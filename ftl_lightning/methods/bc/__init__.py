@@ -10,5 +10,5 @@ METHOD = Method(
     pretraining="ftl_lightning.methods.bc.pretraining:CloningPretraining",
     forms=(Form(WITH_MODES, "modes", 1),),
     configurations="conf/bc",
-    suits="ftl_lightning.training.transitions:expect_present_or_moment",
+    suits="ftl_lightning.training.transitions:check_present_or_moment",
 )

@@ -10,7 +10,7 @@ from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bc import METHOD
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training.additive import AdditiveModel, added
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.text_concept_model import TextConceptModel
@@ -65,7 +65,7 @@ class CloningModel(AdditiveModel, TextConceptModel):
     def __init__(self, prepared: Prepared[CloningConfig]) -> None:
         super().__init__(prepared)
         config = prepared.config
-        expect_range("model.members", config.members, 1, 1000)
+        check_range("model.members", config.members, 1, 1000)
         inputs = config.concept_dim + config.vector_dim
         self.network = ParallelMLP(config.members, inputs, config.hidden_dim, config.moments * config.state_dim)
 

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretraining import Pretraining
-from ftl_lightning.training.transitions import expect_window
+from ftl_lightning.training.transitions import check_window
 
 
 class CloningPretraining(Pretraining[CloningModel]):
@@ -29,16 +29,16 @@ class CloningPretraining(Pretraining[CloningModel]):
     ) -> None:
         super().__init__(**options)
         self.save_hyperparameters()
-        expect_range("model.hidden_dim", hidden_dim, 1)
+        check_range("model.hidden_dim", hidden_dim, 1)
         if plan_horizon is not None:
-            expect_range("model.plan_horizon", plan_horizon, 1)
+            check_range("model.plan_horizon", plan_horizon, 1)
         self.stride = stride
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> CloningModel:
         sizes = {name: self.hparams[name] for name in ("hidden_dim", "members", "stride")}
         horizon = self.hparams["plan_horizon"] or data.domain.plans.horizon
         policy = prepared.configured(CloningConfig, horizon=horizon, **sizes)
-        expect_window(policy.config, data)
+        check_window(policy.config, data)
         return CloningModel(policy)
 
     def losses(self, model: CloningModel, batch: Batch, draw: torch.Generator) -> Tensor:

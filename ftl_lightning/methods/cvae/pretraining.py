@@ -8,11 +8,11 @@ from torch import Tensor
 from ftl_lightning.data.features import moved
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
 from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.pretraining import Pretraining, expect_shown
+from ftl_lightning.training.pretraining import Pretraining, check_shown
 
 
 class VAEPretraining(Pretraining[VAEModel]):
@@ -28,13 +28,13 @@ class VAEPretraining(Pretraining[VAEModel]):
     def __init__(self, latent_dim: int = 20, hidden_dim: int = 512, beta: float = 1.0, **options: Any) -> None:
         super().__init__(**options)
         self.save_hyperparameters()
-        expect_range("model.latent_dim", latent_dim, 1)
-        expect_range("model.hidden_dim", hidden_dim, 1)
-        expect_range("model.beta", beta, 0)
+        check_range("model.latent_dim", latent_dim, 1)
+        check_range("model.hidden_dim", hidden_dim, 1)
+        check_range("model.beta", beta, 0)
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> VAEModel:
         latent = self.hparams["latent_dim"]
-        expect_shown(prepared.config.training_concepts, data.training.concepts)
+        check_shown(prepared.config.training_concepts, data.training.concepts)
         self._first = data.first_windows()
         networks = prepared.configured(VAEConfig, concept_dim=latent, hidden_dim=self.hparams["hidden_dim"])
         return VAEModel(networks.embedded(torch.zeros(len(prepared.embeddings), latent)))

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ftl_lightning.igm.schedule import MOST_STEPS
 from ftl_lightning.services.processes import drawn, mean
-from ftl_lightning.services.ranges import expect_count, expect_range
+from ftl_lightning.services.ranges import check_count, check_range
 from ftl_lightning.services.seeding import generator
 
 
@@ -35,10 +35,10 @@ class Codes:
     relative: bool = True
 
     def __post_init__(self) -> None:
-        expect_range("model.codes.share", self.share, 0, 1)
-        expect_range("model.codes.noise", self.noise, 0)
-        expect_count("model.codes.knots", self.knots, 1, MOST_STEPS)
-        expect_count("model.codes.size", self.size, 1, MOST_STEPS)
+        check_range("model.codes.share", self.share, 0, 1)
+        check_range("model.codes.noise", self.noise, 0)
+        check_count("model.codes.knots", self.knots, 1, MOST_STEPS)
+        check_count("model.codes.size", self.size, 1, MOST_STEPS)
 
     def __call__(self, texts: Tensor, removed: Tensor, clean: Tensor, draw: torch.Generator) -> Tensor:
         """Add codes to text embeddings; returns concepts ``(batch, knots, n)``.

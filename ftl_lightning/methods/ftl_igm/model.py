@@ -18,7 +18,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.igm.schedule import MOST_STEPS, cosine_alpha_bar, denoising_loss, timesteps
 from ftl_lightning.methods.ftl_igm import METHOD
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.services.ranges import expect_range
+from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.spectrum import Spectrum
 from ftl_lightning.training.concept_model import Draws
@@ -46,7 +46,7 @@ class DiffusionConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expect_range("diffusion_steps", self.diffusion_steps, 1, MOST_STEPS)
+        check_range("diffusion_steps", self.diffusion_steps, 1, MOST_STEPS)
 
 
 def build_denoiser(config: DiffusionConfig) -> nn.Module:
@@ -108,8 +108,8 @@ class GenerativeModel(TextConceptModel):
     def adaptable(self) -> dict[str, tuple[int, int]]:
         return adaptable(self.denoiser)
 
-    def expect_adapter(self, adapter: LowRank) -> None:
-        adapter.expect_fits(self.denoiser)
+    def check_adapter(self, adapter: LowRank) -> None:
+        adapter.check_fits(self.denoiser)
 
     @property
     def max_steps(self) -> int:

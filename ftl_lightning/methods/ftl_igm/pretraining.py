@@ -15,7 +15,7 @@ from ftl_lightning.networks import PAPER_SIZE
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.option_groups import flat, groups_of
 from ftl_lightning.services.processes import drawn
-from ftl_lightning.services.ranges import MOST_TOGETHER, expect_count, expect_factor, expect_range
+from ftl_lightning.services.ranges import MOST_TOGETHER, check_count, check_factor, check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
@@ -58,9 +58,9 @@ class LossOptions:
     def __post_init__(self) -> None:
         if self.kind not in LOSSES:
             raise UserError(f"model.loss.kind: expected one of {', '.join(LOSSES)}, found {short(self.kind)!r}")
-        expect_range("model.loss.condition_dropout", self.condition_dropout, 0, 1)
-        expect_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
-        expect_range("model.loss.discount", self.discount, 0, 1)
+        check_range("model.loss.condition_dropout", self.condition_dropout, 0, 1)
+        check_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
+        check_range("model.loss.discount", self.discount, 0, 1)
 
 
 _LOSS, _CODES = LossOptions(), Codes()
@@ -108,8 +108,8 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         self.save_hyperparameters(ignore=[*groups_of(PRETRAINING), *(["draws"] if draws == 1 else [])])
         self.save_hyperparameters(flat({"loss": loss, "codes": codes}, PRETRAINING))
         self.denoiser_args = dict(denoiser_args or {}) | (PAPER_SIZE.get(denoiser, {}) if paper_size else {})
-        expect_count("model.diffusion_steps", diffusion_steps, 1, MOST_STEPS)
-        expect_count("model.draws", draws, 1, MOST_TOGETHER)
+        check_count("model.diffusion_steps", diffusion_steps, 1, MOST_STEPS)
+        check_count("model.draws", draws, 1, MOST_TOGETHER)
         self.loss, self.codes, self.draws = loss, codes, draws
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> GenerativeModel:

@@ -10,5 +10,5 @@ METHOD = Method(
     adaptation="ftl_lightning.training.learner_adaptation:LearnerAdaptation",
     learner="ftl_lightning.methods.in_context.prompting:prompt",
     configurations="conf/in_context",
-    suits="ftl_lightning.training.transitions:expect_present",
+    suits="ftl_lightning.training.transitions:check_present",
 )

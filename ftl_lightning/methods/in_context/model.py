@@ -13,7 +13,7 @@ from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.in_context import METHOD
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.ranges import LARGEST, expect_range
+from ftl_lightning.services.ranges import LARGEST, check_range
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.transitions import StepConfig, unroll
@@ -39,8 +39,8 @@ class InContextConfig(StepConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("tokens", "bins", "width", "heads"):
-            expect_range(f"model.{name}", getattr(self, name), 1, LARGEST)
-        expect_range("model.layers", self.layers, 1, 100)
+            check_range(f"model.{name}", getattr(self, name), 1, LARGEST)
+        check_range("model.layers", self.layers, 1, 100)
 
 
 class InContextModel(ConceptModel):

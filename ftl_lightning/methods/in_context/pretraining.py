@@ -13,8 +13,8 @@ from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretrained import load_model
-from ftl_lightning.training.pretraining import Pretraining, expect_shown
-from ftl_lightning.training.transitions import expect_present, expect_window
+from ftl_lightning.training.pretraining import Pretraining, check_shown
+from ftl_lightning.training.transitions import check_present, check_window
 
 
 class InContextPretraining(Pretraining[InContextModel]):
@@ -59,14 +59,14 @@ class InContextPretraining(Pretraining[InContextModel]):
 
     def build(self, prepared: Prepared[ModelConfig], data: PretrainingData) -> InContextModel:
         config = prepared.config
-        expect_present(data.domain)
+        check_present(data.domain)
         if config.image_dim and self.hparams["images"] is None:
             raise UserError("model.images: expected the folder of a model that reads these images, found none")
         sizes = {name: self.hparams[name] for name in ("tokens", "bins", "width", "layers", "heads", "stride")}
         size = sizes["tokens"] * (config.vector_dim + config.state_dim)
         horizon = self.hparams["plan_horizon"] or data.domain.plans.horizon
         transformer = prepared.configured(InContextConfig, concept_dim=size, horizon=horizon, **sizes)
-        expect_window(transformer.config, data)
+        check_window(transformer.config, data)
         model = InContextModel(transformer.embedded(torch.zeros(len(prepared.embeddings), size)))
         if model.images is not None:
             take_images(model.images, self._images, self.hparams["images"])
@@ -74,7 +74,7 @@ class InContextPretraining(Pretraining[InContextModel]):
         # Perturb whole prompts, half of the time, like observations.
         self._perturbed = model.prompts(data.training, perturbed=True) if config.perturb else self._prompts
         texts = data.training.concepts
-        expect_shown(config.training_concepts, texts)
+        check_shown(config.training_concepts, texts)
         self._rows = [[row for row, text in enumerate(texts) if text == concept] for concept in config.training_concepts]
         model.training_embeddings.copy_(self._prompts[[rows[0] for rows in self._rows]])
         windows = data.first_windows()

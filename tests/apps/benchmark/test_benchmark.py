@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from ftl_lightning.apps.benchmark.check import allowed, drawn, expect_submission
+from ftl_lightning.apps.benchmark.check import allowed, check_submission, drawn
 from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissions
 from ftl_lightning.apps.benchmark.run import scored
 from ftl_lightning.apps.benchmark.submission import Submission
@@ -63,7 +63,7 @@ def line_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 @pytest.mark.slow
 def test_a_strangers_method_gives_a_submission_that_passes(submitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    submission, suites = expect_submission(submitted)
+    submission, suites = check_submission(submitted)
     assert (submission.name, list(suites), len(submission.runs)) == ("replay", ["beats"], 3)
     assert {run.origin for run in submission.runs} == {"pretrained"}
     assert submission.scores["beats"].mean > 0.9

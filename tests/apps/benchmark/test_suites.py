@@ -50,7 +50,7 @@ def test_every_seed_has_hashes(name: str) -> None:
 @pytest.mark.parametrize("name", [*FAMILIES, "object_rearrangement"])
 def test_demonstrations_are_the_frozen_ones(name: str) -> None:
     suite = load_suite(name)
-    suite.expect_data(0, None, (DEMONSTRATIONS,))
+    suite.check_data(0, None, (DEMONSTRATIONS,))
     found = suite.prints(1, None, (DEMONSTRATIONS,))[DEMONSTRATIONS]
     assert found.is_near(suite.data["1"][DEMONSTRATIONS])
     assert not found.is_near(suite.data["0"][DEMONSTRATIONS])
@@ -66,7 +66,7 @@ def test_a_changed_generator_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys
         with pytest.raises(
             UserError, match=r"suite beats, seed 0, demonstrations: expected data with the hash \w{16}, found \w{16}"
         ):
-            suite.expect_data(0, None, (DEMONSTRATIONS,))
+            suite.check_data(0, None, (DEMONSTRATIONS,))
         assert main(["benchmark", "cvae", "--suites", "beats"]) == 2
         assert "the generator was changed" in capsys.readouterr().err
     finally:
@@ -78,8 +78,8 @@ def test_rounding_in_another_way_is_no_other_data() -> None:
     own = suite.data["0"][DEMONSTRATIONS]
     rounded = replace(own, hash="0" * 16, mean=own.mean + 1e-7)
     one = replace(suite, data={"0": {DEMONSTRATIONS: rounded}})
-    assert suite.expect_data(0, None, (DEMONSTRATIONS,))
-    assert not one.expect_data(0, None, (DEMONSTRATIONS,))
+    assert suite.check_data(0, None, (DEMONSTRATIONS,))
+    assert not one.check_data(0, None, (DEMONSTRATIONS,))
 
 
 @pytest.mark.parametrize("name", FAMILIES)

@@ -58,7 +58,7 @@ def arrange(found: Browser, touch: bool = False) -> None:
     found.until(lambda: found.count("#slots canvas") > before)
 
 
-def expect_names(found: Browser) -> None:
+def check_names(found: Browser) -> None:
     """Everything has a name for a screen reader, and headings leave out no level."""
     assert not found.js(NAMELESS)
     levels = found.js(LEVELS)
@@ -70,7 +70,7 @@ def test_the_page_is_there_with_samples_before_anything_is_done(page: Browser) -
     assert page.count("#mixed canvas") == 8
     assert page.count("#mix li") == 1
     assert not page.errors()
-    expect_names(page)
+    check_names(page)
 
 
 def test_five_arrangements_become_a_concept(page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,7 +85,7 @@ def test_five_arrangements_become_a_concept(page: Browser, monkeypatch: pytest.M
     page.until(lambda: "model.learn(" in page.text("python"))
     assert "invert" in page.text("command")
     assert not page.errors()
-    expect_names(page)
+    check_names(page)
 
 
 def test_a_slider_changes_the_samples(page: Browser) -> None:
