@@ -17,7 +17,7 @@ from tests.suites import *  # noqa: F403
 from tests.suites import of_no_test
 
 if TYPE_CHECKING:
-    from ftl_lightning.training import InversionModule
+    from ftl_lightning.training.inversion_module import InversionModule
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -80,8 +80,8 @@ def files() -> dict[Path, int]:
 
 def inversion_module(pretrained: Path, **options: Any) -> "InversionModule":
     """The module of ``invert`` with some options, given by their flat names."""
-    from ftl_lightning.training import InversionModule
-    from ftl_lightning.training.inversion_settings import InversionSettings
+    from ftl_lightning.igm.settings import InversionSettings
+    from ftl_lightning.training.inversion_module import InversionModule
 
     settings = InversionSettings().changed(**options)
     return InversionModule(str(pretrained), **{field.name: getattr(settings, field.name) for field in fields(settings)})

@@ -149,7 +149,7 @@ CANNOT: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("stage", "told"), CANNOT, ids=[told[:50] for _, told in CANNOT])
 def test_what_cannot_run_is_told(stage: dict[str, Any], told: str) -> None:
-    Path("pretraining.yaml").write_text("model: {class_path: ftl_lightning.training.PretrainingModule}")
+    Path("pretraining.yaml").write_text("model: {class_path: ftl_lightning.methods.ftl_igm.pretraining.PretrainingModule}")
     with pytest.raises(UserError, match=f"1 of 1 cells cannot run, none was started: .*{re.escape(told)}"):
         check(list(Stage(**stage).cells(0)))
 

@@ -20,7 +20,7 @@ from ftl_lightning.igm import concept
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.tensor_file import file_hash
-from ftl_lightning.training.concept_check import check_concept
+from ftl_lightning.training.checks import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.pretrained import load_model
 

@@ -268,7 +268,7 @@ def test_a_run_that_stops_by_itself_says_after_how_many_steps(invert: Callable[.
 
 @pytest.mark.parametrize("arguments", [["generate", "object_rearrangement", "--count=1"], FIT], ids=lambda value: value[0])
 def test_ctrl_c_is_one_line_and_130(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Told) -> None:
-    from ftl_lightning.training import PretrainingModule
+    from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

@@ -18,14 +18,14 @@ from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.few_shot.learner import FewShot, LearnedConcept, ModelSettings
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.services.configuration import load
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import file_hash
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.prepared import Prepared
 from tests.conftest import CONF, ROOT
 

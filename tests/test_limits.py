@@ -27,12 +27,12 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import INVERSION, InversionSettings
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.services.limits import MOST_HEADER, MOST_TENSORS, VARIABLE
 from ftl_lightning.services.targets import check_writable_file, check_writable_folder
 from ftl_lightning.training.data import InversionData, PretrainingData
-from ftl_lightning.training.inversion_settings import INVERSION, InversionSettings
 from ftl_lightning.training.trainer import Trainer
 
 from . import conftest

@@ -33,10 +33,10 @@ from ftl_lightning.methods.cvae.pretraining import VAEPretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions
 from ftl_lightning.services.errors import LONGEST, UserError
-from ftl_lightning.training import InversionModule, PretrainingModule
 from ftl_lightning.training import inversion_settings as settings
 from ftl_lightning.training.checkpoint import WholeCheckpoints
 from ftl_lightning.training.data import InversionData
+from ftl_lightning.training.inversion_module import InversionModule, PretrainingModule
 from ftl_lightning.training.rearrangement_datamodule import ObjectRearrangementData
 from ftl_lightning.training.trainer import Trainer
 
@@ -74,11 +74,11 @@ def refusal(*expected: str) -> Iterator[pytest.ExceptionInfo[UserError]]:
 
 CLASSES = {
     "fit": [
-        "--model=ftl_lightning.training.PretrainingModule",
+        "--model=ftl_lightning.methods.ftl_igm.pretraining.PretrainingModule",
         "--data=ftl_lightning.training.rearrangement_datamodule.ObjectRearrangementData",
     ],
     "invert": [
-        "--model=ftl_lightning.training.InversionModule",
+        "--model=ftl_lightning.training.inversion_module.InversionModule",
         "--model.pretrained=object_rearrangement",
         "--data=ftl_lightning.training.data.InversionData",
         "--data.domain=object_rearrangement",

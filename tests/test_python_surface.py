@@ -20,11 +20,11 @@ from ftl_lightning.few_shot.learner import FewShot, LearnedConcept
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import explain
-from ftl_lightning.igm.modes import Modes
+from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.shipped import list_models
-from ftl_lightning.training.longer import longer_than_plans
+from ftl_lightning.training.checks import longer_than_plans
 from tests.conftest import python
 from tests.test_mistakes import refusal
 

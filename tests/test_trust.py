@@ -32,7 +32,7 @@ from pathlib import Path
 from ftl_lightning.domains.driving import DOMAIN
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import CSVLogger
-from ftl_lightning.training import PretrainingModule
+from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.training.data import PretrainingData
 class Called(Callback): ...
 class Logger(CSVLogger): ...

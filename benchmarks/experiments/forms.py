@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from ftl_lightning.cli.main import main as ftl_lightning
 from ftl_lightning.few_shot.learned_concept import LearnedConcept
 from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.forms.choice import ALL
+from ftl_lightning.igm.forms.quality import roughness
+from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE
 from ftl_lightning.services.tensor_file import write_text
-from ftl_lightning.training.forms import ALL
-from ftl_lightning.training.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE
-from ftl_lightning.training.quality import roughness
 
 ROOT = Path(__file__).parents[2]
 FEW, SAMPLES, PRETRAINING = 5, 50, 80

@@ -26,15 +26,15 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.diversity import Real, lines, real_behaviour
 from ftl_lightning.evaluation.generation import Generation, generate
 from ftl_lightning.evaluation.judged import TaskResult
+from ftl_lightning.igm.inversion import invert
+from ftl_lightning.igm.settings import GROUPS, InversionSettings
 from ftl_lightning.reporting.frontier import NOISY, read_frontier, write_frontier
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.training.adaptation import Adaptation
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion import invert
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.inversion_settings import GROUPS, InversionSettings
 
 TEMPERATURES = (0.1, 0.3, 0.6, 1.0, 1.5)
 NOISE = (0.1, 0.2, 0.4, 0.6, 0.8)
@@ -51,7 +51,7 @@ class Form:
         method: its name in tables, and its form.
         variant: what tells it apart from others of the same method and form; may be empty.
         configs: configuration files of ``invert``, added to one another, where ``{domain}`` stands for the domain.
-        changes: of :class:`~ftl_lightning.training.inversion_settings.InversionSettings`, by flat names.
+        changes: of :class:`~ftl_lightning.igm.settings.InversionSettings`, by flat names.
         tempered: whether the temperature matters.
     """
 

@@ -26,7 +26,7 @@ from ftl_lightning.networks.text_encoder import TableEncoder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.ranges import check_count
 from ftl_lightning.services.seeding import DEMONSTRATION_SEED, EVALUATION_SEED
-from ftl_lightning.training.text_concept_model import TextConceptModel
+from ftl_lightning.training.concept_model import TextConceptModel
 
 PROJECT = Path(__file__).resolve().parents[2]
 CONCEPTS = PROJECT / "results" / "concepts"

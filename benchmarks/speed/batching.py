@@ -30,11 +30,11 @@ import torch
 
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
+from ftl_lightning.igm.inversion import invert
+from ftl_lightning.igm.settings import FULL, PRECISIONS, REDUCED
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.in_processes import learned_in_processes
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import FULL, PRECISIONS, REDUCED
 from ftl_lightning.training.model_folder import read_model
 
 SUITES = {"object_rearrangement": "validation", "agent": "paper", "driving": "paper", "strokes": ""}
@@ -141,7 +141,7 @@ def main() -> None:
             if alone:
                 found = invert(model, group, settings, most, told.append)
             else:
-                found = learned_in_processes(folder, group, settings, most, options.processes)
+                found = learned_in_processes(folder, model.device, group, settings, most, options.processes)
             durations.append(clock() - start)
             steps.append(len(told))
             losses += [concept.origin.loss for concept in found.values()]

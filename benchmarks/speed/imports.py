@@ -74,7 +74,7 @@ elif arguments[0] == "invert":
     if arguments[1].startswith("-"):
         from ftl_lightning.services.starting import imported
         imported("ftl_lightning.apps.lightning_cli")
-    from ftl_lightning.training.inversion import Inversion
+    from ftl_lightning.igm.inversion import Inversion
     stopping(Inversion, "step_losses")
 assert cli.main(arguments) == 0
 told()

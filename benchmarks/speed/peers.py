@@ -38,14 +38,14 @@ from torch.nn import functional
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.model_folder import read_model
 
 Batching = Literal["one by one", "batched"]

@@ -21,12 +21,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion import invert
 from ftl_lightning.training.model_folder import read_model
 
 SIZES = ((32, 512, 512), (64, 512, 512), (320, 512, 512), (640, 512, 512), (1500, 512, 512), (640, 64, 4096), (1024, 1024, 1024))

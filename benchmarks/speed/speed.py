@@ -30,17 +30,17 @@ from ftl_lightning.domains.domain import ACCURACY
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.diffusion import denoising_loss
 from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling, ddpm
-from ftl_lightning.igm.schedule import denoising_loss
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.reporting.speed import ONE, PUBLISHED, TEN, Measured, reached
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.seeding import generator, task_key
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.model_folder import read_model
 
 DOMAIN, SUITE = "object_rearrangement", "validation"

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.diffusion import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.inversion import Adam
 from ftl_lightning.igm.samplers import timesteps
-from ftl_lightning.igm.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel, build_denoiser
 from ftl_lightning.networks import PAPER_SIZE
 from ftl_lightning.networks.image_encoder import RESNET18, ImageEncoders
-from ftl_lightning.training.adam import Group
 from ftl_lightning.training.model_folder import read_model
 
 ROOT = Path(__file__).parents[2]
@@ -166,7 +166,7 @@ def made(step: Step, device: str = "cpu") -> Made:
             torch.add(alpha_bar[before] * x, alpha_bar[now] * noise)
 
         return Made(denoise, lambda: None, parameters, 0, False)
-    group = Group(embeddings, 0.0)
+    group = Adam(embeddings, 0.0)
     found: list[Tensor] = []
 
     def one_by_one() -> None:
@@ -186,7 +186,7 @@ def made(step: Step, device: str = "cpu") -> Made:
         found[:] = torch.autograd.grad(losses.sum() / step.batch, [embeddings])
 
     learn = one_by_one if step.kind == "published inversion" else invert
-    return Made(learn, lambda: group.step(found[0], None), parameters, embeddings.numel(), False)
+    return Made(learn, lambda: group.step(found[0], 0, None), parameters, embeddings.numel(), False)
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,10 @@ import yaml
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
-from ftl_lightning.igm.adapter import LowRank, adaptable
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, Origin
-from ftl_lightning.igm.modes import Modes
+from ftl_lightning.igm.forms.adapter import LowRank, adaptable
+from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.configuration import load
@@ -44,7 +44,7 @@ from ftl_lightning.services.errors import LONGEST, UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.training.checkpoint import read_checkpoint
-from ftl_lightning.training.concept_check import check_concept
+from ftl_lightning.training.checks import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.pretrained import load_model
 

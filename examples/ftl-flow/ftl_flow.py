@@ -8,20 +8,20 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import Observed
-from ftl_lightning.igm.branches import Context
 from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.diffusion import Context
 from ftl_lightning.igm.guidance import composed_epsilon
+from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.networks import MLPDenoiser
-from ftl_lightning.training.concept_model import Draws
+from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.method import Method
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretraining import Pretraining
-from ftl_lightning.training.text_concept_model import TextConceptModel
 
-METHOD = Method("flow matching", kind="flow", model="ftl_flow:FlowModel", pretraining="ftl_flow:FlowPretraining")
+METHOD = Method("flow matching", kind="flow", model=lambda: FlowModel, pretraining=lambda: FlowPretraining)
 Velocity = Callable[[Tensor, Tensor], Tensor]  # (x (batch, horizon, state), t (batch,)) -> like x
 TIMES = 1000
 """Times from noise (0) to behaviour, as the network's embedding of time reads them."""

@@ -118,7 +118,7 @@ class CommandLine(LightningCLI):
         if not options or not isinstance(options.get("version"), str) or not {"save_dir", "name"} <= set(options.keys()):
             return
         folder, name = Path(options["save_dir"]) / (options["name"] or ""), options["version"]
-        if self._get(self.config, "ckpt_path") and self._verb in ("fit", "invert"):
+        if self._verb == "fit" and self._get(self.config, "ckpt_path"):
             log_folder.hold(folder / name)
         elif self._verb in ("fit", "invert"):
             options["version"] = log_folder.claim(folder, name, new=self._verb == "invert")
@@ -140,8 +140,6 @@ class CommandLine(LightningCLI):
         """Find the last checkpoint, if requested."""
         self._find_last()
 
-    before_invert = before_fit
-
     def before_validate(self) -> None:
         """Require a checkpoint; Lightning would evaluate random weights."""
         self._find_last()
@@ -155,8 +153,8 @@ class CommandLine(LightningCLI):
         options = self.config_init[self._verb]
         if options.get("ckpt_path") == "last":
             options["ckpt_path"] = last_checkpoint(self.trainer)
-            if options["ckpt_path"] is None and self._verb in ("fit", "invert"):
-                say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; {self._verb} starts anew")
+            if options["ckpt_path"] is None and self._verb == "fit":
+                say(f"ckpt_path: no last checkpoint in {self.trainer.log_dir}; fit starts anew")
 
     def _parse_ckpt_path(self) -> None:
         # Lightning would override configuration and command line by the checkpoint's hyper-parameters, class included.

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from ftl_lightning.data.container import Demonstrations
     from ftl_lightning.data.finding import Finding
     from ftl_lightning.few_shot.learner import FewShot
-    from ftl_lightning.training.demonstration_check import Check
+    from ftl_lightning.training.checks import Check
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _fitting(model: "FewShot", demonstrations: "Demonstrations", path: str) -> "
 
 def _checked(model: "FewShot | None", demonstrations: "Demonstrations", faults: "tuple[Finding, ...]", learn: bool) -> "Check":
     from ftl_lightning.data.check import check as faults_of
-    from ftl_lightning.training.demonstration_check import Check, check_with
+    from ftl_lightning.training.checks import Check, check_with
 
     if model is None:
         return Check(demonstrations.concepts[0], demonstrations, (*faults, *faults_of(demonstrations)))

@@ -114,7 +114,7 @@ def concepts(pretrained: str, folder: list[str] = [], plain: bool = False) -> No
     with about(place / CONFIG):
         texts = check_type(content.get("training_concepts"), Sequence[str], "training_concepts")
     if not plain:
-        from ftl_lightning.training.library import library, table
+        from ftl_lightning.igm.library import library, table
 
         known = library(content["hash"], texts, place, folder)
     for text in texts:
@@ -138,7 +138,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     from ftl_lightning.igm.concept import Concept
     from ftl_lightning.igm.explanation import explain as explained
     from ftl_lightning.services.shipped import MODELS
-    from ftl_lightning.training.concept_check import check_concept
+    from ftl_lightning.training.checks import check_concept
     from ftl_lightning.training.pretrained import find_model, load_model
 
     check_count("nearest", nearest, 1)

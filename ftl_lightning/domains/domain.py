@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import Feature, InitialStates, Observed
 from ftl_lightning.domains import line_plots
-from ftl_lightning.domains.distances import Distance
 from ftl_lightning.domains.paper import PAPERS_METHOD, Compared, Paper
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import Suite, training_suite

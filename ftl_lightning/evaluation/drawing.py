@@ -12,8 +12,8 @@ from ftl_lightning.evaluation.animation import outcome_text
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult, share
 from ftl_lightning.evaluation.tensorboard import log_animation
+from ftl_lightning.igm.forms.quality import first_windows
 from ftl_lightning.training.board import FILMS, PICTURES, ROLLOUTS
-from ftl_lightning.training.quality import first_windows
 
 if TYPE_CHECKING:  # slow import
     from matplotlib.figure import Figure

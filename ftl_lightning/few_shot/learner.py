@@ -34,25 +34,22 @@ from ftl_lightning.few_shot.shared_concept import read_folder
 from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.inversion import Watch
+from ftl_lightning.igm.library import Library, library
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import INVERSION
 from ftl_lightning.services.arguments import changed, check_path, check_text, check_whole, device_named
-from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.ranges import LARGEST_STEP
 from ftl_lightning.services.representation import Shown
 from ftl_lightning.services.seeding import EVALUATION_SEED
 from ftl_lightning.services.shipped import pretrained_folder, shipped_models, shipped_name
 from ftl_lightning.services.trust import vouching
-from ftl_lightning.training.concept_check import check_concept, check_sizes
+from ftl_lightning.training.checks import Check, check_concept, check_sizes, check_with, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.demonstration_check import Check, check_with, warnings_of
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
-from ftl_lightning.training.inversion import Watch
-from ftl_lightning.training.inversion_settings import INVERSION
 from ftl_lightning.training.judging import judged, judging_domain, picture
-from ftl_lightning.training.learner import Learner
-from ftl_lightning.training.library import Library, library
-from ftl_lightning.training.longer import longer_than_plans
 from ftl_lightning.training.pretrained import load_model
 
 if TYPE_CHECKING:
@@ -165,7 +162,7 @@ class FewShot(Shown):
         """Library of the model's concepts: training concepts, learned concepts in its folder, and saved concepts.
 
         Args:
-            folders: folders of saved concepts, besides your library (:func:`~ftl_lightning.training.library.concepts_folder`).
+            folders: folders of saved concepts, besides your library (:func:`~ftl_lightning.igm.library.concepts_folder`).
 
         Raises:
             UserError: for a path that is not a folder.
@@ -286,7 +283,7 @@ class FewShot(Shown):
             progress: show a bar.
             watch: called after each step of the first inversion, for methods with gradient descent; it may sample the concept so
                 far without side effects, or stop by raising an exception.
-            changes: options of :class:`~ftl_lightning.training.inversion_settings.InversionSettings`, such as ``form="paper"``.
+            changes: options of :class:`~ftl_lightning.igm.settings.InversionSettings`, such as ``form="paper"``.
 
         Warns:
             UserWarning: if demonstrations are longer than the model's plans, or likely have a fault (see :meth:`check`).
@@ -307,7 +304,7 @@ class FewShot(Shown):
         Args:
             demonstrations: demonstrations ``(demo, time, state)`` whose texts name the concepts.
             steps, seed, progress: see :meth:`learn`.
-            changes: options of :class:`~ftl_lightning.training.inversion_settings.InversionSettings`, such as ``form="paper"``.
+            changes: options of :class:`~ftl_lightning.igm.settings.InversionSettings`, such as ``form="paper"``.
 
         Returns:
             Concepts by name, in the order of the demonstrations.
@@ -343,17 +340,16 @@ class FewShot(Shown):
         check_whole("seed", seed, 0, None)
         chosen = changed(call, self.tuned.inversion, changes, ("steps", "seed", "progress", "watch"), INVERSION)
         settings = replace(chosen, seed=int(seed)).for_own(bool(self.model.adaptable()) and not {"modes", "adapter"} & {*changes})
-        self.model.method.check_settings(changes if watch is None else {**changes, "watch": watch})
+        given = next(iter([*changes, *([] if watch is None else ["watch"])]), None)
+        descends = self.model.invertible or given is None
+        method = self.model.method.name
+        require(descends, "learn", f"no settings of an inversion, as {method} learns without gradient descent", str(given))
         total = self.tuned.learning_steps if steps is None else check_whole("steps", steps, 1, LARGEST_STEP)
-        if note := longer_than_plans(fitted, self.model):
+        for note in notes_of(self.model, fitted):
             warnings.warn(note, stacklevel=3)
-        for name in names:
-            for note in warnings_of(self.model, fitted.select(name)):
-                warnings.warn(note if len(names) == 1 else f"{name}: {note}", stacklevel=3)
+        watched = None if watch is None else self._watched(names[0], watch)
         with bar(title, total) if progress else nullcontext(lambda *_: None) as advance:
-            learn: Learner = self.model.method.learn()
-            watched = {} if watch is None else {"watch": self._watched(names[0], watch)}
-            learned = learn(self.model, fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), **watched)
+            learned = self.model.learn(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
         for name in names:
             check_sizes(self.model, learned[name])
             self._examples.append(fitted.select(name))

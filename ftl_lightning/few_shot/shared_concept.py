@@ -22,6 +22,7 @@ from ftl_lightning.evaluation.execution import episodes
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition, space_of
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.library import CONCEPT
 from ftl_lightning.igm.summary import summary
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.escape import markdown
@@ -31,7 +32,6 @@ from ftl_lightning.services.representation import counted
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import atomic, write_text
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.library import CONCEPT
 
 CARD, FILM, PICTURE, DEMONSTRATIONS = "README.md", "film.gif", "picture.png", "demonstrations.safetensors"
 MOST_BYTES = 1_000_000

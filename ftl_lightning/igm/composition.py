@@ -8,15 +8,15 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.igm.branches import Denoiser
-from ftl_lightning.igm.modes import Modes
+from ftl_lightning.igm.diffusion import Denoiser
+from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.services.errors import UserError, shown
 from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.representation import Shown, counted, numbers
 
 
 class Adapter(Protocol):
-    """Modifies the denoiser in the branches of a concept, see :mod:`ftl_lightning.igm.adapter`."""
+    """Modifies the denoiser in the branches of a concept, see :mod:`ftl_lightning.igm.forms.adapter`."""
 
     @property
     def everywhere(self) -> bool:

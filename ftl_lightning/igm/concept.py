@@ -8,9 +8,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.igm.adapter import LowRank
 from ftl_lightning.igm.composition import Composition, space_of
-from ftl_lightning.igm.modes import STRETCH, Modes
+from ftl_lightning.igm.forms.adapter import LowRank
+from ftl_lightning.igm.forms.modes import STRETCH, Modes
 from ftl_lightning.igm.point import Part
 from ftl_lightning.services.errors import UserError, about, short, shown
 from ftl_lightning.services.ranges import LARGEST_FACTOR, check_factor, check_range
@@ -57,7 +57,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class Choice:
-    """Selection of a concept's form, see :mod:`ftl_lightning.training.forms`.
+    """Selection of a concept's form, see :mod:`ftl_lightning.igm.forms.choice`.
 
     Attributes:
         form: name of the form.
@@ -75,7 +75,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class QualityRecord:
-    """Quality of a concept's samples, see :mod:`ftl_lightning.training.quality`.
+    """Quality of a concept's samples, see :mod:`ftl_lightning.igm.forms.quality`.
 
     Attributes:
         samples: number of evaluated samples.

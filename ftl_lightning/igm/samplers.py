@@ -15,7 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ftl_lightning.igm.schedule import clean_from_epsilon
+from ftl_lightning.igm.diffusion import clean_from_epsilon
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.ranges import check_count, check_factor
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.igm.branches import Context
+from ftl_lightning.igm.diffusion import Context
 from ftl_lightning.networks.denoiser import Sizes
 from ftl_lightning.networks.image_encoder import POINT
 from ftl_lightning.services.errors import UserError

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.igm.branches import Context
+from ftl_lightning.igm.diffusion import Context
 from ftl_lightning.networks.conditions import condition_encoder
 from ftl_lightning.networks.denoiser import Sizes, sinusoidal_embedding
 from ftl_lightning.services.errors import UserError

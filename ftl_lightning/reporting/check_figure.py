@@ -7,7 +7,7 @@ import torch
 
 from ftl_lightning.data.check import distances
 from ftl_lightning.services.escape import figure_text
-from ftl_lightning.training.demonstration_check import Check
+from ftl_lightning.training.checks import Check
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from ftl_lightning.data.container import Demonstrations
@@ -15,16 +16,17 @@ from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, file_name
 from ftl_lightning.igm.point import NEW_COMPONENT, Point
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.targets import check_writable_file
+from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.demonstration_check import warnings_of
 from ftl_lightning.training.judging import judging_domain
-from ftl_lightning.training.longer import longer_than_plans
-from ftl_lightning.training.methods import adapts, kinds_for
+from ftl_lightning.training.labels import Labels
+from ftl_lightning.training.methods import kinds_for
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.quality import inspected
 
@@ -44,41 +46,52 @@ class Adaptation(pl.LightningModule, ABC):
     """
 
     learns = False
-    """Whether concepts are learned by gradient descent, in training steps."""
+    """Whether concepts are learned by gradient descent."""
+    automatic_optimization = False
+    labels = Labels("", "", "")
 
     def __init__(self, pretrained: str, omega: float, output: str | None) -> None:
         super().__init__()
         self.model: ConceptModel = load_model(pretrained)
-        kind = self.model.method.kind
-        if not adapts(type(self), kind):
-            expected = " or ".join(kinds_for(type(self))) or "another"
-            message = f"expected a model of kind {expected}, found {kind} in {pretrained}"
-            module = self.model.method.adaptation.replace(":", ".")
-            raise UserError(f"model.pretrained: {message}, which model.class_path {module} adapts")
+        if not self.adapts(type(self.model)):
+            expected = f"a model of kind {' or '.join(kinds_for(self.adapts)) or 'another'}"
+            other = "inversion_module.InversionModule" if self.model.invertible else "adaptation.LearnerAdaptation"
+            hint = f"which model.class_path ftl_lightning.training.{other} adapts"
+            raise UserError(f"model.pretrained: expected {expected}, found {self.model.method.kind} in {pretrained}, {hint}")
         self.domain = self.model.domain
         self._omega, self._output = omega, output
         self.concepts: tuple[str, ...] = ()
         self._found: dict[str, Concept] = {}
         self._own = False  # whether the demonstrations are a user's, not a domain's tasks
 
+    @classmethod
+    @abstractmethod
+    def adapts(cls, model: type[ConceptModel]) -> bool:
+        """Whether the module adapts models of this class."""
+
     @property
     def method(self) -> str:
         """The method's name in tables."""
-        return self.model.method.name
+        return self.labels.method or self.model.method.name
 
     @property
     def form(self) -> str:
         """Suffix of the method's name in tables; empty for its default form."""
-        return ""
+        return self.labels.form
 
     @property
     def variant(self) -> str:
         """Variant of the method in tables; may be empty."""
-        return ""
+        return self.labels.variant
 
     @abstractmethod
+    def learn(self) -> dict[str, Concept]:
+        """Learn the concepts of :attr:`demonstrations`."""
+
     def learned(self) -> dict[str, Concept]:
-        """Learned concepts by name."""
+        """Concepts by name, which are learned once."""
+        self._found = self._found or self.learn()
+        return self._found
 
     def configure_model(self) -> None:
         """Set the demonstrations and check that they fit the model.
@@ -108,11 +121,17 @@ class Adaptation(pl.LightningModule, ABC):
         self._own = data.own
         if self.model.examples is not None:  # a user's data: new concepts are judged by their demonstrations
             self.domain = judging_domain(self.model, [self.model.examples, self.demonstrations])
-        if note := longer_than_plans(self.demonstrations, self.model):
+        longer = longer_than_plans(self.demonstrations, self.model)
+        for note in notes_of(self.model, self.demonstrations) if self._own else [longer] if longer else []:
             say(f"note: {note}", error=True)
-        for text in self.concepts if self._own else ():
-            for note in warnings_of(self.model, self.demonstrations.select(text)):
-                say(f"note: {text}: {note}", error=True)
+
+    def training_step(self, batch: int) -> None:
+        """Learn all concepts."""
+        self.find()
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        """None: :meth:`learn` makes all gradient steps."""
+        return []
 
     # Validation and test log the learned concepts' loss on common noise; the evaluator judges behaviour.
     def validation_step(self, step: int) -> None:
@@ -145,9 +164,8 @@ class Adaptation(pl.LightningModule, ABC):
 
     def find(self) -> None:
         """Learn the concepts and write each to a file."""
-        self._found = self.learned()
         log_folder.keep()  # also without training
-        for name, concept in self._found.items():
+        for name, concept in self.learned().items():
             path = self._file(name)
             concept.save(path)
             weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
@@ -170,18 +188,11 @@ class Adaptation(pl.LightningModule, ABC):
                 logger.experiment.add_figure(tag, seen.figure(), self.trainer.global_step)
                 logger.experiment.add_text(tag, str(seen), self.trainer.global_step)
 
-    def on_train_end(self) -> None:
-        self.find()
-
     def on_validation_start(self) -> None:
-        self._found = self.learned()
+        self.learned()
 
     def on_test_start(self) -> None:
-        if self._found:  # training in the same process has just ended
-            return
-        if self.learns and self.processes == 1:
-            self._found = self.learned()
-        else:
+        if not self._found:  # else training in the same process has just ended
             self.find()
 
     def training_weight(self, task: EvaluationTask) -> float:
@@ -224,3 +235,24 @@ class Adaptation(pl.LightningModule, ABC):
             for part in concept.parts().values()
         ]
         return self.model.points() + learned
+
+
+class LearnerAdaptation(Adaptation):
+    """Learn concepts as the model defines it, without gradient descent.
+
+    Args:
+        pretrained: folder of the pretrained model.
+        output: folder for the concepts; ``None`` for ``concepts`` in the log folder.
+        seed: seed of the evaluation's rows.
+    """
+
+    def __init__(self, pretrained: str, output: str | None = None, seed: int = 0) -> None:
+        super().__init__(pretrained, 1.0, output)
+        self.save_hyperparameters()
+
+    @classmethod
+    def adapts(cls, model: type[ConceptModel]) -> bool:
+        return not model.invertible
+
+    def learn(self) -> dict[str, Concept]:
+        return self.model.learn(self.demonstrations, InversionSettings(seed=self.hparams["seed"]), 0)

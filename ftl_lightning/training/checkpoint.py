@@ -4,7 +4,6 @@ import io
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import lightning.pytorch as pl
@@ -14,11 +13,11 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from packaging.version import InvalidVersion, Version
 from torch import Tensor
 
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.errors import UserError, require, shown
 from ftl_lightning.services.limits import check_readable
 from ftl_lightning.services.tensor_file import atomic, check_finite, visible
 
-_KEY = "belongs_to"
+SIGNATURE = "belongs_to"
 _RANDOM = "random"
 _VERSION = "pytorch-lightning_version"
 _FORM: Mapping[str, type] = {
@@ -30,7 +29,7 @@ _FORM: Mapping[str, type] = {
     "optimizer_states": list,
     "lr_schedulers": list,
     "callbacks": dict,
-    _KEY: dict,
+    SIGNATURE: dict,
     _RANDOM: dict,
 }
 """Type of each checkpoint key; only those in :data:`_NEEDED` are required."""
@@ -136,28 +135,24 @@ def last_checkpoint(trainer: pl.Trainer) -> Path | None:
     return max((path for path in paths if path.is_file()), key=lambda path: path.stat().st_mtime, default=None)
 
 
-def check_parameters(found: Mapping[str, Any], module: pl.LightningModule, optional: str = "") -> None:
+def check_parameters(found: Mapping[str, Any], module: pl.LightningModule) -> None:
     """Refuse checkpoint parameters that do not fit a module.
 
     Args:
         found: parameters of the checkpoint, by name.
         module: module with its layers.
-        optional: prefix of the parameters in a checkpoint; empty for all.
 
     Raises:
         UserError: for the first missing, unknown or non-finite parameter, or another shape.
     """
-    expected = {name: value for name, value in module.state_dict().items() if name.startswith(optional)}
+    expected = module.state_dict()
     for name in expected | dict(found):
-        if name not in found or name not in expected:
-            what = ("it", "nothing") if name not in found else ("nothing", "it")
-            raise UserError(f"ckpt_path: key 'state_dict', {name!r}: expected {what[0]}, found {what[1]}; it is damaged")
-        if found[name].shape != expected[name].shape:
-            shapes = f"expected shape {tuple(expected[name].shape)}, found {tuple(found[name].shape)}"
-            raise UserError(f"ckpt_path: key 'state_dict', {name!r}: {shapes}; it is damaged")
-    # Buffers of losses may still be infinite.
-    learned = [name for name, _ in module.named_parameters() if name in found] if optional else list(found)
-    check_finite({name: found[name] for name in learned}, "ckpt_path: key 'state_dict'", "take an older checkpoint")
+        place = f"ckpt_path: key 'state_dict', {name!r}"
+        require(name in found, place, "it", "nothing; it is damaged")
+        require(name in expected, place, "nothing", "it; it is damaged")
+        shapes = tuple(expected[name].shape), tuple(found[name].shape)
+        require(shapes[0] == shapes[1], place, f"shape {shapes[0]}", f"{shapes[1]}; it is damaged")
+    check_finite(found, "ckpt_path: key 'state_dict'", "take an older checkpoint")
 
 
 def check_restored(module: pl.LightningModule, step: int) -> None:
@@ -232,22 +227,17 @@ class Random(NamedTuple):
         return states
 
 
-def _signature(module: pl.LightningModule, more: Mapping[str, Any]) -> dict[str, Any]:
-    return {"module_class": type(module).__name__, **more}
-
-
-def sign(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write the module's class and the settings that must match into its checkpoint."""
-    checkpoint[_KEY] = _signature(module, more)
-
-
-def check_signature(module: pl.LightningModule, checkpoint: dict[str, Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+def check_signature(expected: Mapping[str, Any], checkpoint: Mapping[str, Any]) -> None:
     """Refuse a checkpoint with another signature.
+
+    Args:
+        expected: settings that must match.
+        checkpoint: content of the checkpoint.
 
     Raises:
         UserError: with the first key that differs.
     """
-    expected, signature = _signature(module, more), checkpoint.get(_KEY, {})
-    for key in expected | signature:  # a missing setting has its default
-        if (value := signature.get(key)) != (setting := expected.get(key)):
-            raise UserError(f"ckpt_path: key {key!r}: expected {setting}, found {value}; it is the checkpoint of something else")
+    signature = checkpoint.get(SIGNATURE, {})
+    for key in expected | signature:
+        value, setting = signature.get(key), expected.get(key)
+        require(value == setting, f"ckpt_path: key {key!r}", f"{setting}", f"{value}; it is the checkpoint of something else")

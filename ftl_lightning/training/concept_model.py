@@ -1,21 +1,27 @@
 """Base class of models: concept space, normalisation, and view of behaviour."""
 
 import difflib
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.features import READ, Feature, Observed, check_features
-from ftl_lightning.igm.adapter import LowRank
+from ftl_lightning.data.features import READ, Feature, Observed, check_features, moved
 from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept, Origin
+from ftl_lightning.igm.forms.adapter import LowRank
+from ftl_lightning.igm.forms.choice import learn
+from ftl_lightning.igm.inversion import Inversion, Tell, Watch
+from ftl_lightning.igm.model import Draws
 from ftl_lightning.igm.point import EMPTY_CONCEPT, TRAINING_CONCEPT, Point
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, InversionSettings
 from ftl_lightning.networks.image_encoder import ImageEncoders
-from ftl_lightning.services.errors import UserError, short, shown
+from ftl_lightning.services.errors import UserError, require, short, shown
 from ftl_lightning.services.processes import drawn
 from ftl_lightning.services.representation import Shown, counted
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
@@ -23,17 +29,11 @@ from ftl_lightning.training.method import Method
 from ftl_lightning.training.model_config import ModelConfig, find_view
 from ftl_lightning.training.prepared import Prepared
 
+_LOG = logging.getLogger(__name__)
 KIND = "generative model"
 """Kind of a file of model weights."""
 NEAREST = 3
 """Number of similar training concepts in the error for an unknown text."""
-
-
-class Draws(NamedTuple):
-    """Timesteps ``(sample,)`` int64 and noise ``(sample, horizon, state)`` of diffusion."""
-
-    t: Tensor
-    noise: Tensor
 
 
 class ConceptModel(Shown, nn.Module, ABC):
@@ -56,7 +56,7 @@ class ConceptModel(Shown, nn.Module, ABC):
     Config: ClassVar[type[ModelConfig]]
     """Class of the model's configuration."""
     invertible: ClassVar[bool] = False
-    """Whether concepts are learned through :meth:`losses` by gradient descent."""
+    """Whether concepts are learned by gradient descent on :meth:`losses`."""
     empty: Tensor
     training_embeddings: Tensor
 
@@ -67,13 +67,14 @@ class ConceptModel(Shown, nn.Module, ABC):
         self.examples: Demonstrations | None = None
         self.view = find_view(domain, config.view)
         self._perturb = self.view.perturb if config.perturb and self.view is not None else None
-        if config.perturb and self._perturb is None:
-            raise UserError(f"model.perturb: expected a view that can perturb the present, found {config.view!r}")
-        if config.image_encoder and not config.image_dim:
-            raise UserError(f"image_encoder: expected none, as no image is observed, found {shown(dict(config.image_encoder))}")
+        perturbs = not config.perturb or self._perturb is not None
+        require(perturbs, "model.perturb", "a view that can perturb the present", repr(config.view))
+        images = config.image_dim or not config.image_encoder
+        require(images, "image_encoder", "none, as no image is observed", dict(config.image_encoder))
         self.images = ImageEncoders(config.observed, config.image_encoder) if config.image_dim else None
-        if self.images is not None and self.images.size != config.image_dim:
-            raise UserError(f"image_dim: expected {self.images.size} (what is read of the images), found {config.image_dim}")
+        if self.images is not None:
+            size = self.images.size
+            require(size == config.image_dim, "image_dim", f"{size} (size of the image encoding)", config.image_dim)
         self.normalization = prepared.normalization
         self.initial_normalization = prepared.observed
         self.register_buffer("empty", prepared.embeddings[0].clone())
@@ -110,9 +111,86 @@ class ConceptModel(Shown, nn.Module, ABC):
             ``(composition, count, horizon, state)`` in the domain's units.
         """
 
+    def learn(
+        self,
+        demonstrations: Demonstrations,
+        settings: InversionSettings,
+        steps: int,
+        tell: Tell = lambda loss: None,
+        watch: Watch | None = None,
+        start: Inversion | None = None,
+    ) -> dict[str, Concept]:
+        """Learn every concept of the demonstrations, in the form of the settings, by gradient descent through the frozen model.
+
+        Args:
+            demonstrations: demonstrations; their concept texts name the concepts.
+            settings: settings of the inversion; ignored without gradient descent.
+            steps: maximum number of gradient steps.
+            tell: called with the mean loss after each step.
+            watch: called after each step of the first inversion, see :data:`~ftl_lightning.igm.inversion.Watch`.
+            start: parameters of the first inversion, which are changed; ``None`` to create them.
+
+        Returns:
+            Concepts by name.
+
+        Raises:
+            UserError: for settings that the model does not support, or a loss that is not finite.
+        """
+        return learn(self, demonstrations, settings, steps, tell, watch, start)
+
+    def check_settings(self, settings: InversionSettings) -> None:
+        """Refuse settings that the model does not support; warn if the loss differs from that of pretraining.
+
+        Raises:
+            UserError: with the key.
+        """
+        name, adapts = self.method.name, bool(self.adaptable())
+        require(self.invertible, "model.pretrained", "a model that concepts are learned through", f"one of {name}")
+        off_span, knots = settings.embeddings.off_span, settings.embeddings.knots
+        free = off_span == 1 or self.text_space
+        require(free, "model.embeddings.off_span", f"1 (free) for {name}, whose concepts are no texts", off_span)
+        constant = "1 for this model, whose concepts do not vary over a plan"
+        require(knots == 1 or self.over_time, "model.embeddings.knots", constant, knots)
+        adapted = settings.form in (AUTO, ADAPTED, MIXED)
+        require(adapts or not adapted, "model.form", f"{PAPER}, {ONE} or {MODES} for {name}", settings.form)
+        require(adapts or not settings.adapter.rank, "model.adapter.rank", f"0 (none) for {name}", settings.adapter.rank)
+        pretrained = self.config.training.get("model", {}).get("loss", settings.loss.kind)
+        if pretrained != settings.loss.kind:
+            text = "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse"
+            _LOG.warning(text, pretrained, settings.loss.kind)
+
+    def origin(self, demonstrations: Demonstrations, name: str, weights: str, loss: float, pretrained: str = "") -> Origin:
+        """Provenance of a learned concept.
+
+        Args:
+            demonstrations: demonstrations, including the concept's.
+            name: name of the concept.
+            weights: ``'fixed'`` or ``'learned'``.
+            loss: final loss.
+            pretrained: the model's hash, if known (hashing takes as long as several steps).
+        """
+        selected, space = demonstrations.select(name), (self.config.domain, self.config.encoder, pretrained or self.hash)
+        return Origin(name, *space, selected.hash, len(selected), weights, loss)
+
     def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws | None:
         """Random numbers of :meth:`losses`, shared by all runs; ``None`` for a deterministic loss."""
         return None
+
+    def windows(
+        self, demonstrations: Demonstrations, rows: Tensor, share: Tensor, draw: torch.Generator
+    ) -> tuple[Tensor, Observed]:
+        """Training windows ``(row, window, state)`` and their observed features, on the model's device.
+
+        Args:
+            demonstrations: demonstrations.
+            rows: row of the demonstration of each window ``(row,)``.
+            share: relative start of each window ``(row,)``, 0 to 1.
+            draw: generator of the perturbation, if the model is configured with one.
+        """
+        plans = self.domain.plans
+        starts = demonstrations.starts(rows, share, plans.exponent(self.window), self.window, plans.at_rest)
+        states, observed = demonstrations.windows(rows, starts, self.window)
+        return self.perturbed(states.to(self.device), moved(observed, self.device), draw)
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
         """Losses of behaviour under concepts, for inversion by gradient descent.
@@ -126,11 +204,13 @@ class ConceptModel(Shown, nn.Module, ABC):
 
         Returns:
             ``(run, sample)``.
-
-        Raises:
-            UserError: for a method without inversion.
         """
-        raise UserError(f"model.pretrained: expected a model that concepts are learned through, found one of {self.method.name}")
+        raise NotImplementedError
+
+    @property
+    def text_space(self) -> bool:
+        """Whether the concept space is the text encoder's."""
+        return False
 
     @property
     def traits(self) -> tuple[str, ...]:
@@ -141,6 +221,11 @@ class ConceptModel(Shown, nn.Module, ABC):
     def over_time(self) -> bool:
         """Whether a concept may vary over a plan, with several knots."""
         return False
+
+    @property
+    def horizon(self) -> int:
+        """Number of states in a plan."""
+        return self.config.horizon
 
     @property
     def window(self) -> int:
@@ -178,7 +263,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         return [Point("(empty)", EMPTY_CONCEPT, self.empty), *(Point(text, TRAINING_CONCEPT, each) for text, each in training)]
 
     def adaptable(self) -> dict[str, tuple[int, int]]:
-        """Weights that an adapter can change, see :func:`ftl_lightning.igm.adapter.adaptable`; none without adapters."""
+        """Weights that an adapter can change, see :func:`ftl_lightning.igm.forms.adapter.adaptable`; none without adapters."""
         return {}
 
     def check_adapter(self, adapter: LowRank) -> None:
@@ -260,6 +345,41 @@ class ConceptModel(Shown, nn.Module, ABC):
         """Tensors for a file: weights in half precision, buffers unchanged."""
         weights = dict(self.named_parameters())
         return {name: value.half() if name in weights else value for name, value in self.state_dict().items()}
+
+
+class TextConceptModel(ConceptModel):
+    """A model whose concept space is the text encoder's.
+
+    Embeddings are centred on the training concepts and scaled to unit mean square, since language models' embeddings share a
+    large common part, which hides differences.
+
+    Args:
+        prepared: inputs with the encoder's embeddings.
+    """
+
+    centre: Tensor
+    spread: Tensor
+
+    def __init__(self, prepared: Prepared[ModelConfig]) -> None:
+        embeddings = prepared.embeddings
+        if embeddings.is_meta:  # sizes alone: arithmetic on meta tensors imports torch's compiler, which takes a second
+            centre, spread = embeddings.new_empty(embeddings.shape[1]), embeddings.new_empty(())
+        else:
+            centre = embeddings[1:].mean(dim=0)
+            spread = (embeddings[1:] - centre).square().mean().sqrt()
+            spread = torch.where(spread > 0, spread, 1)  # 0 for a single training concept
+            embeddings = (embeddings - centre) / spread
+        super().__init__(prepared.embedded(embeddings))
+        self.register_buffer("centre", centre)
+        self.register_buffer("spread", spread)
+
+    @property
+    def text_space(self) -> bool:
+        return True
+
+    def standardise(self, embeddings: Tensor) -> Tensor:
+        """Map the encoder's embeddings ``(..., n)`` to the model's concept space."""
+        return (embeddings - self.centre) / self.spread
 
 
 def _unread(features: Mapping[str, Feature], read: bool) -> Mapping[str, Feature]:

@@ -310,7 +310,7 @@ class InversionData(pl.LightningDataModule):
             set. Its concept texts name the concepts to learn; demonstrations without a text form a concept named after the file.
         demonstrations_per_concept: number drawn per concept; 5 in the paper.
         seed: seed of the drawn demonstrations.
-        steps: gradient steps, all in a single epoch.
+        steps: gradient steps.
         root: folder of the user's copy of the data, for domains whose demonstrations do not ship.
 
     Raises:
@@ -358,13 +358,10 @@ class InversionData(pl.LightningDataModule):
         source = domain.source(self.root)
         return concatenate([source.draw(task, count, DEMONSTRATION_SEED + self.seed) for task in learned])
 
-    def train_dataloader(self) -> DataLoader[int]:
-        return DataLoader(Steps(self, self.steps), batch_size=None)
-
     def test_dataloader(self) -> DataLoader[int]:
         return DataLoader(range(1), batch_size=None)  # type: ignore[arg-type]
 
-    val_dataloader = test_dataloader
+    train_dataloader = val_dataloader = test_dataloader
 
 
 def shares(demonstrations: Demonstrations, balance: float) -> Tensor:

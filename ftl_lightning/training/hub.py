@@ -5,11 +5,11 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from ftl_lightning.igm.library import CONCEPT
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.shipped import FOLDERS
 from ftl_lightning.services.tensor_file import atomic
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.library import CONCEPT
 from ftl_lightning.training.model_config import CONFIG
 from ftl_lightning.training.model_folder import save_model
 

@@ -2,7 +2,6 @@
 
 import multiprocessing
 import tempfile
-from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -12,11 +11,11 @@ import torch
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.printing import silence
 from ftl_lightning.services.progress import bar
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.pretrained import load_model
 
 
@@ -45,11 +44,11 @@ class _Share:
 
 def learned_in_processes(
     model: str,
+    device: torch.device,
     demonstrations: Demonstrations,
     settings: InversionSettings,
     steps: int,
     processes: int,
-    devices: Iterable[torch.device] = (torch.device("cpu"),),
 ) -> dict[str, Concept]:
     """Learn the concepts of the demonstrations in several processes.
 
@@ -57,16 +56,17 @@ def learned_in_processes(
 
     Args:
         model: folder or name of the pretrained model.
+        device: device to learn on; with several GPUs, processes take them in turn.
         demonstrations: demonstrations; their concept texts name the concepts.
         settings: settings of the inversion.
         steps: gradient steps.
         processes: maximum number of processes; at most one for each concept.
-        devices: devices, assigned in turn.
 
     Raises:
         UserError: raised by the learner, or if a process ended early.
     """
-    names, devices = tuple(dict.fromkeys(demonstrations.concepts)), tuple(devices)
+    names = tuple(dict.fromkeys(demonstrations.concepts))
+    devices = [torch.device("cuda", number) for number in range(torch.cuda.device_count())] if device.type == "cuda" else [device]
     numbered = tuple(enumerate(names))
     with tempfile.TemporaryDirectory() as folder:
         demonstrations.save(Path(folder) / _DEMONSTRATIONS)
@@ -107,7 +107,7 @@ def _learn(share: _Share) -> str:
             every = Demonstrations.load(Path(share.folder) / _DEMONSTRATIONS)
             names = {name for _, name in share.concepts}
             demonstrations = every.rows([row for row, name in enumerate(every.concepts) if name in names])
-            learned = model.method.learn()(model, demonstrations, share.settings, share.steps)
+            learned = model.learn(demonstrations, share.settings, share.steps)
             for number, name in share.concepts:
                 learned[name].save(_file(share.folder, number))
         except UserError as error:

@@ -1,17 +1,16 @@
-"""Declaration of a method, registered in the entry-point group ``ftl_lightning.methods``."""
+"""Declaration of a method, offered by a package in the entry-point group ``ftl_lightning.methods``."""
 
-import importlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ftl_lightning.services.errors import UserError, about
+from ftl_lightning.services.errors import about, require
 
-if TYPE_CHECKING:  # declarations do not need torch
+if TYPE_CHECKING:  # a declaration needs no torch
     from ftl_lightning.domains.domain import Domain
-
-INVERSION = "ftl_lightning.training.forms:learn"
-"""Learner by gradient descent."""
+    from ftl_lightning.training.adaptation import Adaptation
+    from ftl_lightning.training.concept_model import ConceptModel
+    from ftl_lightning.training.pretraining import Pretraining
 
 
 @dataclass(frozen=True)
@@ -33,57 +32,30 @@ class Form:
 class Method:
     """A way to learn tasks from a few demonstrations.
 
-    ``model``, ``pretraining``, ``adaptation``, ``learner`` and ``suits`` are ``'package.module:NAME'``, imported on demand.
+    ``model``, ``pretraining`` and ``adaptation`` are functions that return a class, so that the declaration needs no torch.
 
     Attributes:
         name: name in tables and results.
         kind: kind of the pretrained models, as in ``config.json``. A method that adapts another method's models has their kind.
-        adaptation: the LightningModule of ``invert``, an :class:`~ftl_lightning.training.adaptation.Adaptation`.
-        model: the network, a :class:`~ftl_lightning.training.concept_model.ConceptModel`; empty for another method's network.
-        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.training.pretraining.Pretraining`; empty for another
-            method's network.
-        learner: learner without a trainer, a :class:`~ftl_lightning.training.learner.Learner`; by default gradient descent on
-            the model's losses.
+        model: the network, a :class:`~ftl_lightning.training.concept_model.ConceptModel`, which also learns concepts; ``None`` for
+            another method's network.
+        pretraining: the LightningModule of ``fit``, a :class:`~ftl_lightning.training.pretraining.Pretraining`; ``None`` for
+            another method's network.
+        adaptation: the LightningModule of ``invert``, an :class:`~ftl_lightning.training.adaptation.Adaptation`; by default
+            gradient descent if the model is invertible, else the model's ``learn``.
         forms: forms of its concepts, in the order in which their names are joined.
         configurations: folder of configuration files, one for each domain; empty for none.
-        suits: a function of a domain that raises a ``UserError`` for an unsupported domain; empty if all are supported.
+        suits: raises a ``UserError`` for an unsupported domain.
     """
 
     name: str
     kind: str
-    adaptation: str = "ftl_lightning.training.inversion_module:InversionModule"
-    model: str = ""
-    pretraining: str = ""
-    learner: str = INVERSION
+    model: "Callable[[], type[ConceptModel]] | None" = None
+    pretraining: "Callable[[], type[Pretraining[Any]]] | None" = None
+    adaptation: "Callable[[], type[Adaptation]] | None" = None
     forms: Sequence[Form] = ()
     configurations: str = ""
-    suits: str = ""
-
-    def check_settings(self, names: Iterable[str]) -> None:
-        """Refuse inversion settings for a method without gradient descent.
-
-        Raises:
-            UserError: with the first setting.
-        """
-        if self.learner != INVERSION and (name := next(iter(names), None)) is not None:
-            reason = f"as {self.name} learns without gradient descent, found {name}"
-            raise UserError(f"learn: expected no settings of an inversion, {reason}")
-
-    def model_class(self) -> Any:
-        """The network's class."""
-        return self._named(self.model)
-
-    def pretraining_class(self) -> Any:
-        """The LightningModule of ``fit``."""
-        return self._named(self.pretraining)
-
-    def adaptation_class(self) -> Any:
-        """The LightningModule of ``invert``."""
-        return self._named(self.adaptation)
-
-    def learn(self) -> Any:
-        """The learner without a trainer."""
-        return self._named(self.learner)
+    suits: "Callable[[Domain], None]" = lambda domain: None
 
     def check_domain(self, domain: "Domain") -> None:
         """Refuse an unsupported domain.
@@ -91,19 +63,38 @@ class Method:
         Raises:
             UserError: with what the domain lacks.
         """
-        if self.suits:
-            with about(f"method {self.name}"):
-                self._named(self.suits)(domain)
+        with about(f"method {self.name}"):
+            self.suits(domain)
+
+    def adaptation_class(self) -> "type[Adaptation]":
+        """The LightningModule of ``invert``."""
+        from ftl_lightning.training.adaptation import LearnerAdaptation
+        from ftl_lightning.training.inversion_module import InversionModule
+
+        if self.adaptation is not None:
+            return self.adaptation()
+        return InversionModule if self.model is None or self.model().invertible else LearnerAdaptation
 
     def form(self, hparams: Mapping[str, Any]) -> str:
         """Form of concepts for these options; empty for the paper's form."""
         return " ".join(form.name for form in self.forms if hparams[form.option] != form.usual)
 
-    def _named(self, reference: str) -> Any:
-        module, _, name = reference.partition(":")
-        try:
-            return getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise UserError(
-                f"method {self.name}: expected {reference!r}, found no such thing ({error}); mend its package"
-            ) from error
+
+def check_present(domain: "Domain") -> None:
+    """Refuse domains without observations.
+
+    Raises:
+        UserError: with the domain.
+    """
+    reason = f"{domain.name}: there is no present to go on from"
+    require(domain.observed, "domain", "one with observed features", reason)
+
+
+def check_present_or_moment(domain: "Domain") -> None:
+    """Refuse domains without observations, unless plans are single states.
+
+    Raises:
+        UserError: with the domain.
+    """
+    if domain.plans.horizon > 1:
+        check_present(domain)

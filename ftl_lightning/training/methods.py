@@ -2,13 +2,17 @@
 
 import importlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.tensor_file import content_hash, file_hash
 from ftl_lightning.services.trust import entry_points
 from ftl_lightning.training.method import Method
+
+if TYPE_CHECKING:
+    from ftl_lightning.training.concept_model import ConceptModel
 
 GROUP = "ftl_lightning.methods"
 """Entry-point group of methods: ``name = package.module:METHOD``."""
@@ -84,16 +88,16 @@ def kinds() -> list[str]:
     return [method.kind for method in methods() if method.model]
 
 
-def method_of(kind: str) -> Method | None:
-    """The method of a kind of models; ``None`` if it is not installed."""
-    return next((method for method in methods() if method.model and method.kind == kind), None)
+def kinds_for(adapts: "Callable[[type[ConceptModel]], bool]") -> list[str]:
+    """Kinds of models whose class has a property."""
+    return [method.kind for method in methods() if method.model and adapts(method.model())]
 
 
-def adapts(adaptation: type, kind: str) -> bool:
-    """Whether an adaptation adapts models of a kind: a method of this kind names it or a base class."""
-    return any(method.kind == kind and issubclass(adaptation, method.adaptation_class()) for method in methods())
+def model_class(kind: str) -> "type[ConceptModel] | None":
+    """The network's class for a kind of models; ``None`` if no installed package offers it."""
+    return next((method.model() for method in methods() if method.model and method.kind == kind), None)
 
 
-def kinds_for(adaptation: type) -> list[str]:
-    """Kinds of models that an adaptation adapts."""
-    return list(dict.fromkeys(method.kind for method in methods() if issubclass(adaptation, method.adaptation_class())))
+def class_path(kind: type) -> str:
+    """Name of a class in a configuration file."""
+    return f"{kind.__module__}.{kind.__qualname__}"

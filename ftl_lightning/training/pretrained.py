@@ -9,7 +9,7 @@ from ftl_lightning.domains.registry import is_known, load_domain
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.methods import kinds, method_of
+from ftl_lightning.training.methods import kinds, model_class
 from ftl_lightning.training.model_config import CONFIG, read_config
 from ftl_lightning.training.model_folder import read_model
 
@@ -27,9 +27,9 @@ def load_model(folder: str | Path, domain: Domain | str | None = None) -> Concep
     """
     folder = pretrained_folder(folder)
     kind = read_config(folder)["kind"]
-    if (method := method_of(kind)) is None:
+    if (network := model_class(kind)) is None:
         raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(kinds())}, found {short(kind)!r}")
-    return read_model(method.model_class(), folder, load_domain(domain) if isinstance(domain, str) else domain)
+    return read_model(network, folder, load_domain(domain) if isinstance(domain, str) else domain)
 
 
 def find_model(model_hash: str, places: Sequence[Path]) -> Path:

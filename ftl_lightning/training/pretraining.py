@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
+import lightning.pytorch as pl
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
@@ -26,23 +27,24 @@ from ftl_lightning.services.option_groups import groups_of
 from ftl_lightning.services.processes import mean, rows_of
 from ftl_lightning.services.ranges import LARGEST_FACTOR, LARGEST_RATE, check_factor, check_range
 from ftl_lightning.services.seeding import generator
-from ftl_lightning.training.checkpoint import Random
+from ftl_lightning.services.tensor_file import check_finite
+from ftl_lightning.training.checkpoint import SIGNATURE, Random, check_parameters, check_restored, check_signature
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig, find_view
 from ftl_lightning.training.model_folder import save_model
 from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.resume import ExactResume
 from ftl_lightning.training.teaching import Teaching
 
 M = TypeVar("M", bound=ConceptModel)
 
 
-class Pretraining(ExactResume, ABC, Generic[M]):
+class Pretraining(pl.LightningModule, ABC, Generic[M]):
     """Base module that fits a method's model to a domain's demonstrations.
 
     ``model`` holds the exponential moving average (EMA) of the weights and is validated, exported and adapted; ``raw`` holds the
-    raw weights, which the published code uses. Layers are built once the data module, which decides sizes, is attached.
+    raw weights, which the published code uses. A resumed run ends with the bytes of an unbroken run. Layers are built once the data
+    module, which decides sizes, is attached.
 
     Args:
         learning_rate: learning rate of AdamW, after a linear warm-up and before a cosine decay to 0 at ``trainer.max_steps``.
@@ -81,6 +83,8 @@ class Pretraining(ExactResume, ABC, Generic[M]):
     """Dummy parameter for a model without learnable parameters."""
     stride: int = 1
     """Stride between the states of a window."""
+    resumed_from = 0
+    """Step of the loaded checkpoint; 0 for none."""
 
     def __init__(
         self,
@@ -228,6 +232,10 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         """Record that later checkpoints follow a validation."""
         self._validated = True
 
+    def on_train_start(self) -> None:
+        """Check the restored state."""
+        check_restored(self, self.resumed_from)
+
     def training_step(self, batch: Batch) -> Tensor:
         with rows_of(self.trainer.global_rank, self.trainer.world_size):
             return self._training_loss(batch)
@@ -322,21 +330,30 @@ class Pretraining(ExactResume, ABC, Generic[M]):
         return self.model.points()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Sign the checkpoint and store the global generators' states."""
-        super().on_save_checkpoint(checkpoint)
+        """Sign the checkpoint and store the global generators' states.
+
+        Raises:
+            UserError: if a parameter is not finite; an existing checkpoint is kept.
+        """
+        checkpoint[SIGNATURE] = self.signature()
+        place = f"training: step {self.global_step}"
+        check_finite(checkpoint["state_dict"], place, "nothing was saved of it; lower the learning rate")
         loop = self.trainer.fit_loop
         validates = not self._validated and loop.epoch_loop._should_check_val_fx(loop._data_fetcher)  # type: ignore[arg-type]
         Random.now(self.device, int(validates) + int(self.trainer.is_last_batch)).write(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another module or model configuration."""
-        super().on_load_checkpoint(checkpoint)
+        check_signature(self.signature(), checkpoint)
+        check_parameters(checkpoint["state_dict"], self)
+        self.resumed_from = checkpoint["global_step"]
         self._random = Random.read(checkpoint)
 
     def signature(self) -> dict[str, Any]:
         """Configuration that decides the shapes and meaning of a checkpoint's parameters."""
         different = ("training", "training_concepts", "perturb", "metrics", "feature_dropout")
-        return {key: value for key, value in asdict(self.model.config).items() if key not in different}
+        config = {key: value for key, value in asdict(self.model.config).items() if key not in different}
+        return {"module_class": type(self).__name__, **config}
 
 
 def check_dropout(shares: Mapping[str, float], features: Mapping[str, Feature]) -> dict[str, float]:

@@ -12,7 +12,7 @@ from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from ftl_lightning.services import log_folder
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError, require, short
 from ftl_lightning.services.printing import silence
 from ftl_lightning.services.ranges import check_count, check_range
 from ftl_lightning.training import process_group
@@ -198,34 +198,23 @@ class Trainer(pl.Trainer):
                 f"{self.ckpt_path}: expected a checkpoint of a run like this one, found one that cannot be restored ({reason})"
             ) from error
 
-    def invert(self, model: Adaptation, datamodule: pl.LightningDataModule, ckpt_path: str | None = None) -> None:
+    def invert(self, model: Adaptation, datamodule: pl.LightningDataModule) -> None:
         """Learn the concepts, write them to files, then generate and judge samples.
 
         Args:
             model: adapts a pretrained model.
             datamodule: demonstrations.
-            ckpt_path: checkpoint of an inversion to resume.
         """
-        if not isinstance(model, Adaptation):
-            raise UserError(f"model.class_path: expected a module that adapts a pretrained model, found {type(model).__name__}")
-        if ckpt_path and not model.learns:
-            raise UserError(f"ckpt_path: expected none for {model.method}, which learns nothing, found {ckpt_path}")
+        adapts = isinstance(model, Adaptation)
+        require(adapts, "model.class_path", "a module that adapts a pretrained model", type(model).__name__)
         self.verb = "invert"
         process_group.check_alone(self, self.verb)
-        if self.processes > 1:
-            self._expect_plain(model, ckpt_path)
-        elif model.learns:
-            self.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
-        self.test(model, datamodule=datamodule, verbose=False)
-
-    def _expect_plain(self, model: Adaptation, ckpt_path: str | None) -> None:
-        """Refuse options that learning in several processes ignores, because no trainer runs in them."""
-        if not model.learns:
-            message = f"expected 1 for {model.method}, which learns nothing, found {self.processes}"
-        elif ckpt_path:
-            message = f"expected 1 to go on with a checkpoint, found {self.processes}"
-        elif self.unusual:
-            message = f"expected 1 with trainer.{next(iter(self.unusual))}, found {self.processes}"
+        for name, value in self.unusual.items() if model.learns else ():
+            require(
+                False, f"trainer.{name}", "no such option, as data.steps and model.budget decide how concepts are learned", value
+            )
+        if model.learns:
+            self.fit(model, datamodule=datamodule)
         else:
-            return
-        raise UserError(f"trainer.processes: {message}")
+            require(self.processes == 1, "trainer.processes", f"1 for {model.method}, which learns nothing", self.processes)
+        self.test(model, datamodule=datamodule, verbose=False)

@@ -16,12 +16,12 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.settings import BudgetOptions
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.networks.hashing import HashingEncoder
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training import InversionModule, PretrainingModule
 from ftl_lightning.training.data import InversionData, OwnData
-from ftl_lightning.training.inversion_settings import BudgetOptions
+from ftl_lightning.training.inversion_module import InversionModule, PretrainingModule
 from ftl_lightning.training.model_folder import save_model
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.trainer import Trainer

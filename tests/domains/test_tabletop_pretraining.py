@@ -15,10 +15,10 @@ from ftl_lightning.domains.tabletop import source
 from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE
 from ftl_lightning.domains.tabletop.tasks import AROUND_BOWL, PUSH, PUSH_ON_BOOK
 from ftl_lightning.domains.tabletop.views import BLUR, HALF, MIDDLE, RAISED, VIEWS, misplaced, told
+from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
-from ftl_lightning.training import PretrainingModule
 from ftl_lightning.training.data import PretrainingData
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.trainer import Trainer

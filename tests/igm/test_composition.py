@@ -3,8 +3,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ftl_lightning.data.features import Feature
-from ftl_lightning.igm.branches import Context, Denoiser
 from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.diffusion import Context, Denoiser
 from ftl_lightning.igm.guidance import composed_epsilon
 from ftl_lightning.networks import MLPDenoiser
 from ftl_lightning.networks.denoiser import Sizes

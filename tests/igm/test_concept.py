@@ -10,7 +10,7 @@ import torch
 from safetensors import safe_open
 
 from ftl_lightning.igm.concept import KIND, VERSION, Concept, Origin
-from ftl_lightning.igm.modes import Modes
+from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.tensor_file import save_tensors
 from tests.conftest import ROOT

@@ -7,8 +7,8 @@ import torch
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import explain
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import InversionSettings
+from ftl_lightning.igm.inversion import invert
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.training.pretrained import load_model
 from tests.conftest import ROOT, refused, succeed
 

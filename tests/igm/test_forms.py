@@ -17,19 +17,19 @@ from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import ModelSettings
-from ftl_lightning.igm.adapter import LowRank, adaptable
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Concept, Origin
+from ftl_lightning.igm.forms.adapter import LowRank, adaptable
+from ftl_lightning.igm.forms.modes import Modes
 from ftl_lightning.igm.guidance import composed_epsilon
-from ftl_lightning.igm.modes import Modes
+from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.networks import TemporalUNet
 from ftl_lightning.networks.denoiser import Sizes
 from ftl_lightning.networks.temporal_unet import over_time
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.prepared import Prepared
 
 SIZES = Sizes(horizon=8, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})

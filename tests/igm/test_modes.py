@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ftl_lightning.evaluation.closed_loop import sampled_plans
 from ftl_lightning.igm.composition import Composition, batched
-from ftl_lightning.igm.modes import STRETCH, Modes
+from ftl_lightning.igm.forms.modes import STRETCH, Modes
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.training.concept_model import ConceptModel
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from ftl_lightning.igm.diffusion import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.igm.samplers import SAMPLERS, Sampling, ddim, ddpm, dpm_solver, timesteps
-from ftl_lightning.igm.schedule import add_noise, clean_from_epsilon, cosine_alpha_bar, denoising_loss
 from ftl_lightning.services.errors import UserError
 
 ALPHA_BAR = cosine_alpha_bar(100)

@@ -1,6 +1,6 @@
 """A method that learns nothing in pretraining: it memorises, and its concepts are demonstrations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +16,10 @@ from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import Batch, OwnData, PretrainingData
-from ftl_lightning.training.inversion import origin
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.method import Method
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.model_folder import read_model
@@ -28,8 +27,7 @@ from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretraining import Pretraining
 from ftl_lightning.training.trainer import Trainer
 
-MEMORY = f"{__name__}:remember"
-METHOD = Method("memory", kind="memory", model=f"{__name__}:Memory", learner=MEMORY)
+METHOD = Method("memory", kind="memory", model=lambda: Memory)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +52,14 @@ class Memory(ConceptModel):
         plans = together.embeddings[rows, 0, 0].unflatten(-1, (self.config.horizon, self.config.state_dim))
         return self.decode(plans, observed or {}).unflatten(0, (len(compositions), count))
 
+    def learn(self, demonstrations: Demonstrations, settings: InversionSettings, *_: object) -> dict[str, Concept]:
+        """Every concept is its demonstrations."""
+        plans = self.encode(demonstrations.states[:, : self.window], {}).flatten(1)[:, None]
+        width = settings.seed or plans.shape[2]  # a seed cuts it off, to be refused
+        name = demonstrations.concepts[0]
+        origin = self.origin(demonstrations, name, "fixed", 0.0)
+        return {name: Concept(plans[..., :width], torch.ones(len(plans)), origin)}
+
 
 class MemoryPretraining(Pretraining[Memory]):
     """Keeps the first window of each training concept."""
@@ -68,20 +74,6 @@ class MemoryPretraining(Pretraining[Memory]):
 
     def losses(self, model: Memory, batch: Batch, draw: torch.Generator) -> Tensor:
         return torch.zeros(len(batch.states))
-
-
-def remember(
-    model: ConceptModel,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    tell: Callable[[float], None] = lambda loss: None,
-) -> dict[str, Concept]:
-    """Every concept is its demonstrations."""
-    plans = model.encode(demonstrations.states[:, : model.window], {}).flatten(1)[:, None]
-    width = settings.seed or plans.shape[2]  # a seed cuts it off, to be refused
-    name = demonstrations.concepts[0]
-    return {name: Concept(plans[..., :width], torch.ones(len(plans)), origin(model, demonstrations, name, "fixed", 0.0))}
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.training.methods import load_method, method_names, method_of
+from ftl_lightning.training.methods import load_method, method_names, model_class
 from tests.conftest import ROOT, Once, python, succeed
 from tests.domains.test_plug_in import VERBS, installed
 
@@ -76,7 +76,7 @@ def test_an_installed_method_pretrains_adapts_appears_in_tables_and_is_used_from
 
 def test_a_method_that_an_entry_point_offers_pretrains_adapts_and_is_used_from_python(offered: None) -> None:
     assert method_names()[-1] == "flow"
-    assert method_of("flow") is load_method("flow")
+    assert model_class("flow") is load_method("flow").model()
     succeed(*FIT)
     succeed(*INVERT)
     expect_pretrained_and_adapted()

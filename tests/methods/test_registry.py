@@ -6,25 +6,23 @@ import pytest
 import torch
 
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.methods.in_context.prompting import prompt
+from ftl_lightning.igm.settings import AdapterOptions
+from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.methods.lora.adaptation import FineTuning
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training.adaptation import Adaptation
+from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.forms import learn
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.inversion_settings import AdapterOptions
-from ftl_lightning.training.learner_adaptation import LearnerAdaptation
 from ftl_lightning.training.method import Form, Method
-from ftl_lightning.training.methods import SHIPPED, adapts, kinds, kinds_for, load_method, method_names, method_of, methods
+from ftl_lightning.training.methods import SHIPPED, kinds, kinds_for, load_method, method_names, methods, model_class
 from ftl_lightning.training.pretraining import Pretraining
 from tests.conftest import ROOT
 
 KINDS = ["diffusion", "bc", "cvae", "in-context"]
 MODULE = """
 from ftl_lightning.training.method import Method
-METHOD = Method(name="echo", kind="diffusion", adaptation="echo_method:Missing")
+METHOD = Method(name="echo", kind="diffusion")
 NOTHING = "a text"
 """
 BROKEN = "raise RuntimeError('no luck')"
@@ -59,28 +57,22 @@ def test_the_six_are_offered_in_the_order_of_tables() -> None:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_each_names_classes_that_there_are(name: str) -> None:
+def test_each_has_its_classes(name: str) -> None:
     method = load_method(name)
     assert issubclass(method.adaptation_class(), Adaptation)
-    assert callable(method.learn())
     assert method.configurations in ("conf", f"conf/{name}")
-    assert bool(method.model) == bool(method.pretraining)
-    if method.model:
-        assert issubclass(method.model_class(), ConceptModel)
-        assert method.model_class().method is method
-        assert issubclass(method.pretraining_class(), Pretraining)
-        assert method_of(method.kind) is method
-    else:
+    if method.model is None or method.pretraining is None:
         assert method.kind == "diffusion"
+    else:
+        assert issubclass(method.model(), ConceptModel)
+        assert method.model().method is method
+        assert issubclass(method.pretraining(), Pretraining)
+        assert model_class(method.kind) is method.model()
 
 
-def test_a_kind_that_no_package_offers_has_no_method() -> None:
-    assert method_of("diffusion") is load_method("ftl_igm")
-    assert method_of("alchemy") is None
-
-
-def test_the_others_adapt_by_gradient_descent_and_in_context_learning_reads() -> None:
-    assert {name: load_method(name).learn() for name in SHIPPED} == dict.fromkeys(SHIPPED, learn) | {"in_context": prompt}
+def test_a_kind_that_no_package_offers_has_no_model() -> None:
+    assert model_class("diffusion") is GenerativeModel
+    assert model_class("alchemy") is None
 
 
 @pytest.mark.parametrize(
@@ -90,13 +82,10 @@ def test_the_others_adapt_by_gradient_descent_and_in_context_learning_reads() ->
         (FineTuning, ["diffusion", "bc", "cvae"]),  # what it is derived from adapts these
         (LanguageAdaptation, ["diffusion"]),
         (LearnerAdaptation, ["in-context"]),
-        (Adaptation, []),
     ],
 )
 def test_an_adaptation_adapts_models_of_some_kinds(adaptation: type[Adaptation], expected: list[str]) -> None:
-    assert kinds_for(adaptation) == expected
-    assert [kind for kind in KINDS if adapts(adaptation, kind)] == expected
-    assert not adapts(adaptation, "alchemy")
+    assert kinds_for(adaptation.adapts) == expected
 
 
 def test_a_form_is_told_by_the_option_that_decides() -> None:
@@ -128,20 +117,11 @@ def test_each_broken_entry_point_is_one_line(name: str, message: str, package: N
     assert "\n" not in str(told.value)
 
 
-def test_a_class_that_a_method_names_and_that_is_none_is_one_line(package: None) -> None:
-    with pytest.raises(
-        UserError, match=r"method echo: expected 'echo_method:Missing', found no such thing \(.*\); mend its package"
-    ):
-        load_method("echo").adaptation_class()
-    with pytest.raises(UserError, match="method echo: expected '', found no such thing"):
-        load_method("echo").model_class()
-
-
 def test_a_model_that_reads_demonstrations_learns_and_samples_without_a_trainer() -> None:
     learner = FewShot.from_pretrained(ROOT / "pretrained" / "baseline" / "in_context" / "agent")
     shown = learner.domain.source(None).draw("go to bowl", 2, 0)
     learned = learner.learn(shown)
-    expected = prompt(learner.model, shown, learner.tuned.inversion, 0)["go to bowl"]
+    expected = learner.model.learn(shown, learner.tuned.inversion, 0)["go to bowl"]
     assert torch.equal(learned.concept.embeddings, expected.embeddings)
     assert learned.concept.weights.tolist() == [1.0, 1.0]
     assert learned.concept.origin.count == 2
@@ -154,11 +134,7 @@ def test_a_model_that_reads_demonstrations_learns_and_samples_without_a_trainer(
     assert found.states.isfinite().all()
 
 
-def test_a_learner_refuses_the_model_of_another_method(shipped: Path) -> None:
-    learner = FewShot.from_pretrained(shipped)
-    shown = learner.domain.source(None).draw("circle right of square", 1, 0)
-    with pytest.raises(UserError, match="model: expected one of in-context learning, found one of"):
-        prompt(learner.model, shown, learner.tuned.inversion, 0)
+def test_an_adaptation_refuses_the_model_of_another_method(shipped: Path) -> None:
     with pytest.raises(UserError, match=r"model\.pretrained: expected a model of kind in-context, found diffusion in"):
         LearnerAdaptation(str(shipped))
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ftl_lightning.data.features import Feature
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import BudgetOptions
 from ftl_lightning.methods.bc.pretraining import CloningPretraining
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
@@ -18,10 +19,9 @@ from ftl_lightning.methods.in_context.pretraining import InContextPretraining
 from ftl_lightning.networks.image_encoder import ImageEncoder, ImageEncoders, SpatialSoftmax
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
+from ftl_lightning.training.adaptation import LearnerAdaptation
 from ftl_lightning.training.data import InversionData, OwnData
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.inversion_settings import BudgetOptions
-from ftl_lightning.training.learner_adaptation import LearnerAdaptation
 from ftl_lightning.training.model_folder import read_model
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.trainer import Trainer

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.igm.prediction import Prediction
+from ftl_lightning.igm.diffusion import Prediction
+from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.spectrum import Spectrum
-from ftl_lightning.training import PretrainingModule
 from ftl_lightning.training.data import OwnData
 from ftl_lightning.training.trainer import Trainer
 

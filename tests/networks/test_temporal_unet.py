@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature
-from ftl_lightning.igm.prediction import LOSSES, Prediction, loss_weights
-from ftl_lightning.igm.schedule import add_noise, cosine_alpha_bar
+from ftl_lightning.igm.diffusion import LOSSES, Prediction, add_noise, cosine_alpha_bar, loss_weights
 from ftl_lightning.networks import MLPDenoiser, TemporalUNet
 from ftl_lightning.networks.conditions import EntityEncoder
 from ftl_lightning.networks.denoiser import Sizes

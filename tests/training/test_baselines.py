@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from ftl_lightning.methods.in_context.prompting import prompt
 from torch import nn
 
 from ftl_lightning.data.normalization import Normalization
@@ -14,23 +15,21 @@ from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import InversionSettings
+from ftl_lightning.methods.bases import StepConfig, added, unroll
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel, ParallelMLP
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
 from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
 from ftl_lightning.methods.in_context.pretraining import InContextPretraining
-from ftl_lightning.methods.in_context.prompting import prompt
 from ftl_lightning.methods.language.adaptation import LanguageAdaptation
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
-from ftl_lightning.training.additive import added
+from ftl_lightning.training.adaptation import LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion_settings import InversionSettings
-from ftl_lightning.training.learner_adaptation import LearnerAdaptation
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.trainer import Trainer
-from ftl_lightning.training.transitions import StepConfig, unroll
 from tests import tiny as sizes
 from tests.conftest import CONF, ROOT, refused, succeed
 from tests.domains.mocap_samples import folder

@@ -13,12 +13,10 @@ from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
+from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses, subsets
 from ftl_lightning.reporting.check_figure import picture
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training.demonstration_check import Known, warnings_of
-from ftl_lightning.training.leave_one_out import LeaveOneOut, leave_one_out, odd_one, subsets
-from ftl_lightning.training.relative_loss import relative_losses
-from ftl_lightning.training.scale_check import scale_findings
+from ftl_lightning.training.checks import Known, scale_findings, warnings_of
 from tests.conftest import CONF, ROOT, refused, succeed
 
 KNOWN, NEW = "circle right of square", "square diagonal to triangle"

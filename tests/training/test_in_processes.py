@@ -13,12 +13,11 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.concept import Concept, file_name
+from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training import in_processes
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.forms import learn
 from ftl_lightning.training.in_processes import learned_in_processes
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.trainer import Trainer
 from tests.conftest import CONF, ROOT, inversion_module, refused, succeed
 
@@ -73,7 +72,7 @@ def inversion(pretrained: Path, name: str, *options: str) -> list[str]:
 @pytest.mark.usefixtures("_work")
 def test_two_processes_learn_the_concepts_of_one(tiny: Path) -> None:
     line = build("invert", inversion(tiny, "one")[1:])
-    alone = learn(line.model.model, line.datamodule.demonstrations, line.model.settings, STEPS)
+    alone = line.model.model.learn(line.datamodule.demonstrations, line.model.settings, STEPS)
     assert len(alone) == 10
     succeed(*inversion(tiny, "two", "--trainer.processes=2"))
     assert len(list(Path("two/concepts").iterdir())) == len(alone)
@@ -95,13 +94,13 @@ def demonstrations() -> Demonstrations:
 @pytest.mark.usefixtures("_work")
 def test_a_mistake_in_one_process_is_told_by_the_first(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nowhere"):
-        learned_in_processes(str(tmp_path / "nowhere"), demonstrations(), InversionSettings(), 1, 1)
+        learned_in_processes(str(tmp_path / "nowhere"), torch.device("cpu"), demonstrations(), InversionSettings(), 1, 1)
 
 
 def test_a_process_that_is_stopped_from_outside_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(in_processes, "ProcessPoolExecutor", Stopped)
     with pytest.raises(UserError, match=r"trainer\.processes: expected 2 processes to the end, one was stopped"):
-        learned_in_processes("anything", demonstrations(), InversionSettings(), 1, 3)
+        learned_in_processes("anything", torch.device("cpu"), demonstrations(), InversionSettings(), 1, 3)
 
 
 def test_what_several_processes_do_not_look_at_is_refused(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:

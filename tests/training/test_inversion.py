@@ -14,14 +14,14 @@ from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.evaluation.rows import configuration
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.forms.leave_one_out import quickly
+from ftl_lightning.igm.inversion import Inversion, explained, invert
+from ftl_lightning.igm.settings import EXPLAINED, InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.tensor_file import file_hash
-from ftl_lightning.training import InversionModule
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion import Inversion, explained, invert
-from ftl_lightning.training.inversion_settings import EXPLAINED, InversionSettings
-from ftl_lightning.training.leave_one_out import quickly
+from ftl_lightning.training.inversion_module import InversionModule
 from ftl_lightning.training.model_folder import read_model
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.trainer import Trainer
@@ -114,26 +114,26 @@ def test_what_is_learned_does_not_depend_on_what_is_learned_beside_it(tiny: Path
     assert torch.allclose(one.embeddings, other.embeddings, atol=2e-4)
 
 
-def test_restarts_start_at_training_concepts_and_the_best_of_them_goes_on_alone(tiny: Path) -> None:
+def test_restarts_start_at_training_concepts_and_the_best_of_them_goes_on_alone(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model, steps = load_model(tiny), 5
     demonstrations = validation(steps).demonstrations
     settings = InversionSettings().changed(samples=8, initial_spread=0.0, components=1, **SCREENED)
     inversion = Inversion(model, demonstrations, settings)
     starts = inversion.embeddings.detach().clone()[:, 0, 0]
     assert torch.equal(starts, model.training_embeddings[:3].repeat(len(inversion.concepts), 1))
-    optimizer, _ = inversion.optimizer(steps)
-    runs = []
-    for step in range(steps):
-        losses = inversion.step_losses(step)
+    runs, losses_of = [], inversion.step_losses
+
+    def counted(step: int) -> torch.Tensor:
+        losses = losses_of(step)
         runs.append(len(losses))
-        optimizer.zero_grad()
-        losses.sum().backward()
-        optimizer.step()
-        inversion.stepped(step)
+        return losses
+
+    monkeypatch.setattr(inversion, "step_losses", counted)
+    learned = invert(model, demonstrations, settings, steps, start=inversion)
     assert runs == [3 * len(inversion.concepts)] * 2 + [len(inversion.concepts)] * 3
-    assert inversion.screened is not None
-    kept = inversion.embeddings[inversion.screened]
-    learned = inversion.learned()
+    kept = inversion.embeddings[inversion.active]
     assert torch.equal(torch.stack([concept.embeddings for concept in learned.values()]), kept)
 
 
@@ -146,7 +146,6 @@ def test_after_screening_an_inversion_ends_when_those_that_go_on_have_stopped(ti
         if not inversion.stepped(step):
             break
     assert step < 59  # nothing moves without an optimizer, so rounds of ten steps gain nothing
-    assert inversion.screened is not None
     assert not inversion.stopping.going.any()
 
 
@@ -342,7 +341,7 @@ def test_what_one_set_explains_is_its_share_of_the_modes_gain() -> None:
 def test_auto_mixes_the_modes_where_one_set_explains_enough(
     tiny: Path, least: float, mixed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftl_lightning.training.inversion.EXPLAINED", least)
+    monkeypatch.setattr("ftl_lightning.igm.inversion.EXPLAINED", least)
     auto, each = (from_few(tiny, shown(), modes=modes).modes for modes in ("auto", "each"))
     assert auto.mixed is mixed
     assert not each.mixed  # it is told to draw them
@@ -357,7 +356,7 @@ def test_auto_asks_how_much_of_what_the_modes_gain_one_set_gains(tiny: Path, mon
         asked.append([loss.item() for loss in losses])
         return explained(*losses)
 
-    monkeypatch.setattr("ftl_lightning.training.inversion.explained", spy)
+    monkeypatch.setattr("ftl_lightning.igm.inversion.explained", spy)
     own = shown()
     several = from_few(tiny, own, steps=80, modes="auto")
     ((empty, one, modes),) = asked

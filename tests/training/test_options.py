@@ -10,13 +10,7 @@ import pytest
 from ftl_lightning.apps import lightning_cli
 from ftl_lightning.apps.lightning_cli import parse
 from ftl_lightning.few_shot.tuned import ModelSettings
-from ftl_lightning.methods.ftl_igm import pretraining
-from ftl_lightning.methods.ftl_igm.codes import Codes
-from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING
-from ftl_lightning.services.errors import UserError
-from ftl_lightning.services.option_groups import flat, groups_of, replaced
-from ftl_lightning.training import PretrainingModule
-from ftl_lightning.training.inversion_settings import (
+from ftl_lightning.igm.settings import (
     GROUPS,
     INVERSION,
     BudgetOptions,
@@ -24,6 +18,11 @@ from ftl_lightning.training.inversion_settings import (
     LossOptions,
     ModeOptions,
 )
+from ftl_lightning.methods.ftl_igm import pretraining
+from ftl_lightning.methods.ftl_igm.codes import Codes
+from ftl_lightning.methods.ftl_igm.pretraining import PRETRAINING, PretrainingModule
+from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.option_groups import flat, groups_of, replaced
 from tests.conftest import CONF, inversion_module
 
 OBJECTS = CONF / "object_rearrangement.yaml"

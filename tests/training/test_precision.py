@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from ftl_lightning.igm.inversion import invert
+from ftl_lightning.igm.settings import BudgetOptions, InversionSettings
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion import invert
-from ftl_lightning.training.inversion_settings import BudgetOptions, InversionSettings
 from ftl_lightning.training.pretrained import load_model
 
 

@@ -15,9 +15,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ftl_lightning.cli.main import main
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
-from ftl_lightning.methods.ftl_igm.pretraining import LossOptions
+from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training import PretrainingModule
 from ftl_lightning.training.checkpoint import WholeCheckpoints, read_checkpoint
 from ftl_lightning.training.model_folder import read_model, save_model
 from ftl_lightning.training.rearrangement_datamodule import ObjectRearrangementData

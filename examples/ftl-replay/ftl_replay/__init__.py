@@ -1,6 +1,6 @@
 """Replay as a method of ftl-lightning: a concept is its demonstrations, and a sample is one of them with a little noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +14,6 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import Batch, PretrainingData
-from ftl_lightning.training.inversion import origin
-from ftl_lightning.training.inversion_settings import InversionSettings
 from ftl_lightning.training.method import Method
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
@@ -24,10 +22,8 @@ from ftl_lightning.training.pretraining import Pretraining
 METHOD = Method(
     "replay",
     kind="replay",
-    model="ftl_replay:ReplayModel",
-    pretraining="ftl_replay:ReplayPretraining",
-    adaptation="ftl_lightning.training.learner_adaptation:LearnerAdaptation",
-    learner="ftl_replay:learn",
+    model=lambda: ReplayModel,
+    pretraining=lambda: ReplayPretraining,
     configurations=str(Path(__file__).parent),  # suites.yaml
 )
 
@@ -60,6 +56,18 @@ class ReplayModel(ConceptModel):
             plans.append(plan + self.config.noise * noise)
         return self.decode(torch.cat(plans), observed or {}).unflatten(0, (len(compositions), count))
 
+    def learn(self, demonstrations: Demonstrations, *settings: object, **callbacks: object) -> dict[str, Concept]:
+        """Every concept is the beginning of each of its demonstrations, ``(demonstration, 1, horizon * state)``."""
+        concepts = {}
+        for name in dict.fromkeys(demonstrations.concepts):
+            demonstrated = demonstrations.select(name)
+            rows = torch.arange(len(demonstrated))
+            states, observed = demonstrated.windows(rows, torch.zeros_like(rows), self.window)
+            plans = self.encode(states, observed).flatten(1)[:, None]
+            origin = self.origin(demonstrations, name, "fixed", 0.0)
+            concepts[name] = Concept(plans, torch.ones(len(plans)), origin)
+        return concepts
+
 
 class ReplayPretraining(Pretraining[ReplayModel]):
     """Keeps a plan of each training concept; there is nothing to fit."""
@@ -78,21 +86,3 @@ class ReplayPretraining(Pretraining[ReplayModel]):
 
     def losses(self, model: ReplayModel, batch: Batch, draw: torch.Generator) -> Tensor:
         return torch.zeros(len(batch.states))
-
-
-def learn(
-    model: ConceptModel,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    tell: Callable[[float], None] = lambda loss: None,
-) -> dict[str, Concept]:
-    """Every concept is the beginning of each of its demonstrations, ``(demonstration, 1, horizon * state)``."""
-    found = {}
-    for name in dict.fromkeys(demonstrations.concepts):
-        own = demonstrations.select(name)
-        rows = torch.arange(len(own))
-        states, observed = own.windows(rows, torch.zeros_like(rows), model.window)
-        plans = model.encode(states, observed).flatten(1)[:, None]
-        found[name] = Concept(plans, torch.ones(len(plans)), origin(model, demonstrations, name, "fixed", 0.0))
-    return found

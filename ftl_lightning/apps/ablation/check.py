@@ -37,7 +37,7 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.apps.lightning_cli import parse
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.networks.text_encoder import load_encoder
-    from ftl_lightning.training.methods import adapts, kinds_for
+    from ftl_lightning.training.methods import kinds_for, model_class
     from ftl_lightning.training.model_config import read_config
 
     config = parse(cell.verb, cell.arguments)
@@ -58,8 +58,9 @@ def _check(cell: Cell, made: set[str]) -> None:
     if model["pretrained"] not in made:
         adaptation = _class(config["model"]["class_path"])
         trained = read_config(pretrained_folder(model["pretrained"]))
-        if trained["domain"] != domain.name or not adapts(adaptation, trained["kind"]):
-            expected = " or ".join(kinds_for(adaptation))
+        network = model_class(trained["kind"])
+        if trained["domain"] != domain.name or network is None or not adaptation.adapts(network):
+            expected = " or ".join(kinds_for(adaptation.adapts))
             raise UserError(
                 f"model.pretrained: expected a model of {domain.name} ({expected}), found one of {trained['domain']} "
                 f"({trained['kind']}) in {model['pretrained']}"

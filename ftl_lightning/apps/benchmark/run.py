@@ -23,7 +23,7 @@ from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder, shipped
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.method import Method
-from ftl_lightning.training.methods import load_method
+from ftl_lightning.training.methods import class_path, load_method
 from ftl_lightning.training.model_config import CONFIG
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Entry:
             UserError: if no file names the method's adaptation class.
         """
         path, added = self.configuration(suite), shipped(f"conf/method/{self.method}.yaml")
-        expected = self.declared.adaptation.rpartition(":")[2]
+        expected = self.declared.adaptation_class().__name__
         for files in ((path,), (path, added)):
             classes = [str((load(file, "invert").get("model") or {}).get("class_path", "")) for file in files if file.is_file()]
             if classes[-1].rpartition(".")[2] == expected:
@@ -97,10 +97,10 @@ class Entry:
             "defaults": ["conf/verb.yaml"],
             "data": {"init_args": {"domain": suite.domain}},
             "fit": {
-                "model": {"class_path": method.pretraining.replace(":", ".")},
+                "model": {"class_path": class_path(method.pretraining())} if method.pretraining else {},
                 "data": {"class_path": "ftl_lightning.training.data.PretrainingData"},
             },
-            "invert": {"model": {"class_path": method.adaptation.replace(":", ".")}},
+            "invert": {"model": {"class_path": class_path(method.adaptation_class())}},
         }
         write_text(path, yaml.safe_dump(content))
         return path

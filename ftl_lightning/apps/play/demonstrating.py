@@ -13,7 +13,7 @@ from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, check_path
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.errors import UserError, short
-from ftl_lightning.training.demonstration_check import fit_findings
+from ftl_lightning.training.checks import fit_findings
 
 WANTED = 5
 """Number of demonstrations that the page asks for."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ftl_lightning.igm.concept import file_name
-from ftl_lightning.training.inversion_settings import INVERSION
+from ftl_lightning.igm.settings import INVERSION
 
 FOLDER = "concepts"
 """Folder to which commands write learned concepts."""

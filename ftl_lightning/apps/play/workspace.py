@@ -19,10 +19,10 @@ from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import OWN
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import KIND, Concept
+from ftl_lightning.igm.forms.quality import GENERATED
+from ftl_lightning.igm.settings import PAPER
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.tensor_file import kind_of
-from ftl_lightning.training.inversion_settings import PAPER
-from ftl_lightning.training.quality import GENERATED
 
 SHOWN, SHOWN_FIRST = 8, 4
 """Number of samples shown of a learned concept, and during learning."""

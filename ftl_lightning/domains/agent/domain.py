@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ftl_lightning.data.cache import cached
 from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.agent import dynamics, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
@@ -19,7 +20,6 @@ from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, 
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
 from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.recorder import Recorder

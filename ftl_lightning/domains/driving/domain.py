@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ftl_lightning.data.cache import cached
 from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.motion import turned

@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.distances import path_distance
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes

@@ -1,14 +1,33 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details')."""
 
+from typing import TYPE_CHECKING, Any
+
 from ftl_lightning.domains.paper import WITH_MODES
-from ftl_lightning.training.method import Form, Method
+from ftl_lightning.training.method import Form, Method, check_present_or_moment
+
+if TYPE_CHECKING:
+    from ftl_lightning.training.concept_model import ConceptModel
+    from ftl_lightning.training.pretraining import Pretraining
+
+
+def _model() -> "type[ConceptModel]":
+    from ftl_lightning.methods.bc.model import CloningModel
+
+    return CloningModel
+
+
+def _pretraining() -> "type[Pretraining[Any]]":
+    from ftl_lightning.methods.bc.pretraining import CloningPretraining
+
+    return CloningPretraining
+
 
 METHOD = Method(
     name="BC",
     kind="bc",
-    model="ftl_lightning.methods.bc.model:CloningModel",
-    pretraining="ftl_lightning.methods.bc.pretraining:CloningPretraining",
+    model=_model,
+    pretraining=_pretraining,
     forms=(Form(WITH_MODES, "modes", 1),),
     configurations="conf/bc",
-    suits="ftl_lightning.training.transitions:check_present_or_moment",
+    suits=check_present_or_moment,
 )

@@ -9,12 +9,11 @@ from torch import Tensor, nn
 from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.methods.bases import AdditiveModel, StepConfig, added, unroll
 from ftl_lightning.methods.bc import METHOD
 from ftl_lightning.services.ranges import check_range
-from ftl_lightning.training.additive import AdditiveModel, added
+from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.text_concept_model import TextConceptModel
-from ftl_lightning.training.transitions import StepConfig, unroll
 
 
 @dataclass(frozen=True, kw_only=True)

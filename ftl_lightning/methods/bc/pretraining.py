@@ -5,13 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ftl_lightning.methods.bases import check_window
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel
 from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretraining import Pretraining
-from ftl_lightning.training.transitions import check_window
 
 
 class CloningPretraining(Pretraining[CloningModel]):
@@ -20,7 +20,7 @@ class CloningPretraining(Pretraining[CloningModel]):
     Args:
         hidden_dim, members: see :class:`CloningConfig`.
         plan_horizon: states in an unrolled plan; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.training.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``, or 1.
+        stride: see :class:`~ftl_lightning.methods.bases.StepConfig`; ``data.horizon`` is ``stride + 1``, or 1.
         options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.
     """
 

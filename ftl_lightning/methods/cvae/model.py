@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.methods.bases import AdditiveModel, added
 from ftl_lightning.methods.cvae import METHOD
-from ftl_lightning.training.additive import AdditiveModel, added
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
 

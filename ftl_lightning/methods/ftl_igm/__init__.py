@@ -1,13 +1,32 @@
 """Our method (the paper's FTL-IGM): a conditional diffusion model whose concepts are learned by gradient descent."""
 
+from typing import TYPE_CHECKING, Any
+
 from ftl_lightning.domains.paper import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.training.method import Form, Method
+
+if TYPE_CHECKING:
+    from ftl_lightning.training.concept_model import ConceptModel
+    from ftl_lightning.training.pretraining import Pretraining
+
+
+def _model() -> "type[ConceptModel]":
+    from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+
+    return GenerativeModel
+
+
+def _pretraining() -> "type[Pretraining[Any]]":
+    from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
+
+    return PretrainingModule
+
 
 METHOD = Method(
     name=OURS,
     kind="diffusion",
-    model="ftl_lightning.methods.ftl_igm.model:GenerativeModel",
-    pretraining="ftl_lightning.methods.ftl_igm.pretraining:PretrainingModule",
+    model=_model,
+    pretraining=_pretraining,
     forms=(Form(WITH_MODES, "modes", 1), Form(WITH_KNOTS, "knots", 1), Form(WITH_ADAPTER, "adapter", 0)),
     configurations="conf",
 )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ftl_lightning.igm.schedule import MOST_STEPS
+from ftl_lightning.igm.diffusion import MOST_STEPS
 from ftl_lightning.services.processes import drawn, mean
 from ftl_lightning.services.ranges import check_count, check_range
 from ftl_lightning.services.seeding import generator

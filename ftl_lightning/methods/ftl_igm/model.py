@@ -9,22 +9,19 @@ from torch import Tensor, nn
 
 from ftl_lightning import networks
 from ftl_lightning.data.features import Observed
-from ftl_lightning.igm.adapter import LowRank, adaptable
-from ftl_lightning.igm.branches import Context
-from ftl_lightning.igm.composition import Composition, batched
-from ftl_lightning.igm.guidance import composed_epsilon
-from ftl_lightning.igm.prediction import PREDICTIONS, Prediction, loss_weights
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.diffusion import MOST_STEPS, PREDICTIONS, Context, Prediction, cosine_alpha_bar
+from ftl_lightning.igm.forms.adapter import LowRank, adaptable
+from ftl_lightning.igm.model import DiffusionModel, Draws
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.schedule import MOST_STEPS, cosine_alpha_bar, denoising_loss, timesteps
 from ftl_lightning.methods.ftl_igm import METHOD
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.spectrum import Spectrum
-from ftl_lightning.training.concept_model import Draws
+from ftl_lightning.training.concept_model import TextConceptModel
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.text_concept_model import TextConceptModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,28 +52,28 @@ def build_denoiser(config: DiffusionConfig) -> nn.Module:
     Raises:
         UserError: for an unknown class or invalid arguments.
     """
-    if config.denoiser not in networks.__all__:
-        raise UserError(f"denoiser: expected one of {', '.join(networks.__all__)}, found {short(config.denoiser)!r}")
-    if config.prediction not in PREDICTIONS:
-        raise UserError(f"prediction: expected one of {', '.join(PREDICTIONS)}, found {short(config.prediction)!r}")
-    if config.prediction in ("epsilon", "v") and config.denoiser_args.get("smooth"):
-        raise UserError(f"denoiser_args.smooth: expected 0 for a network that puts out {config.prediction}, which is not smooth")
+    known, smooth = networks.__all__, config.denoiser_args.get("smooth")
+    require(config.denoiser in known, "denoiser", f"one of {', '.join(known)}", repr(short(config.denoiser)))
+    require(config.prediction in PREDICTIONS, "prediction", f"one of {', '.join(PREDICTIONS)}", repr(short(config.prediction)))
+    rough = config.prediction in ("epsilon", "v")
+    reason = f"0 for a network that predicts {config.prediction}, which is not smooth"
+    require(not (rough and smooth), "denoiser_args.smooth", reason, smooth)
     kind: type[nn.Module] = getattr(networks, config.denoiser)
-    if config.prediction == "cosines" and getattr(kind, "over_time", False):
-        raise UserError(f"prediction: expected clean for {config.denoiser}, whose output is smooth by itself, found cosines")
-    points = config.denoiser_args.get("initial_encoder") == "points"
-    if points and config.image_dim and config.image_encoder.get("head") != "points":
-        raise UserError("denoiser_args.initial_encoder: expected flat, found points: image_encoder.head reads no points")
+    over_time = config.prediction == "cosines" and getattr(kind, "over_time", False)
+    require(not over_time, "prediction", f"clean for {config.denoiser}, whose output is smooth by itself", "cosines")
+    points = config.denoiser_args.get("initial_encoder") == "points" and config.image_dim
+    reads = config.image_encoder.get("head") == "points"
+    require(reads or not points, "denoiser_args.initial_encoder", "flat", "points: image_encoder.head reads no points")
     denoiser = from_mapping(kind, config.denoiser_args, "denoiser_args", config)
     if config.prediction == "epsilon":
         return denoiser
-    if config.state_columns and len(config.state_columns) != config.state_dim:
-        raise UserError(f"observed, state: expected {config.state_dim} columns, found {len(config.state_columns)}")
+    columns = len(config.state_columns)
+    require(columns in (0, config.state_dim), "observed, state", f"{config.state_dim} columns", columns)
     spectrum = Spectrum(config.horizon, config.state_dim) if config.prediction == "cosines" else None
     return Prediction(denoiser, config.prediction, config.diffusion_steps, config.state_columns, spectrum)
 
 
-class GenerativeModel(TextConceptModel):
+class GenerativeModel(DiffusionModel, TextConceptModel):
     """Conditional diffusion model of plans.
 
     Args:
@@ -87,12 +84,11 @@ class GenerativeModel(TextConceptModel):
     invertible = True
     Config = DiffusionConfig
     config: DiffusionConfig
-    denoiser: nn.Module
-    alpha_bar: Tensor
 
     def __init__(self, prepared: Prepared[DiffusionConfig]) -> None:
         super().__init__(prepared)
         self.denoiser = build_denoiser(prepared.config)
+        self.plan = prepared.config.horizon, prepared.config.state_dim
         self.register_buffer("alpha_bar", cosine_alpha_bar(prepared.config.diffusion_steps))
 
     @property
@@ -111,34 +107,15 @@ class GenerativeModel(TextConceptModel):
     def check_adapter(self, adapter: LowRank) -> None:
         adapter.check_fits(self.denoiser)
 
-    @property
-    def max_steps(self) -> int:
-        return len(self.alpha_bar)
-
-    def draws(self, samples: int, timestep_power: float, draw: torch.Generator) -> Draws:
-        """Draw noise and stratified timesteps ``T (1 - u^power)``, u uniform in [0, 1)."""
-        device = draw.device
-        spread = (torch.arange(samples, device=device) + torch.rand(samples, generator=draw, device=device)) / samples
-        t = timesteps(spread, len(self.alpha_bar), timestep_power)[torch.randperm(samples, generator=draw, device=device)]
-        return Draws(t, torch.randn((samples, self.config.horizon, self.config.state_dim), generator=draw, device=device))
-
     def observe(self, observed: Observed) -> Context:
         """Encode observed features once per plan."""
         context: Context = self.denoiser.observe(self.vector(observed))  # type: ignore[operator]
         return context
 
     def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
-        """Loss of Eq. 2 for every run and sample."""
         assert draws is not None
-        runs, context = len(composition.embeddings), self.observe(observed)
-        losses = denoising_loss(
-            lambda x, t: composed_epsilon(self.denoiser, x, t, composition, self.empty, context),
-            self.encode(states, observed),
-            draws.noise.repeat(runs, 1, 1),
-            draws.t.repeat(runs),
-            self.alpha_bar,
-        )
-        return losses.unflatten(0, (runs, -1)) * loss_weights(loss, self.alpha_bar)[draws.t]
+        context = self.observe(observed)
+        return self.composed_losses(self.encode(states, observed), context, composition, draws, loss)
 
     @torch.no_grad()
     def sample(
@@ -149,18 +126,6 @@ class GenerativeModel(TextConceptModel):
         generators: Sequence[torch.Generator],
         observed: Observed | None = None,
     ) -> Tensor:
-        (together, row), seen = batched(compositions, count, generators), observed or {}
-        context = self.observe(seen)
-
-        def epsilon(x: Tensor, t: Tensor) -> Tensor:
-            return composed_epsilon(self.denoiser, x, t, together, self.empty, context, row)
-
-        shape = (count, self.config.horizon, self.config.state_dim)
-
-        def noise() -> Tensor:
-            # Draw on the generators' device: a seed gives the same samples on every device.
-            drawn = [torch.randn(shape, generator=draw, device=draw.device) for draw in generators]
-            return torch.cat(drawn).to(self.device)
-
-        plans = sampling.run(epsilon, noise, self.alpha_bar)
-        return self.decode(plans, seen).unflatten(0, (len(compositions), count))
+        features = observed or {}
+        plans = self.composed_plans(compositions, count, sampling, generators, self.observe(features))
+        return self.decode(plans, features).unflatten(0, (len(compositions), count))

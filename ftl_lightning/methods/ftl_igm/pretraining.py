@@ -7,8 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.igm.prediction import LOSSES, Prediction, loss_weights
-from ftl_lightning.igm.schedule import LARGEST_POWER, MOST_STEPS, denoising_loss, timesteps
+from ftl_lightning.igm.diffusion import LARGEST_POWER, LOSSES, MOST_STEPS, Prediction, denoising_loss, loss_weights, timesteps
 from ftl_lightning.methods.ftl_igm.codes import Codes
 from ftl_lightning.methods.ftl_igm.model import DiffusionConfig, GenerativeModel
 from ftl_lightning.networks import PAPER_SIZE
@@ -44,7 +43,7 @@ class LossOptions:
     Attributes:
         kind: quantity of the squared error, ``'epsilon'`` (Eq. 1), ``'v'`` or ``'clean'``. ``'v'`` and ``'clean'`` give more weight
             to noisy timesteps, at which the concept matters: factors 1 / abar_t and (1 - abar_t) / abar_t.
-        timestep_power: see :func:`ftl_lightning.igm.schedule.timesteps`; 1 is the paper's.
+        timestep_power: see :func:`ftl_lightning.igm.diffusion.timesteps`; 1 is the paper's.
         discount: state k of a window has weight ``discount ** k``; use values below 1 with replanning.
         condition_dropout: probability p of replacing a sample's concept by the unconditional embedding; drawn per sample
             (the published code draws per batch).
@@ -76,7 +75,7 @@ class PretrainingModule(Pretraining[GenerativeModel]):
         diffusion_steps: T.
         draws: number of timesteps and noises per window and step; the observation is encoded once for all draws.
         prediction: parametrisation of the output: ``'epsilon'`` (the paper's), ``'v'``, ``'clean'``, ``'displacement'`` or
-            ``'cosines'`` (:class:`ftl_lightning.igm.prediction.Prediction`).
+            ``'cosines'`` (:class:`ftl_lightning.igm.diffusion.Prediction`).
         loss: options of the loss.
         codes: coarse codes of behaviour for some samples, which prepare the network for concepts that vary over a plan and for
             concepts without a text.

@@ -10,13 +10,16 @@ from torch.nn import functional
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import Observed, moved
 from ftl_lightning.igm.composition import Composition, batched
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.inversion import Inversion, Tell, Watch
 from ftl_lightning.igm.samplers import Sampling
+from ftl_lightning.igm.settings import InversionSettings
+from ftl_lightning.methods.bases import StepConfig, unroll
 from ftl_lightning.methods.in_context import METHOD
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.ranges import LARGEST, check_range
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.transitions import StepConfig, unroll
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +142,27 @@ class InContextModel(ConceptModel):
     def bins(self, normalised: Tensor) -> Tensor:
         """Bin of each value."""
         return ((normalised + 1) / 2 * self.config.bins).long().clamp(0, self.config.bins - 1)
+
+    def learn(
+        self,
+        demonstrations: Demonstrations,
+        settings: InversionSettings,
+        steps: int,
+        tell: Tell = lambda loss: None,
+        watch: Watch | None = None,
+        start: Inversion | None = None,
+    ) -> dict[str, Concept]:
+        """Encode demonstrations as concepts; only ``demonstrations`` is used.
+
+        Raises:
+            UserError: for features observed only at the first time.
+        """
+        concepts = {}
+        for name in dict.fromkeys(demonstrations.concepts):
+            prompts = self.prompts(demonstrations.select(name))
+            origin = self.origin(demonstrations, name, "fixed", 0.0)
+            concepts[name] = Concept(prompts[:, None], torch.ones(len(prompts)), origin)
+        return concepts
 
     @torch.no_grad()
     def sample(

@@ -7,14 +7,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ftl_lightning.methods.bases import check_window
 from ftl_lightning.methods.in_context.model import InContextConfig, InContextModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import Batch, PretrainingData
+from ftl_lightning.training.method import check_present
 from ftl_lightning.training.model_config import ModelConfig
 from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretrained import load_model
 from ftl_lightning.training.pretraining import Pretraining, check_shown
-from ftl_lightning.training.transitions import check_present, check_window
 
 
 class InContextPretraining(Pretraining[InContextModel]):
@@ -24,7 +25,7 @@ class InContextPretraining(Pretraining[InContextModel]):
         tokens, bins, width, layers, heads: see :class:`InContextConfig`.
         prompts: maximum number of demonstrations in a prompt; the number is drawn per step and concept.
         plan_horizon: number of states in an unrolled plan; ``None`` for the domain's.
-        stride: see :class:`~ftl_lightning.training.transitions.StepConfig`; ``data.horizon`` is ``stride + 1``.
+        stride: see :class:`~ftl_lightning.methods.bases.StepConfig`; ``data.horizon`` is ``stride + 1``.
         images: folder of a trained model of any method with frozen image encoders for observed images, as demonstrations are
             encoded before training.
         options: see :class:`~ftl_lightning.training.pretraining.Pretraining`.

@@ -1,11 +1,23 @@
 """Language (paper, 'Conditioning on Language Descriptions of New Concepts'): our model, conditioned on task descriptions."""
 
+from typing import TYPE_CHECKING
+
 from ftl_lightning.methods.ftl_igm import METHOD as OURS
 from ftl_lightning.training.method import Method
+
+if TYPE_CHECKING:
+    from ftl_lightning.training.adaptation import Adaptation
+
+
+def _adaptation() -> "type[Adaptation]":
+    from ftl_lightning.methods.language.adaptation import LanguageAdaptation
+
+    return LanguageAdaptation
+
 
 METHOD = Method(
     name="language",
     kind=OURS.kind,
-    adaptation="ftl_lightning.methods.language.adaptation:LanguageAdaptation",
+    adaptation=_adaptation,
     configurations="conf",
 )

@@ -8,10 +8,10 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.methods.language import METHOD
 from ftl_lightning.networks.text_encoder import load_encoder
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.services.errors import require
 from ftl_lightning.training.adaptation import Adaptation
-from ftl_lightning.training.inversion import origin
-from ftl_lightning.training.text_concept_model import TextConceptModel
+from ftl_lightning.training.concept_model import ConceptModel, TextConceptModel
+from ftl_lightning.training.labels import Labels
 
 
 class LanguageAdaptation(Adaptation):
@@ -31,6 +31,8 @@ class LanguageAdaptation(Adaptation):
         UserError: for a model of another method or encoder.
     """
 
+    labels = Labels(METHOD.name, "", "")
+
     def __init__(
         self,
         pretrained: str,
@@ -42,32 +44,29 @@ class LanguageAdaptation(Adaptation):
     ) -> None:
         super().__init__(pretrained, omega, output)
         self.save_hyperparameters()
-        if not isinstance(self.model, TextConceptModel):
-            raise UserError(
-                f"model.pretrained: expected a model whose concepts are texts, found {self.model.method.kind} in {pretrained}"
-            )
+        assert isinstance(self.model, TextConceptModel)
         self._standardise = self.model.standardise
         self._encoder = load_encoder(encoder, self.model.domain.concepts.table, revision)
-        if (name := self._encoder.identity) != self.model.config.encoder:
-            raise UserError(f"model.encoder: expected {self.model.config.encoder!r} (the pretrained model's), found {name!r}")
+        expected, name = self.model.config.encoder, self._encoder.identity
+        require(name == expected, "model.encoder", f"{expected!r} (the pretrained model's)", repr(name))
 
-    @property
-    def method(self) -> str:
-        return METHOD.name
+    @classmethod
+    def adapts(cls, model: type[ConceptModel]) -> bool:
+        return model.method.kind == METHOD.kind
 
     def _embedding(self, goal: str) -> Tensor:
         """Embed a task's description, ``(1, 1, n)``."""
         return self._standardise(self._encoder([self.domain.concepts.sentence(goal)]).to(self.device))[None]
 
-    def learned(self) -> dict[str, Concept]:
-        weights = torch.tensor([self._omega])
+    def learn(self) -> dict[str, Concept]:
+        weights, origin = torch.tensor([self._omega]), self.model.origin
+        names = self.concepts
         return {
-            name: Concept(self._embedding(name).cpu(), weights, origin(self.model, self.demonstrations, name, "fixed", 0.0))
-            for name in self.concepts
+            name: Concept(self._embedding(name).cpu(), weights, origin(self.demonstrations, name, "fixed", 0.0)) for name in names
         }
 
     def composition(self, task: EvaluationTask) -> Composition | None:
         """The description of the whole task with its weight."""
-        if task.component is not None or not set(task.learned) <= set(self._found):
+        if task.component is not None or not set(task.learned) <= set(self.learned()):
             return None
         return Composition(self._embedding(task.goal), torch.tensor([self._omega], device=self.device))

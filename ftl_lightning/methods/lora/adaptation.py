@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
+from ftl_lightning.igm.settings import AdapterOptions
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.inversion_settings import AdapterOptions
 
 _WHOLE = AdapterOptions(rank=4, scope="all")
 

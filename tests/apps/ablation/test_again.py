@@ -7,7 +7,7 @@ import pytest
 
 from ftl_lightning.apps.ablation.plan import Cell
 from ftl_lightning.apps.ablation.run import attempt
-from ftl_lightning.training import PretrainingModule
+from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from tests.conftest import CONF
 
 

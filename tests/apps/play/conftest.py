@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ftl_lightning.apps.play.workspace import Workspace
-from ftl_lightning.training.inversion_settings import PAPER
+from ftl_lightning.igm.settings import PAPER
 from tests.apps.play.served import Served, here
 
 if TYPE_CHECKING:

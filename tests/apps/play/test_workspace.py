@@ -20,8 +20,8 @@ from ftl_lightning.apps.testing.more_strokes import drawn
 from ftl_lightning.cli.main import main
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.settings import PAPER
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training.inversion_settings import PAPER
 from tests.conftest import ROOT
 
 TASK = "square diagonal to triangle"

@@ -7,7 +7,7 @@ import pytest
 from ftl_lightning.apps.testing.more_strokes import BACKWARDS, KNOWN, MIRRORED, RANDOM, TEST, VALIDATION, Judge, drawn
 from ftl_lightning.apps.testing.strokes import STEPS
 from ftl_lightning.few_shot.learner import FewShot
-from ftl_lightning.training.quality import Quality
+from ftl_lightning.igm.forms.quality import Quality
 
 CARD = Path(__file__).parents[3] / "pretrained" / "strokes" / "README.md"
 

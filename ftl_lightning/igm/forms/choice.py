@@ -1,22 +1,18 @@
 """Forms of learned concepts, and selection of a form by leave-one-out error."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
-
-import torch
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Choice, Concept
-from ftl_lightning.igm.modes import Modes, even_stretch
-from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.inversion import Watch, check_settings, invert, warn_of_loss
-from ftl_lightning.training.inversion_settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
-from ftl_lightning.training.leave_one_out import learned_from, quickly
-from ftl_lightning.training.quality import Quality, measured
-from ftl_lightning.training.relative_loss import relative_losses
-from ftl_lightning.training.text_concept_model import TextConceptModel
+from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses
+from ftl_lightning.igm.forms.modes import Modes, even_stretch
+from ftl_lightning.igm.forms.quality import Quality, measured
+from ftl_lightning.igm.inversion import Inversion, Tell, Watch, invert
+from ftl_lightning.igm.model import Invertible
+from ftl_lightning.igm.settings import ADAPTED, AUTO, MIXED, MODES, ONE, PAPER, UNSAID, InversionSettings
 
 RANK, RATE, ADAPTER_STEPS = 1, 3e-3, 120
 """Default rank, learning rate and steps of adapters."""
@@ -40,25 +36,31 @@ SPAN_LOSS = 1.03
 """Maximum ratio of leave-one-out losses, in the span of the training concepts to free, to compose a concept from a set in the
 span."""
 
-Tell = Callable[[float], None]
-
 
 def learn(
-    model: ConceptModel,
+    model: Invertible,
     demonstrations: Demonstrations,
     settings: InversionSettings,
     steps: int,
     tell: Tell = lambda loss: None,
     watch: Watch | None = None,
+    start: Inversion | None = None,
 ) -> dict[str, Concept]:
-    """:func:`~ftl_lightning.training.inversion.invert`, with concepts in the form of the settings.
+    """Learn every concept of the demonstrations in the form of the settings; for ``'auto'``, selected by leave-one-out error.
 
-    Only the first inversion is watched.
+    Args:
+        model, demonstrations, settings, steps, tell: see :func:`~ftl_lightning.igm.inversion.invert`.
+        watch, start: of the first inversion, with :func:`first_settings`.
     """
-    check_settings(model, settings)
-    warn_of_loss(model, settings)
-    first = invert(model, demonstrations, first_settings(settings), steps, tell, watch)
-    return formed(model, demonstrations, settings, steps, first, tell)
+    model.check_settings(settings)
+    first = invert(model, demonstrations, first_settings(settings), steps, tell, watch, start)
+    if settings.form in (UNSAID, PAPER, ONE):
+        return first
+    if settings.form == MODES:
+        return _with_modes(model, demonstrations, settings, steps, first, tell)
+    if settings.form in (ADAPTED, MIXED):
+        return _adapted(model, demonstrations, settings, steps, settings.form == MIXED, tell)
+    return _chosen(model, demonstrations, settings, steps, first, tell)
 
 
 def first_settings(settings: InversionSettings) -> InversionSettings:
@@ -66,41 +68,6 @@ def first_settings(settings: InversionSettings) -> InversionSettings:
     if settings.form in (UNSAID, PAPER):
         return settings
     return _one_set(settings)
-
-
-def formed(
-    model: ConceptModel,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    first: dict[str, Concept],
-    tell: Tell = lambda loss: None,
-) -> dict[str, Concept]:
-    """Concepts in the form of the settings; for ``'auto'``, selected by leave-one-out error.
-
-    Args:
-        model, demonstrations, settings, steps, tell: as in :func:`~ftl_lightning.training.inversion.invert`.
-        first: concepts learned with :func:`first_settings`.
-    """
-    if settings.form in (UNSAID, PAPER, ONE):
-        return first
-    with torch.inference_mode(False), torch.enable_grad():  # a trainer turns gradients off after training
-        return _beyond_first(model, demonstrations, settings, steps, first, tell)
-
-
-def _beyond_first(
-    model: ConceptModel,
-    demonstrations: Demonstrations,
-    settings: InversionSettings,
-    steps: int,
-    first: Mapping[str, Concept],
-    tell: Tell,
-) -> dict[str, Concept]:
-    if settings.form == MODES:
-        return _with_modes(model, demonstrations, settings, steps, first, tell)
-    if settings.form in (ADAPTED, MIXED):
-        return _adapted(model, demonstrations, settings, steps, settings.form == MIXED, tell)
-    return _chosen(model, demonstrations, settings, steps, first, tell)
 
 
 def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
@@ -111,7 +78,7 @@ def _one_set(settings: InversionSettings, **changes: Any) -> InversionSettings:
 
 
 def _with_modes(
-    model: ConceptModel,
+    model: Invertible,
     demonstrations: Demonstrations,
     settings: InversionSettings,
     steps: int,
@@ -130,7 +97,7 @@ def _with_modes(
 
 
 def _adapted(
-    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, steps: int, mixed: bool, tell: Tell
+    model: Invertible, demonstrations: Demonstrations, settings: InversionSettings, steps: int, mixed: bool, tell: Tell
 ) -> dict[str, Concept]:
     """Concepts of one set and an adapter; with ``mixed``, of mixtures that share an adapter (several demonstrations only)."""
     adapter = settings.adapter
@@ -180,7 +147,7 @@ class _Shares:
 
 
 def _loss_shares(
-    model: ConceptModel,
+    model: Invertible,
     demonstrations: Demonstrations,
     settings: InversionSettings,
     steps: int,
@@ -195,7 +162,7 @@ def _loss_shares(
         for name, rows in every.items()
     }
     folds = [[row for row in every[name] if row != out] for name, rows in left.items() for out in rows]
-    for off_span in (settings.embeddings.off_span, 0.0)[: 1 + isinstance(model, TextConceptModel)] if folds else ():
+    for off_span in (settings.embeddings.off_span, 0.0)[: 1 + model.text_space] if folds else ():
         learned = learned_from(model, demonstrations, folds, quickly(settings).changed(off_span=off_span), steps, tell)
         number = 0
         for name, rows in left.items():
@@ -207,7 +174,7 @@ def _loss_shares(
     return {name: _Shares(*measured) for name, measured in losses.items()}
 
 
-def _own_loss(model: ConceptModel, demonstrations: Demonstrations, concept: Concept, settings: InversionSettings) -> float:
+def _own_loss(model: Invertible, demonstrations: Demonstrations, concept: Concept, settings: InversionSettings) -> float:
     """Relative training loss of one set of embeddings."""
     weights = concept.weights if settings.omega != "learned" else concept.weights / settings.weights.scale
     alone = Composition(concept.embeddings[None], weights[None]).to(model.device)
@@ -220,7 +187,7 @@ def _of(demonstrations: Demonstrations, concepts: Collection[str]) -> Demonstrat
 
 
 def _chosen(
-    model: ConceptModel,
+    model: Invertible,
     demonstrations: Demonstrations,
     settings: InversionSettings,
     steps: int,
@@ -263,7 +230,7 @@ def _chosen(
     return {name: chosen[name] for name in first}
 
 
-def _narrowed(model: ConceptModel, demonstrations: Demonstrations, concept: Concept, seed: int) -> tuple[Concept, Quality]:
+def _narrowed(model: Invertible, demonstrations: Demonstrations, concept: Concept, seed: int) -> tuple[Concept, Quality]:
     """Mixtures, stretched less if they spread too widely, and their quality."""
     quality = measured(model, demonstrations, {MIXED: concept}, seed)[MIXED]
     if quality.spread <= WIDE or concept.modes is None:

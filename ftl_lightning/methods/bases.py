@@ -1,5 +1,6 @@
-"""Base of one-step methods: predict the next state, and unroll it into a plan."""
+"""Base classes of baselines: composition by addition, and transitions that are unrolled into plans."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -8,13 +9,45 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import READ, Observed
-from ftl_lightning.domains.domain import Domain
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.model import Draws
+from ftl_lightning.services.errors import require
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.model_config import ModelConfig
 
 if TYPE_CHECKING:  # it needs Lightning, models do not
     from ftl_lightning.training.data import PretrainingData
+
+
+class AdditiveModel(ConceptModel):
+    """A model conditioned on the weighted sum of a composition's parts (paper, 'Implementation Details')."""
+
+    invertible = True
+
+    @abstractmethod
+    def errors(self, states: Tensor, observed: Observed, concepts: Tensor) -> Tensor:
+        """Squared error of behaviour ``(batch,)``.
+
+        Args:
+            states: ``(batch, window, state)`` in the domain's units.
+            observed: features ``(batch, *shape)`` by name.
+            concepts: ``(batch, n)``.
+        """
+
+    def losses(self, states: Tensor, observed: Observed, composition: Composition, draws: Draws | None, loss: str) -> Tensor:
+        runs, each = len(composition.weights), added(composition)
+        return self.errors(states, observed, each.repeat_interleave(len(states) // runs, dim=0)).unflatten(0, (runs, -1))
+
+
+def added(composition: Composition) -> Tensor:
+    """Weighted sums ``(row, n)`` of the concepts of a composition ``(row, K, 1, n)``.
+
+    Raises:
+        UserError: for a concept restricted to some columns: a sum acts on all columns.
+    """
+    require(composition.columns is None, "compose", "concepts without '@' for a model that adds them up", "groups of columns")
+    rows = zip(composition.weights, composition.embeddings, strict=True)
+    return torch.stack([weights @ embeddings.flatten(1) for weights, embeddings in rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +62,11 @@ class StepConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.stride < 1:
-            raise UserError(f"model.stride: expected 1 or more, found {self.stride}")
-        if self.horizon > 1 and (self.horizon, self.stride) != (2, 1) and not self.state_columns:
-            raise UserError(
-                f"model.plan_horizon: expected 2 states, and stride 1 (what domain {self.domain} observes holds no state from "
-                f"which a longer plan could be unrolled), found {self.horizon} and {self.stride}"
-            )
+        require(self.stride >= 1, "model.stride", "1 or more", self.stride)
+        reason = f"(what domain {self.domain} observes holds no state from which a longer plan could be unrolled)"
+        unrolls = self.horizon == 1 or (self.horizon, self.stride) == (2, 1) or self.state_columns
+        lengths = f"{self.horizon} and {self.stride}"
+        require(unrolls, "model.plan_horizon", f"2 states, and stride 1 {reason}", lengths)
 
     @property
     def window(self) -> int:
@@ -48,34 +79,13 @@ class StepConfig(ModelConfig):
         return min(self.horizon, 2)
 
 
-def check_present(domain: Domain) -> None:
-    """Refuse domains without observations.
-
-    Raises:
-        UserError: with the domain.
-    """
-    if not domain.observed:
-        raise UserError(f"domain: expected one with observed features, found {domain.name}: there is no present to go on from")
-
-
-def check_present_or_moment(domain: Domain) -> None:
-    """Refuse domains without observations, unless plans are single states.
-
-    Raises:
-        UserError: with the domain.
-    """
-    if domain.plans.horizon > 1:
-        check_present(domain)
-
-
 def check_window(config: StepConfig, data: "PretrainingData") -> None:
     """Refuse windows that are not a transition.
 
     Raises:
         UserError: with the key.
     """
-    if data.horizon != config.window:
-        raise UserError(f"data.horizon: expected {config.window} (states that a transition spans), found {data.horizon}")
+    require(data.horizon == config.window, "data.horizon", f"{config.window} (states that a transition spans)", data.horizon)
 
 
 def unroll(model: ConceptModel, config: StepConfig, predict: Callable[[Tensor | None], Tensor], observed: Observed) -> Tensor:

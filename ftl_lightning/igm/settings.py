@@ -5,9 +5,8 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal, Self
 
-from ftl_lightning.igm.prediction import LOSSES
-from ftl_lightning.igm.schedule import LARGEST_POWER
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.igm.diffusion import LARGEST_POWER, LOSSES
+from ftl_lightning.services.errors import require
 from ftl_lightning.services.option_groups import replaced
 from ftl_lightning.services.ranges import LARGEST, LARGEST_RATE, MOST_TOGETHER, check_count, check_factor, check_range
 
@@ -77,10 +76,8 @@ class EmbeddingOptions:
     def __post_init__(self) -> None:
         check_count("model.embeddings.knots", self.knots, 1, MOST)
         check_factor("model.embeddings.initial_spread", self.initial_spread, 0)
-        if self.start not in STARTS:
-            raise UserError(f"model.embeddings.start: expected {' or '.join(STARTS)}, found {shown(self.start)}")
-        if not 0 <= self.off_span <= 1:
-            raise UserError(f"model.embeddings.off_span: expected 0 (span) to 1 (free), found {self.off_span}")
+        require(self.start in STARTS, "model.embeddings.start", " or ".join(STARTS), repr(self.start))
+        require(0 <= self.off_span <= 1, "model.embeddings.off_span", "0 (span) to 1 (free)", self.off_span)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +108,7 @@ class WeightOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ModeOptions:
-    """Several sets of embeddings of a concept, see :class:`~ftl_lightning.igm.modes.Modes`.
+    """Several sets of embeddings of a concept, see :class:`~ftl_lightning.igm.forms.modes.Modes`.
 
     Attributes:
         sets: 1 is the paper's form; otherwise a set is also learned, from the same start, for every demonstration (``'each'``), or
@@ -124,12 +121,12 @@ class ModeOptions:
     samples: int = 8
 
     def __post_init__(self) -> None:
-        if isinstance(self.sets, int) and self.sets < 1:
-            raise UserError(f"model.modes.sets: expected 1 or more, 'each' or 'auto', found {self.sets}")
-        if isinstance(self.sets, str) and self.sets not in ("each", "auto"):
-            raise UserError(f"model.modes.sets: expected a number, 'each' or 'auto', found {self.sets!r}")
+        place = "model.modes.sets"
         if isinstance(self.sets, int):
-            check_count("model.modes.sets", self.sets, 1, MOST_TOGETHER)
+            require(self.sets >= 1, place, "1 or more, 'each' or 'auto'", self.sets)
+            check_count(place, self.sets, 1, MOST_TOGETHER)
+        else:
+            require(self.sets in ("each", "auto"), place, "a number, 'each' or 'auto'", repr(self.sets))
         check_count("model.modes.samples", self.samples, 1, MOST_TOGETHER)
 
 
@@ -149,10 +146,8 @@ class AdapterOptions:
     scope: Literal["concept", "all"] = "concept"
 
     def __post_init__(self) -> None:
-        if self.scope not in ("concept", "all"):
-            raise UserError(f"model.adapter.scope: expected concept or all, found {self.scope!r}")
-        if self.rank < 0:
-            raise UserError(f"model.adapter.rank: expected 0 (none) or a rank, found {self.rank}")
+        require(self.scope in ("concept", "all"), "model.adapter.scope", "concept or all", repr(self.scope))
+        require(self.rank >= 0, "model.adapter.rank", "0 (none) or a rank", self.rank)
         check_count("model.adapter.rank", self.rank, 0, MOST)
         check_factor("model.adapter.learning_rate", self.learning_rate, 0, LARGEST_RATE)
 
@@ -168,7 +163,7 @@ class BudgetOptions:
         learning_rate: learning rate of the embeddings (Adam).
         tolerance: early stopping: a run stops when each of two rounds of 10 steps lowers its loss on held-out noise by less than
             this share of its total decrease. The learning rate is constant and the result is the mean over the best round, see
-            :class:`~ftl_lightning.training.stopping.Stopping`. Steps after the last whole round do not count; without a whole
+            :class:`~ftl_lightning.igm.forms.stopping.Stopping`. Steps after the last whole round do not count; without a whole
             round the last step does. ``None`` for all steps, with the rate decaying to 0.
         precision: precision of the network's products in a step, named as in Lightning's trainer: ``'32-true'``, or
             ``'bf16-mixed'`` for bfloat16, half the time with hardware support, see ``docs/speed.md``. Stopping and the reported
@@ -187,10 +182,9 @@ class BudgetOptions:
         check_count("model.budget.restarts", self.restarts, 1, MOST)
         check_count("model.budget.screening", self.screening, 0, LARGEST)
         check_factor("model.budget.learning_rate", self.learning_rate, 0, LARGEST_RATE)
-        if self.tolerance is not None and not 0 <= self.tolerance < 1:
-            raise UserError(f"model.budget.tolerance: expected null or a share from 0 up to 1, found {self.tolerance}")
-        if self.precision not in PRECISIONS:
-            raise UserError(f"model.budget.precision: expected one of {', '.join(PRECISIONS)}, found {self.precision!r}")
+        share = self.tolerance is None or 0 <= self.tolerance < 1
+        require(share, "model.budget.tolerance", "null or a share from 0 up to 1", self.tolerance)
+        require(self.precision in PRECISIONS, "model.budget.precision", f"one of {', '.join(PRECISIONS)}", repr(self.precision))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,8 +203,7 @@ class LossOptions:
     timestep_power: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.kind not in LOSSES:
-            raise UserError(f"model.loss.kind: expected one of {', '.join(LOSSES)}, found {self.kind!r}")
+        require(self.kind in LOSSES, "model.loss.kind", f"one of {', '.join(LOSSES)}", repr(self.kind))
         check_factor("model.loss.timestep_power", self.timestep_power, 1, LARGEST_POWER)
 
 
@@ -228,7 +221,7 @@ class InversionSettings:
         budget: compute budget.
         loss: options of the loss.
         seed: seed of starts, noise and timesteps.
-        form: form of concepts, from :data:`FORMS`, see :mod:`ftl_lightning.training.forms`. ``'auto'`` and the forms after it
+        form: form of concepts, from :data:`FORMS`, see :mod:`ftl_lightning.igm.forms.choice`. ``'auto'`` and the forms after it
             override modes and adapter; an adapter's rank and learning rate are kept if given.
 
     Raises:
@@ -247,14 +240,13 @@ class InversionSettings:
     form: str = UNSAID
 
     def __post_init__(self) -> None:
-        if self.form not in FORMS:
-            raise UserError(f"model.form: expected one of {', '.join(FORMS[1:])}, found {self.form!r}")
+        require(self.form in FORMS, "model.form", f"one of {', '.join(FORMS[1:])}", repr(self.form))
         check_count("model.components", self.components, 1, MOST)
         check_range("model.seed", self.seed, 0)
         if self.omega != "learned":
             check_factor("model.omega", self.omega)
-        if self.form in (UNSAID, PAPER) and self.adapter.rank and self.budget.tolerance is not None:
-            raise UserError("model.adapter.rank: expected model.budget.tolerance null beside it, found a number")
+        stops = self.form in (UNSAID, PAPER) and self.adapter.rank and self.budget.tolerance is not None
+        require(not stops, "model.adapter.rank", "model.budget.tolerance null beside it", "a number")
 
     def for_own(self, choose: bool) -> Self:
         """Settings for a user's demonstrations: the form is ``'auto'`` unless form, modes or adapter are given.

@@ -1,14 +1,13 @@
 """Low-rank adapters (LoRA, Hu et al., 2022), which modify the denoiser in the branch of a concept."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.igm.branches import Context, Denoiser, Noised, branches
-from ftl_lightning.igm.composition import Adapter, Composition
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.igm.diffusion import Denoiser
+from ftl_lightning.services.errors import UserError, require, short
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +46,8 @@ class LowRank:
         """
         known = adaptable(network)
         for name, (up, down) in self.factors.items():
-            if known.get(name) != (sizes := (len(up), down.shape[1])):
-                raise UserError(f"key 'adapter/{short(name)}': expected the sizes {known.get(name, 'of no weight')}, found {sizes}")
+            sizes, place = (len(up), down.shape[1]), f"key 'adapter/{short(name)}'"
+            require(known.get(name) == sizes, place, f"the sizes {known.get(name, 'of no weight')}", sizes)
 
     def __len__(self) -> int:
         """Number of parameters."""
@@ -80,10 +79,10 @@ class LowRank:
             if up is None or down is None or not up.dim() == down.dim() == 2 or up.shape[1] != down.shape[0]:
                 shapes = " and ".join("none" if factor is None else str(tuple(factor.shape)) for factor in (up, down))
                 raise UserError(f"key 'adapter/{short(name)}': expected shapes (outputs, rank) and (rank, inputs), found {shapes}")
-            if not up.dtype == down.dtype == torch.float32:
-                raise UserError(f"key 'adapter/{short(name)}': expected float32, found {up.dtype} and {down.dtype}")
-        if unknown := set(tensors) - {f"{name}/{kind}" for name in names for kind in KINDS}:
-            raise UserError(f"key 'adapter': expected factors {' and '.join(KINDS)}, found {short(min(unknown))}")
+            single = up.dtype == down.dtype == torch.float32
+            require(single, f"key 'adapter/{short(name)}'", "float32", f"{up.dtype} and {down.dtype}")
+        unknown = set(tensors) - {f"{name}/{kind}" for name in names for kind in KINDS}
+        require(not unknown, "key 'adapter'", f"factors {' and '.join(KINDS)}", short(min(unknown, default="")))
         return cls({name: (tensors[f"{name}/{KINDS[0]}"], tensors[f"{name}/{KINDS[1]}"]) for name in names}, everywhere)
 
 
@@ -94,60 +93,3 @@ def adaptable(network: nn.Module) -> dict[str, tuple[int, int]]:
     """Sizes ``(outputs, everything else)`` of the adaptable weights, which are all matrices and convolutions, by name."""
     weights = {name: weight for name, weight in network.named_parameters() if weight.dim() > 1}
     return {name: (len(weight), weight[0].numel()) for name, weight in weights.items()}
-
-
-def adapted_branches(
-    denoiser: Denoiser,
-    noised: Noised,
-    composition: Composition,
-    row: Tensor,
-    empty: Tensor,
-    concepts: Tensor,
-    index: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Evaluate the branches of a composition with adapters.
-
-    An adapter with ``everywhere`` also modifies the unconditional branch and the branches of its composition without an adapter.
-    The unmodified unconditional branch is evaluated without gradient.
-
-    Args:
-        denoiser: unmodified denoiser.
-        noised: noisy plans.
-        composition: ``(composition, K, ...)`` with adapters.
-        row: composition of each plan ``(batch,)``.
-        empty: unconditional embedding ``(1, knots, n)``.
-        concepts: concepts of all compositions ``(composition * K, knots, n)``.
-        index: rows of ``concepts`` for each plan ``(K, batch)``.
-
-    Returns:
-        Noise of the unconditional branch ``(batch, horizon, state)`` and of the concepts' ``(K, batch, horizon, state)``.
-    """
-    adapters, number = composition.adapters, composition.adapter_number[row]  # (batch, K)
-    everywhere = number.new_tensor([0, *(n * adapter.everywhere for n, adapter in enumerate(adapters, start=1))])
-    default = everywhere[number].amax(dim=1)  # (batch,): adapter of the branches without one
-    number = torch.where(number == 0, default[:, None], number)
-    conditional = branches(_by_adapter(denoiser, adapters, number.T.flatten()), noised, concepts, index)
-    first = torch.zeros_like(row)[None]
-    if default.any():
-        unconditional = branches(_by_adapter(denoiser, adapters, default), noised, empty, first)
-    else:
-        with torch.no_grad():
-            unconditional = branches(denoiser, noised, empty, first)
-    return unconditional[0], conditional
-
-
-def _by_adapter(denoiser: Denoiser, adapters: Sequence[Adapter], number: Tensor) -> Denoiser:
-    """Denoiser that applies adapter ``number (sample,)`` to each sample, from 1; 0 for none. One forward pass per adapter."""
-
-    def estimate(x: Tensor, t: Tensor, concepts: Tensor, index: Tensor, context: Context) -> Tensor:
-        by_number = number.argsort(stable=True)
-        groups = by_number.split(number.bincount(minlength=1 + len(adapters)).tolist())
-        noise = []
-        for adapter, samples in zip((None, *adapters), groups, strict=True):
-            if len(samples):
-                changed = denoiser if adapter is None else adapter(denoiser)
-                some = Noised(x, t, context).at(samples)
-                noise.append(changed(some.x, some.t, concepts, index[samples], some.context))
-        return torch.cat(noise)[by_number.argsort()]
-
-    return estimate

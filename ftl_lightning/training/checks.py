@@ -1,0 +1,299 @@
+"""Checks of demonstrations and learned concepts against a model."""
+
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ftl_lightning.data.check import check
+from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.features import moved
+from ftl_lightning.data.finding import Finding
+from ftl_lightning.igm.composition import Composition
+from ftl_lightning.igm.concept import Concept
+from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, relative_losses
+from ftl_lightning.igm.settings import InversionSettings
+from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.representation import counted
+from ftl_lightning.training.concept_model import ConceptModel
+
+MARGIN, MOST_OF = 0.97, 0.8
+"""Maximum loss, relative to the unconditional (empty concept's) loss, of a demonstration that a training concept explains; minimum
+share of explained demonstrations for a known task.
+"""
+MOST_FAULTS = 6
+"""Maximum number of reported findings, most severe first."""
+EXCESS = 0.05
+"""Tolerated excess, as a share of half a column's pretraining range."""
+MANY, OUTSIDE = 0.25, 3.0
+"""Warning thresholds: share of values outside the range, and maximum normalised value."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """The training concept that explains demonstrations best.
+
+    Attributes:
+        text: text of the training concept.
+        losses: loss of each demonstration ``(demo,)``, relative to the unconditional loss.
+    """
+
+    text: str
+    losses: tuple[float, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of demonstrations that it explains."""
+        return sum(loss <= MARGIN for loss in self.losses)
+
+    @property
+    def clear(self) -> bool:
+        """Whether it explains nearly all demonstrations, and their mean loss."""
+        mean = sum(self.losses) / len(self.losses)
+        return self.count >= MOST_OF * len(self.losses) and mean <= MARGIN
+
+    def __str__(self) -> str:
+        mean = sum(self.losses) / len(self.losses)
+        best = f"{self.text!r} ({self.count} of {len(self.losses)}, loss {mean:.2f} of the empty concept's)"
+        if self.clear:
+            return f"known: the model already explains them as {best}; if that is all you mean, no learning is needed"
+        return f"known: no training concept explains them all; the best is {best}"
+
+
+@dataclass(frozen=True)
+class Check:
+    """Result of checking a concept's demonstrations.
+
+    Attributes:
+        name: name of the concept.
+        demonstrations: checked demonstrations.
+        findings: faults and notes, errors and warnings first.
+        known: the training concept that explains them best; ``None`` without a model.
+        left_out: leave-one-out losses; ``None`` without learning.
+    """
+
+    name: str
+    demonstrations: Demonstrations
+    findings: tuple[Finding, ...]
+    known: Known | None = None
+    left_out: LeaveOneOut | None = None
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """Likely faults."""
+        return tuple(finding for finding in self.findings if finding.severity != "note")
+
+    def __str__(self) -> str:
+        lengths, columns = self.demonstrations.lengths, self.demonstrations.states.shape[2]
+        shortest, longest = int(lengths.min()), int(lengths.max())
+        steps = counted(longest, "step") if shortest == longest else f"{shortest} to {longest} steps"
+        lines = [f"{self.name}: {counted(len(lengths), 'demonstration')} of {steps}, {counted(columns, 'column')}"]
+        if not self.warnings:
+            lines.append("  no faults: no gaps, jumps, stills, duplicates or outliers")
+        findings = [f"  {'' if finding.severity == 'note' else f'{finding.severity}: '}{finding}" for finding in self.findings]
+        rest = len(findings) - MOST_FAULTS
+        lines += findings if rest <= 0 else [*findings[:MOST_FAULTS], f"  and {rest} more"]
+        lines += [] if self.known is None else [f"  {self.known}"]
+        lines += [] if self.left_out is None else [f"  {line}" for line in self.left_out.lines() if line]
+        return "\n".join(lines)
+
+
+def known_as(
+    model: ConceptModel, demonstrations: Demonstrations, settings: InversionSettings, tell: Callable[[int], None]
+) -> Known:
+    """The training concept with the lowest mean loss."""
+    embeddings = model.training_embeddings[:, None, None]
+    concepts = Composition(embeddings, torch.ones(embeddings.shape[:2], device=model.device))
+    losses = relative_losses(model, demonstrations, concepts, settings, tell)
+    best = int(losses.mean(dim=1).argmin())
+    return Known(model.config.training_concepts[best], tuple(losses[best].tolist()))
+
+
+def fit_findings(model: ConceptModel, demonstrations: Demonstrations) -> tuple[Finding, ...]:
+    """Findings about the length and scale of demonstrations."""
+    longer, longest = longer_than_plans(demonstrations, model), int(demonstrations.lengths.max())
+    findings = [Finding(longer, "note")] if longer else []
+    if longest < model.window and not demonstrations.observed:
+        message = f"demonstrations of up to {longest} steps are shorter than the model's plans of {model.window}"
+        findings.append(Finding(f"{message}; their last state is repeated", "note"))
+    return (*findings, *scale_findings(model, demonstrations))
+
+
+def warnings_of(model: ConceptModel, demonstrations: Demonstrations) -> tuple[str, ...]:
+    """Lines about likely faults of one concept's demonstrations."""
+    findings = (*check(demonstrations), *scale_findings(model, demonstrations))
+    return tuple(str(finding) for finding in findings if finding.severity != "note")
+
+
+def notes_of(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[str]:
+    """Lines about demonstrations that are longer than plans, and about likely faults of each concept's demonstrations."""
+    if longer := longer_than_plans(demonstrations, model):
+        yield longer
+    names = dict.fromkeys(demonstrations.concepts)
+    for name in names:
+        for note in warnings_of(model, demonstrations.select(name)):
+            yield note if len(names) == 1 else f"{name}: {note}"
+
+
+def check_with(
+    model: ConceptModel,
+    demonstrations: Demonstrations,
+    settings: InversionSettings,
+    steps: int = 0,
+    found: tuple[Finding, ...] = (),
+    progress: bool = False,
+) -> Check:
+    """Check demonstrations of one concept with a model.
+
+    Args:
+        model: the frozen model.
+        demonstrations: demonstrations of one concept that fit the model.
+        settings: settings of the inversion.
+        steps: maximum number of gradient steps on subsets; 0 to learn nothing.
+        found: earlier findings.
+        progress: show a bar.
+
+    Raises:
+        UserError: for a model without inversion.
+    """
+    model.check_settings(settings)
+    name = demonstrations.concepts[0]
+    faults = (*found, *check(demonstrations), *fit_findings(model, demonstrations))
+    nothing = nullcontext(lambda *_: None)
+    titled, total = f"{name}: training concepts", len(model.config.training_concepts)
+    with bar(titled, total, lines=False) if progress else nothing as advance:
+        known = known_as(model, demonstrations, settings, advance)
+    left: LeaveOneOut | None = None
+    if steps and len(demonstrations) > 1:
+        with bar(f"{name}: learning from some", steps) if progress else nothing as advance:
+            left = leave_one_out(model, demonstrations, settings, steps, lambda loss: advance(1, f"loss {loss:.3g}"))
+    ordered = tuple(sorted(faults, key=lambda finding: finding.severity == "note"))
+    return Check(name, demonstrations, ordered, known, left)
+
+
+def longer_than_plans(demonstrations: Demonstrations, model: ConceptModel) -> str:
+    """Note about the use of demonstrations that are longer than the model's plans.
+
+    Empty if demonstrations are not longer, or in closed-loop domains with observations at every time, where a plan may start at
+    any time.
+
+    Args:
+        demonstrations: demonstrations to learn from.
+        model: pretrained model.
+    """
+    window, plans = model.window, model.domain.plans
+    longest, shortest = int(demonstrations.lengths.max()), int(demonstrations.lengths.min())
+    if longest <= window:
+        return ""
+    start = f"demonstrations of {'' if longest == shortest else 'up to '}{longest} steps are"
+    if first := set(demonstrations.observed) - set(demonstrations.per_step):
+        names = ", ".join(map(repr, sorted(first)))
+        return (
+            f"{start} cut to the model's horizon of {window}: the first {window} steps are learned from, "
+            f"as {names} is known at the first time alone"
+        )
+    if demonstrations.observed and model.domain.closed_loop is not None and plans.exponent(window) == 1:
+        return ""
+    # The same exponent decides where windows start, see Demonstrations.starts.
+    where = "anywhere" if plans.exponent(window) == 1 else "anywhere, mostly early"
+    return (
+        f"{start} longer than the model's horizon of {window}: they are learned from in stretches of {window} steps, which start "
+        f"{where}; a plan has {model.config.horizon} steps"
+    )
+
+
+@torch.no_grad()
+def scale_findings(model: ConceptModel, demonstrations: Demonstrations) -> tuple[Finding, ...]:
+    """Warn if many values of states or observed vectors are outside the pretraining range, or some are far outside.
+
+    Args:
+        model: pretrained model.
+        demonstrations: demonstrations that fit the model.
+    """
+    return tuple(_scale(model, demonstrations))
+
+
+def outside(model: ConceptModel, demonstrations: Demonstrations) -> Tensor:
+    """Normalised states ``(state, time)``, in consecutive windows from each demonstration's start."""
+    rows, starts = [], []
+    for row, length in enumerate(demonstrations.lengths.tolist()):
+        first = set(demonstrations.observed) - set(demonstrations.per_step)
+        begins = [0] if first else list(range(0, max(length - model.window, 0) + 1, max(model.window, 1)))
+        rows += [row] * len(begins)
+        starts += begins
+    states, observed = demonstrations.windows(torch.tensor(rows), torch.tensor(starts), model.window)
+    encoded: Tensor = model.encode(states.to(model.device), moved(observed, model.device))
+    return encoded.flatten(0, 1).T.cpu()
+
+
+def _scale(model: ConceptModel, demonstrations: Demonstrations) -> Iterator[Finding]:
+    columns, view = model.domain.plans.columns, model.view
+    values = outside(model, demonstrations).abs()
+    named = view is None or view.same_columns
+    names = columns if named and len(columns) == len(values) else [f"{column} of the model's view" for column in range(len(values))]
+    yield from _range_finding("states", values, names)
+    if model.initial_normalization is not None:
+        try:
+            seen = model.vector(moved(demonstrations.initial_states.observed, model.device))
+        except UserError:  # reported elsewhere
+            return
+        if seen is not None:
+            size = len(model.initial_normalization.low)
+            vectors = seen[:, :size].abs().T.cpu()
+            yield from _range_finding("observed vectors", vectors, [f"number {number}" for number in range(size)])
+    if named and len(columns) == len(values):
+        low, high = model.normalization.low.cpu(), model.normalization.high.cpu()
+        every = torch.cat([states[:length] for states, length in zip(demonstrations.states, demonstrations.lengths, strict=True)])
+        resolution = max(model.domain.plans.resolution, 1e-3)
+        differs = (every - low).abs().amax(dim=0) > resolution * low.abs().clamp(min=1)
+        lost = [name for name, hidden in zip(columns, ((high <= low) & differs).tolist(), strict=True) if hidden]
+        if lost:
+            text = short(", ".join(lost), 60)
+            yield Finding(f"scale: what is different here was constant in pretraining, so the model does not see it: {text}")
+
+
+def _range_finding(what: str, values: Tensor, names: "list[str] | tuple[str, ...]") -> Iterator[Finding]:
+    beyond = values > 1 + EXCESS
+    share, worst = float(beyond.float().mean()), beyond.float().mean(dim=1)
+    column = int(worst.argmax()) if float(values.max()) <= OUTSIDE else int(values.amax(dim=1).argmax())
+    most = float(values[column].max())
+    message = f"scale: {100 * share:.0f} % of the {what} are outside of the range seen in pretraining"
+    if beyond.any():
+        message += f", most in {short(names[column], 40)} ({100 * float(worst[column]):.0f} %, up to {most:.1f} times the range)"
+    yield Finding(message, "warning" if share > MANY or most > OUTSIDE else "note")
+
+
+def check_concept(model: ConceptModel, concept: Concept, path: str | Path) -> None:
+    """Refuse a learned concept of another model.
+
+    Args:
+        model: the model.
+        concept: the learned concept.
+        path: file of the concept.
+
+    Raises:
+        UserError: if encoder, domain, pretrained model or sizes differ.
+    """
+    of_model = {"encoder": model.config.encoder, "domain": model.config.domain, "pretrained": model.hash}
+    for key, expected in of_model.items():
+        value, wanted = getattr(concept.origin, key), f"{expected!r} (the pretrained model's)"
+        require(value == expected, f"{path}: key {key!r}", wanted, f"{short(value)!r}; learn it again")
+    with about(path):
+        check_sizes(model, concept)
+
+
+def check_sizes(model: ConceptModel, concept: Concept) -> None:
+    """Refuse a concept whose sizes do not fit a model.
+
+    Raises:
+        UserError: with the key.
+    """
+    place, size = "key 'embeddings'", model.config.concept_dim
+    require(concept.embeddings.shape[2] == size, place, f"{size} numbers each", concept.embeddings.shape[2])
+    require(concept.knots == 1 or model.over_time, place, "1 knot for this model", concept.knots)
+    if concept.adapter is not None:
+        model.check_adapter(concept.adapter)
