@@ -46,17 +46,17 @@ def composed_epsilon(
         every = branches(denoiser, noised, torch.cat((empty, concepts)), torch.cat((first, index + 1)))
         unconditional, conditional = every[0], every[1:]
         return unconditional + weighted_sum(composition, row, conditional - unconditional)
-    everywhere: Tensor | None = None
+    unadapted, adapted, everywhere = denoiser, denoiser, torch.zeros(1, dtype=torch.bool)
     if composition.adapters:
         number, everywhere = _adapter_numbers(composition, row)
-        conditional = branches(_by_adapter(denoiser, composition, number.T.flatten()), noised, concepts, index)
-    else:
-        conditional = branches(denoiser, noised, concepts, index)
-    if everywhere is not None and everywhere.any():
-        unconditional = branches(_by_adapter(denoiser, composition, everywhere), noised, empty, first)[0]
+        adapted = _by_adapter(denoiser, composition, number.T.flatten())
+        unadapted = _by_adapter(denoiser, composition, everywhere)
+    if everywhere.any():
+        unconditional = branches(unadapted, noised, empty, first)[0]
     else:
         with torch.no_grad():
             unconditional = branches(denoiser, noised, empty, first)[0]
+    conditional = branches(adapted, noised, concepts, index)
     return unconditional + weighted_sum(composition, row, conditional - unconditional)
 
 

@@ -133,15 +133,10 @@ class Adaptation(pl.LightningModule, ABC):
         """None: :meth:`learn` makes all gradient steps."""
         return []
 
-    # Validation and test log the learned concepts' loss on common noise; the evaluator judges behaviour.
-    def validation_step(self, step: int) -> None:
-        self._log_loss("val/loss")
-
-    def test_step(self, step: int) -> None:
-        self._log_loss("test/loss")
-
-    def _log_loss(self, name: str) -> None:
-        self.log(name, sum(concept.origin.loss for concept in self._found.values()) / len(self._found), batch_size=1)
+    def test_step(self, batch: int) -> None:
+        """Log the loss of the learned concepts on common noise; the evaluator judges behaviour."""
+        losses = [concept.origin.loss for concept in self._found.values()]
+        self.log("test/loss", sum(losses) / len(losses), batch_size=1)
 
     def train(self, mode: bool = True) -> "Adaptation":
         """Switch modes; the pretrained model stays in evaluation mode."""
@@ -187,9 +182,6 @@ class Adaptation(pl.LightningModule, ABC):
                 tag = f"quality/{file_name(name)}"
                 logger.experiment.add_figure(tag, seen.figure(), self.trainer.global_step)
                 logger.experiment.add_text(tag, str(seen), self.trainer.global_step)
-
-    def on_validation_start(self) -> None:
-        self.learned()
 
     def on_test_start(self) -> None:
         if not self._found:  # else training in the same process has just ended

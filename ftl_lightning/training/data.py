@@ -361,7 +361,7 @@ class InversionData(pl.LightningDataModule):
     def test_dataloader(self) -> DataLoader[int]:
         return DataLoader(range(1), batch_size=None)  # type: ignore[arg-type]
 
-    train_dataloader = val_dataloader = test_dataloader
+    train_dataloader = test_dataloader
 
 
 def shares(demonstrations: Demonstrations, balance: float) -> Tensor:

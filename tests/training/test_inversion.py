@@ -220,7 +220,7 @@ def test_own_demonstrations_and_composition(invert: Callable[..., Path], tiny: P
 
 def test_a_task_is_composed_of_all_that_it_names_with_the_weight_of_each(tiny: Path) -> None:
     module = learn(tiny, omega=1.2, training_omega=0.8, components=2)
-    module.on_validation_start()
+    module.learned()
     first, second, *_ = module.concepts
     text, other = module.model.config.training_concepts[:2]
     found = module.composition(EvaluationTask("s", "g", learned=(first, second), texts=(text,), without=(other,)))
@@ -368,7 +368,7 @@ def test_auto_asks_how_much_of_what_the_modes_gain_one_set_gains(tiny: Path, mon
 
 def test_alone_a_task_is_generated_from_modes_and_composed_or_in_part_from_the_centre(tiny: Path) -> None:
     module = learn(tiny, modes="each")
-    module.on_validation_start()
+    module.learned()
     name, other, *_ = module.concepts
     concept, text = module.learned()[name], module.model.config.training_concepts[0]
     alone = module.composition(EvaluationTask("s", "g", learned=(name,)))
@@ -398,7 +398,7 @@ def test_the_guidance_scale_multiplies_learned_weights_and_no_others(tiny: Path,
 def test_the_projector_names_the_components_of_every_mode(tiny: Path) -> None:
     for modes, count in ((1, 0), (2, 2)):
         module = learn(tiny, modes=modes)
-        module.on_validation_start()
+        module.learned()
         name = module.concepts[0]
         points = module.concept_points()
         own = [point.part for point in points if point.text == name]
