@@ -22,7 +22,7 @@ from ftl_lightning.services.configuration import load
 from ftl_lightning.services.tensor_file import file_hash
 from ftl_lightning.training.checks import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 from .conftest import CONF, ROOT, refused
 from .test_mistakes import refusal

@@ -11,7 +11,7 @@ from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from tests.conftest import CONF, Once, succeed
 from tests.tiny import QUIET
 

@@ -22,7 +22,7 @@ from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.concept import VERSION
 from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 from .conftest import CONF, ROOT, python
 

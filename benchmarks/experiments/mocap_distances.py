@@ -33,7 +33,7 @@ from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.checks import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 MOST = 500
 """Windows on each side, where there are as many."""

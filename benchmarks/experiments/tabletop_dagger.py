@@ -26,7 +26,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.seeding import generator, task_key
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 STEPS = (10, 120)
 """That the model drives."""

@@ -47,7 +47,7 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.tensor_file import write_text
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 MODEL, PUSHED, APPROACHED, EYES = "model", "model pushes", "expert pushes", "expert through eyes"
 OUT = ((0.30, 0.73), (-0.31, 0.31))

@@ -23,7 +23,7 @@ from ftl_lightning.networks.image_encoder import POINT
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.tensor_file import write_text
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 SEED = 990
 TESTED = 0.2

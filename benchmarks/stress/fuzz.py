@@ -46,7 +46,7 @@ from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.training.checkpoint import read_checkpoint
 from ftl_lightning.training.checks import check_concept
 from ftl_lightning.training.concept_model import ConceptModel
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 SLOW, MEMORY = 5.0, 2**30
 HEADER = "ftl_lightning"

@@ -162,7 +162,7 @@ def _run(options: BenchmarkOptions) -> None:
     from ftl_lightning.apps.benchmark.suite import SEEDS, load_suite
     from ftl_lightning.services.representation import counted
     from ftl_lightning.services.targets import check_writable_file
-    from ftl_lightning.training.methods import code_hash, load_method
+    from ftl_lightning.training.method import code_hash, load_method
 
     out = Path(options.out)
     work = out.with_name(f"{out.stem}.work")

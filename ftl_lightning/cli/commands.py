@@ -139,7 +139,7 @@ def explain(concept: str, pretrained: str = "", nearest: int = 3) -> None:
     from ftl_lightning.igm.explanation import explain as explained
     from ftl_lightning.services.shipped import MODELS
     from ftl_lightning.training.checks import check_concept
-    from ftl_lightning.training.pretrained import find_model, load_model
+    from ftl_lightning.training.model_folder import find_model, load_model
 
     check_count("nearest", nearest, 1)
     learned = Concept.load(concept)

@@ -50,7 +50,7 @@ from ftl_lightning.training.checks import Check, check_concept, check_sizes, che
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.hub import CONCEPT_FILES, download, is_repository, save_with_card, upload
 from ftl_lightning.training.judging import judged, judging_domain, picture
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -33,7 +33,7 @@ from ftl_lightning.reporting.table import (
     summarise,
 )
 from ftl_lightning.reporting.tables import against, as_learned_most
-from ftl_lightning.training.methods import load_method
+from ftl_lightning.training.method import load_method
 
 BASELINES = tuple(load_method(name).name for name in ("bc", "cvae", "in_context", "language"))
 """Names of the paper's baselines."""

@@ -26,8 +26,8 @@ from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.judging import judging_domain
 from ftl_lightning.training.labels import Labels
-from ftl_lightning.training.methods import kinds_for
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.method import kinds_for
+from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.quality import inspected
 
 

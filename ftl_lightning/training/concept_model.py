@@ -26,8 +26,7 @@ from ftl_lightning.services.processes import drawn
 from ftl_lightning.services.representation import Shown, counted
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
 from ftl_lightning.training.method import Method
-from ftl_lightning.training.model_config import ModelConfig, find_view
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
 
 _LOG = logging.getLogger(__name__)
 KIND = "generative model"

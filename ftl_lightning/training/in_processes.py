@@ -16,7 +16,7 @@ from ftl_lightning.services import trust
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.printing import silence
 from ftl_lightning.services.progress import bar
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 
 @dataclass(frozen=True)

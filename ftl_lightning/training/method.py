@@ -1,12 +1,17 @@
-"""Declaration of a method, offered by a package in the entry-point group ``ftl_lightning.methods``."""
+"""Methods: their declaration, offered by a package in the entry-point group ``ftl_lightning.methods``, and their registry."""
 
-from collections.abc import Callable, Mapping, Sequence
+import importlib
+import importlib.util
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ftl_lightning.services.errors import about, require
+from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.tensor_file import content_hash, file_hash
+from ftl_lightning.services.trust import entry_points
 
-if TYPE_CHECKING:  # a declaration needs no torch
+if TYPE_CHECKING:
     from ftl_lightning.domains.domain import Domain
     from ftl_lightning.training.adaptation import Adaptation
     from ftl_lightning.training.concept_model import ConceptModel
@@ -98,3 +103,92 @@ def check_present_or_moment(domain: "Domain") -> None:
     """
     if domain.plans.horizon > 1:
         check_present(domain)
+
+
+GROUP = "ftl_lightning.methods"
+"""Entry-point group of methods: ``name = package.module:METHOD``."""
+SHIPPED = ("ftl_igm", "bc", "cvae", "in_context", "language", "lora")
+"""This package's methods, in the order of tables; others follow by name."""
+
+
+def method_names() -> tuple[str, ...]:
+    """Names of all methods, in the order of tables."""
+    offered = _offered()
+    return (*(name for name in SHIPPED if name in offered), *sorted(set(offered) - set(SHIPPED)))
+
+
+def _offered() -> dict[str, str]:
+    """``module:ATTRIBUTE`` of methods by name; this package's names take precedence."""
+    offered = {point.name: point.value for point in reversed(entry_points(GROUP))}
+    return offered | _ours()
+
+
+def _ours() -> dict[str, str]:
+    """Methods of this package, without a look-up of installed packages."""
+    return {name: f"ftl_lightning.methods.{name}:METHOD" for name in SHIPPED}
+
+
+def load_method(name: str) -> Method:
+    """Load a method by name.
+
+    Raises:
+        UserError: for an unknown name or another object.
+    """
+    offered = _ours() if name in SHIPPED else _offered()
+    if name not in offered:
+        raise UserError(f"method: expected one of {', '.join(method_names())}, found {short(name)!r}")
+    return _loaded(name, offered[name])
+
+
+def code_hash(name: str) -> str:
+    """Hash of the modules and settings of a method's package; empty for this package, which has a version.
+
+    Raises:
+        UserError: for an unknown name.
+    """
+    load_method(name)
+    if name in SHIPPED:
+        return ""
+    spec = importlib.util.find_spec(_offered()[name].partition(":")[0].partition(".")[0])
+    places = [Path(place) for place in (spec and spec.submodule_search_locations) or ()]
+    files = [path for place in places for kind in ("*.py", "*.yaml") for path in place.rglob(kind)]
+    if spec is not None and spec.origin and not places:  # a single-file package
+        files = [Path(spec.origin)]
+    return content_hash(sorted((path.name, file_hash(path)) for path in files))
+
+
+def _loaded(name: str, reference: str) -> Method:
+    module, _, attribute = reference.partition(":")
+    try:
+        method = getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # an imported module may raise anything
+        raise UserError(f"method {name!r}: cannot be imported ({type(error).__name__}: {error}); mend its package") from error
+    if not isinstance(method, Method):
+        raise UserError(f"method {name!r}: expected a Method, found {type(method).__name__}; mend its package")
+    return method
+
+
+def methods() -> Iterator[Method]:
+    """All methods, in the order of tables, imported lazily."""
+    yield from (_loaded(name, reference) for name, reference in _ours().items())
+    yield from (_loaded(name, reference) for name, reference in sorted(_offered().items()) if name not in SHIPPED)
+
+
+def kinds() -> list[str]:
+    """All kinds of pretrained models."""
+    return [method.kind for method in methods() if method.model]
+
+
+def kinds_for(adapts: "Callable[[type[ConceptModel]], bool]") -> list[str]:
+    """Kinds of models whose class has a property."""
+    return [method.kind for method in methods() if method.model and adapts(method.model())]
+
+
+def model_class(kind: str) -> "type[ConceptModel] | None":
+    """The network's class for a kind of models; ``None`` if no installed package offers it."""
+    return next((method.model() for method in methods() if method.model and method.kind == kind), None)
+
+
+def class_path(kind: type) -> str:
+    """Name of a class in a configuration file."""
+    return f"{kind.__module__}.{kind.__qualname__}"

@@ -1,23 +1,27 @@
 """Folder of a pretrained model: ``config.json``, ``model.safetensors``, and examples of a user's data."""
 
 import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TypeVar
 
 import torch
+from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, own_domain
-from ftl_lightning.domains.registry import domain_of_file
+from ftl_lightning.domains.registry import domain_of_file, is_known, load_domain
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.schema import from_mapping
+from ftl_lightning.services.shipped import pretrained_folder
 from ftl_lightning.services.tensor_file import alone, check_finite, file_hash, load_tensors, save_tensors, write_text
 from ftl_lightning.training.concept_model import KIND, ConceptModel
-from ftl_lightning.training.model_config import CONFIG, VERSION, check_domain, read_config
-from ftl_lightning.training.model_weights import WEIGHTS, at_most, check_weights
-from ftl_lightning.training.prepared import blank
+from ftl_lightning.training.method import kinds, model_class
+from ftl_lightning.training.model_config import CONFIG, VERSION, blank, check_domain, read_config
 
 M = TypeVar("M", bound=ConceptModel)
 EXAMPLES = "demonstrations.safetensors"
@@ -84,3 +88,96 @@ def read_model(kind: type[M], folder: str | Path, domain: Domain | None = None) 
     model.examples = examples
     model.load_state_dict(tensors)
     return model.requires_grad_(False).eval()
+
+
+WEIGHTS = "model.safetensors"
+"""File name in a model's folder."""
+MOST_PARAMETERS = 10_000
+"""Maximum number of parameter tensors in a model from a file."""
+SPARE = 4
+"""Maximum ratio of built numbers to numbers in the file: layers that are stacked afterwards are built twice."""
+
+
+@contextmanager
+def at_most(numbers: int) -> Iterator[None]:
+    """Build a network of about ``numbers`` numbers; abort for larger networks.
+
+    Raises:
+        UserError: for a network that is larger or cannot be built.
+    """
+    tensors, left = 0, SPARE * numbers
+
+    def count(module: nn.Module, name: str, parameter: Tensor | None) -> None:
+        nonlocal tensors, left
+        if parameter is not None:
+            tensors, left = tensors + 1, left - parameter.numel()
+        if tensors > MOST_PARAMETERS or left < 0:
+            raise UserError(f"expected the sizes of the {numbers} numbers in {WEIGHTS}, found those of a larger network")
+
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # torch and the networks raise many kinds for inconsistent sizes
+        raise UserError(f"expected sizes that make a network, found others ({short(str(error), 100)})") from error
+    finally:
+        handle.remove()
+
+
+def check_weights(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Refuse tensors that do not fit a model or are not finite.
+
+    Raises:
+        UserError: with the first such tensor.
+    """
+    for name in [*expected, *found]:
+        if name not in found or name not in expected:
+            message = "expected it, found nothing" if name not in found else "expected nothing, found it"
+            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: {message}")
+        tensor, like = found[name], expected[name]
+        if tensor.shape != like.shape or tensor.is_floating_point() != like.is_floating_point():
+            kinds = [f"{str(each.dtype).removeprefix('torch.')} {tuple(each.shape)}" for each in (like, tensor)]
+            raise UserError(f"does not fit {CONFIG}: key {short(name)!r}: expected {kinds[0]}, found {kinds[1]}")
+        if tensor.is_floating_point() and tensor.numel() and not torch.stack(tensor.aminmax()).isfinite().all():
+            raise UserError(f"key {short(name)!r}: expected finite numbers, found others; take another copy of both files")
+
+
+def load_model(folder: str | Path, domain: Domain | str | None = None) -> ConceptModel:
+    """Load a frozen model.
+
+    Args:
+        folder: folder written by :func:`~ftl_lightning.training.model_folder.save_model`, or the name of a shipped model.
+        domain: replaces the folder's domain: a name, ``'package.module:DOMAIN'``, or a domain. A folder alone can only name
+            domains of installed packages, see :mod:`ftl_lightning.services.trust`.
+
+    Raises:
+        UserError: with the file, if it is missing, damaged or of an unknown method, or if the files do not match.
+    """
+    folder = pretrained_folder(folder)
+    kind = read_config(folder)["kind"]
+    if (network := model_class(kind)) is None:
+        raise UserError(f"{Path(folder) / CONFIG}: key 'kind': expected one of {', '.join(kinds())}, found {short(kind)!r}")
+    return read_model(network, folder, load_domain(domain) if isinstance(domain, str) else domain)
+
+
+def find_model(model_hash: str, places: Sequence[Path]) -> Path:
+    """Find the folder of the model with this hash below ``places``; a known domain is preferred.
+
+    Configurations are read as data; nothing that they name is imported.
+
+    Raises:
+        UserError: if there is none.
+    """
+    matches = []
+    for path in (path for place in places for path in sorted(place.rglob(CONFIG))):
+        try:
+            content = read_config(path.parent)
+        except UserError:  # the configuration of something else
+            continue
+        if content["hash"] == model_hash:
+            matches.append((path.parent, content["domain"]))
+    if not matches:
+        searched = ", ".join(map(str, places))
+        raise UserError(f"pretrained: expected the model with the hash {model_hash} below {searched}, found none; name its folder")
+    return next((folder for folder, domain in matches if domain == OWN or is_known(domain)), matches[0][0])

@@ -31,9 +31,8 @@ from ftl_lightning.services.tensor_file import check_finite
 from ftl_lightning.training.checkpoint import SIGNATURE, Random, check_parameters, check_restored, check_signature
 from ftl_lightning.training.concept_model import ConceptModel, joined_vectors
 from ftl_lightning.training.data import Batch, PretrainingData
-from ftl_lightning.training.model_config import ModelConfig, find_view
+from ftl_lightning.training.model_config import ModelConfig, Prepared, find_view
 from ftl_lightning.training.model_folder import save_model
-from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.teaching import Teaching
 
 M = TypeVar("M", bound=ConceptModel)
@@ -132,7 +131,7 @@ class Pretraining(pl.LightningModule, ABC, Generic[M]):
 
         Args:
             prepared: configuration and text embeddings; a method adds options of its network by
-                :meth:`~ftl_lightning.training.prepared.Prepared.configured`.
+                :meth:`~ftl_lightning.training.model_config.Prepared.configured`.
             data: training data.
         """
 

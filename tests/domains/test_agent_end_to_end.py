@@ -16,7 +16,7 @@ from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.methods.ftl_igm.model import build_denoiser
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, PretrainingData
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from tests import tiny
 from tests.conftest import CONF, ROOT, refused, succeed
 

@@ -26,9 +26,8 @@ from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.model_config import find_view
+from ftl_lightning.training.model_config import Prepared, find_view
 from ftl_lightning.training.model_folder import read_model
-from ftl_lightning.training.prepared import Prepared
 from tests import tiny
 from tests.conftest import CONF, ROOT, refused, succeed
 

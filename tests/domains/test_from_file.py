@@ -22,8 +22,7 @@ from ftl_lightning.networks.hashing import HashingEncoder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, OwnData
 from ftl_lightning.training.inversion_module import InversionModule, PretrainingModule
-from ftl_lightning.training.model_folder import save_model
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model, save_model
 from ftl_lightning.training.trainer import Trainer
 
 SLOPES = {"go right": (1.0, 0.0), "go up": (0.0, 1.0), "go between": (0.5, 0.5)}

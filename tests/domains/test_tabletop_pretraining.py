@@ -20,7 +20,7 @@ from ftl_lightning.networks.image_encoder import ImageEncoders
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.training.data import PretrainingData
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.trainer import Trainer
 from tests.conftest import ROOT
 from tests.domains.tabletop_samples import made_up

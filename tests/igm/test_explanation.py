@@ -9,7 +9,7 @@ from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.explanation import explain
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import InversionSettings
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from tests.conftest import ROOT, refused, succeed
 
 NAMES = ("a", "b", "c", "d")

@@ -30,7 +30,7 @@ from ftl_lightning.networks import TemporalUNet
 from ftl_lightning.networks.denoiser import Sizes
 from ftl_lightning.networks.temporal_unet import over_time
 from ftl_lightning.services.errors import UserError
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import Prepared
 
 SIZES = Sizes(horizon=8, state_dim=3, concept_dim=4, observed={"place": Feature((5,))})
 ORIGIN = Origin("new", "own", "e", "p", "d", 5, "fixed", 0.15)

@@ -21,9 +21,8 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import Batch, OwnData, PretrainingData
 from ftl_lightning.training.method import Method
-from ftl_lightning.training.model_config import ModelConfig
+from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.model_folder import read_model
-from ftl_lightning.training.prepared import Prepared
 from ftl_lightning.training.pretraining import Pretraining
 from ftl_lightning.training.trainer import Trainer
 

@@ -14,8 +14,7 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.adaptation import Adaptation, LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.method import Form, Method
-from ftl_lightning.training.methods import SHIPPED, kinds, kinds_for, load_method, method_names, methods, model_class
+from ftl_lightning.training.method import SHIPPED, Form, Method, kinds, kinds_for, load_method, method_names, methods, model_class
 from ftl_lightning.training.pretraining import Pretraining
 from tests.conftest import ROOT
 

@@ -23,7 +23,7 @@ from ftl_lightning.networks.mlp import MLPDenoiser
 from ftl_lightning.networks.temporal_unet import TemporalUNet
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import generator
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import Prepared
 
 STEPS = 6
 OF_VECTORS = [name for name in ENCODERS if name != "points"]

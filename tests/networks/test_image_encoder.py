@@ -22,8 +22,7 @@ from ftl_lightning.services.seeding import generator
 from ftl_lightning.training.adaptation import LearnerAdaptation
 from ftl_lightning.training.data import InversionData, OwnData
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.model_folder import read_model
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model, read_model
 from ftl_lightning.training.trainer import Trainer
 
 SHAPE = (3, 32, 24)

@@ -29,7 +29,7 @@ from ftl_lightning.reporting.figures import comparison_bars, concept_map, growth
 from ftl_lightning.reporting.report import BEGIN, END
 from ftl_lightning.reporting.table import MOST_COLUMNS, Table, select
 from ftl_lightning.reporting.tables import tables
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from tests.conftest import ROOT
 from tests.evaluation.rows import REFERENCE
 from tests.evaluation.rows import row as usual_row

@@ -27,8 +27,8 @@ from ftl_lightning.services.seeding import generator
 from ftl_lightning.training.adaptation import LearnerAdaptation
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_config import Prepared
+from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.trainer import Trainer
 from tests import tiny as sizes
 from tests.conftest import CONF, ROOT, refused, succeed

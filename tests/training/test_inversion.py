@@ -22,8 +22,7 @@ from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.tensor_file import file_hash
 from ftl_lightning.training.data import InversionData
 from ftl_lightning.training.inversion_module import InversionModule
-from ftl_lightning.training.model_folder import read_model
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model, read_model
 from ftl_lightning.training.trainer import Trainer
 from tests.conftest import CONF, ROOT, inversion_module, succeed
 

@@ -9,7 +9,7 @@ from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import BudgetOptions, InversionSettings
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 
 
 @pytest.mark.parametrize("options", [{}, {"modes": "each"}, {"adapter": 2}], ids=["one set", "modes", "adapter"])

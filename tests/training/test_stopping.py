@@ -15,7 +15,7 @@ from ftl_lightning.igm.inversion import Inversion, invert
 from ftl_lightning.igm.settings import PAPER, InversionSettings
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.trainer import Trainer
 from tests.conftest import inversion_module
 

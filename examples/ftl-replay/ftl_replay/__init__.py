@@ -15,8 +15,7 @@ from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.method import Method
-from ftl_lightning.training.model_config import ModelConfig
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.pretraining import Pretraining
 
 METHOD = Method(

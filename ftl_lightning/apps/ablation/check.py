@@ -37,7 +37,7 @@ def _check(cell: Cell, made: set[str]) -> None:
     from ftl_lightning.apps.lightning_cli import parse
     from ftl_lightning.domains.registry import load_domain
     from ftl_lightning.networks.text_encoder import load_encoder
-    from ftl_lightning.training.methods import kinds_for, model_class
+    from ftl_lightning.training.method import kinds_for, model_class
     from ftl_lightning.training.model_config import read_config
 
     config = parse(cell.verb, cell.arguments)

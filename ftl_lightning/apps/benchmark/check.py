@@ -14,7 +14,7 @@ from ftl_lightning.apps.benchmark.suite import ASKED, SEEDS, TRAINING, Benchmark
 from ftl_lightning.services.errors import UserError, about, short
 from ftl_lightning.services.printing import say
 from ftl_lightning.services.tensor_file import content_hash
-from ftl_lightning.training.methods import code_hash, load_method
+from ftl_lightning.training.method import code_hash, load_method
 from ftl_lightning.version import __version__
 
 HASH = re.compile(r"[0-9a-f]{16}")

@@ -22,8 +22,7 @@ from ftl_lightning.services.printing import say
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.shipped import pretrained_folder, shipped
 from ftl_lightning.services.tensor_file import write_text
-from ftl_lightning.training.method import Method
-from ftl_lightning.training.methods import class_path, load_method
+from ftl_lightning.training.method import Method, class_path, load_method
 from ftl_lightning.training.model_config import CONFIG
 
 if TYPE_CHECKING:

@@ -114,7 +114,7 @@ def _films(show: Show, demonstrations: Demonstrations, observed: bool, flags: li
 def _of_concept(file: str, model: str) -> tuple[list[str], list[Json]]:
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.services.shipped import MODELS
-    from ftl_lightning.training.pretrained import find_model
+    from ftl_lightning.training.model_folder import find_model
 
     concept = Concept.load(file)
     places = (Path("pretrained"), Path("logs"), MODELS)

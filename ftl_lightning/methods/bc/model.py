@@ -13,7 +13,7 @@ from ftl_lightning.methods.bases import AdditiveModel, StepConfig, added, unroll
 from ftl_lightning.methods.bc import METHOD
 from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training.concept_model import TextConceptModel
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import Prepared
 
 
 @dataclass(frozen=True, kw_only=True)

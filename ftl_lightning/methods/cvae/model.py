@@ -11,8 +11,7 @@ from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.methods.bases import AdditiveModel, added
 from ftl_lightning.methods.cvae import METHOD
-from ftl_lightning.training.model_config import ModelConfig
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import ModelConfig, Prepared
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,7 @@ from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
 from ftl_lightning.services.processes import drawn
 from ftl_lightning.services.ranges import check_range
 from ftl_lightning.training.data import Batch, PretrainingData
-from ftl_lightning.training.model_config import ModelConfig
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.pretraining import Pretraining, check_shown
 
 

@@ -20,8 +20,7 @@ from ftl_lightning.services.ranges import check_range
 from ftl_lightning.services.schema import from_mapping
 from ftl_lightning.services.spectrum import Spectrum
 from ftl_lightning.training.concept_model import TextConceptModel
-from ftl_lightning.training.model_config import ModelConfig
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import ModelConfig, Prepared
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,7 @@ from ftl_lightning.services.option_groups import flat, groups_of
 from ftl_lightning.services.processes import drawn
 from ftl_lightning.services.ranges import MOST_TOGETHER, check_count, check_factor, check_range
 from ftl_lightning.training.data import Batch, PretrainingData
-from ftl_lightning.training.model_config import ModelConfig
-from ftl_lightning.training.prepared import Prepared
+from ftl_lightning.training.model_config import ModelConfig, Prepared
 from ftl_lightning.training.pretraining import Pretraining
 
 WINDOWS = 4096

@@ -12,9 +12,8 @@ from ftl_lightning.methods.in_context.model import InContextConfig, InContextMod
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import Batch, PretrainingData
 from ftl_lightning.training.method import check_present
-from ftl_lightning.training.model_config import ModelConfig
-from ftl_lightning.training.prepared import Prepared
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_config import ModelConfig, Prepared
+from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.training.pretraining import Pretraining, check_shown
 
 

@@ -29,7 +29,7 @@ from ftl_lightning.services.schema import read_json
 from ftl_lightning.services.shipped import shipped
 from ftl_lightning.services.tensor_file import visible, write_text
 from ftl_lightning.services.web import FILM
-from ftl_lightning.training.pretrained import load_model
+from ftl_lightning.training.model_folder import load_model
 from ftl_lightning.version import __version__
 
 HERE = Path(__file__).parent
