@@ -3,21 +3,17 @@
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ftl_lightning.services.printing import line, say
 from ftl_lightning.services.ranges import LARGEST_STEP, check_count, check_range
-
-if TYPE_CHECKING:
-    from ftl_lightning.few_shot.learned_concept import LearnedConcept
 
 
 @dataclass(frozen=True)
 class InvertOptions:
     """Learn the concepts of a file of demonstrations through a pretrained model, without a trainer.
 
-    The concepts equal those of "invert --config" for the same file, with the settings of the model's domain. Nothing is logged,
-    evaluated or resumed.
+    The concepts equal those of "invert --config" for the same file, with the settings of the model's domain. Nothing is
+    logged or evaluated.
 
     Attributes:
         pretrained: folder of the pretrained model, or the name of a shipped model.
@@ -47,34 +43,19 @@ def invert(options: InvertOptions) -> None:
     """Learn the concepts of the file together and write each."""
     from ftl_lightning.domains.from_file import read_own
     from ftl_lightning.few_shot.learner import FewShot
-    from ftl_lightning.igm.concept import file_name
-    from ftl_lightning.services.errors import UserError, about, short
-    from ftl_lightning.services.targets import check_writable_file
+    from ftl_lightning.igm.library import concept_files, write_concept
+    from ftl_lightning.services.errors import about
 
     model = FewShot.from_pretrained(options.pretrained, options.settings or None)
     demos = read_own(options.demonstrations)
     with about(options.demonstrations):
         demos = model.demonstrations(demos)
-    names = tuple(dict.fromkeys(demos.concepts))
-    paths = [Path(options.out) / f"{file_name(name)}.safetensors" for name in names]
-    if len(set(paths)) < len(paths):
-        raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(names), 150)}")
-    for path in paths:
-        check_writable_file(path, "out")
+    files = concept_files(demos.concepts, Path(options.out), "out")
     changes = {"form": options.form} if options.form else {}
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always", UserWarning)
         learned = model.learn_all(demos, steps=options.steps or None, seed=options.seed, progress=True, **changes)
     for note in notes:
         say("note:", line(str(note.message)), error=True)
-    for path, concept in zip(paths, learned.values(), strict=True):
-        concept.save(path)
-        _tell(path, concept)
-
-
-def _tell(path: Path, learned: "LearnedConcept") -> None:
-    concept = learned.concept
-    weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
-    say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
-    if concept.choice is not None:
-        say(f"  form: {concept.choice}")
+    for name, path in files.items():
+        write_concept(learned[name].concept, path)

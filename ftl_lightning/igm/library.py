@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ftl_lightning.igm.concept import file_name
+from ftl_lightning.igm.concept import Concept, file_name
 from ftl_lightning.igm.summary import summary
-from ftl_lightning.services.errors import UserError, short, shown
-from ftl_lightning.services.printing import line
+from ftl_lightning.services.errors import UserError, require, short, shown
+from ftl_lightning.services.printing import line, say
 from ftl_lightning.services.representation import Shown, counted
+from ftl_lightning.services.targets import check_writable_file
 from ftl_lightning.services.tensor_file import data_folder, visible
 
 Kind = Literal["training", "shipped", "saved"]
@@ -207,3 +208,33 @@ def library(model: str, training: Sequence[str], own: Path | None = None, folder
         rate, metric = (None, "") if quality is None or quality.right is None else (quality.right, quality.metric)
         entries.append(Entry(origin.name, kind, model, origin.count, content.form, rate, metric, path))
     return Library(tuple(entries), others, tuple(damaged))
+
+
+def concept_files(names: Iterable[str], folder: Path, place: str) -> dict[str, Path]:
+    """Output files of learned concepts by name.
+
+    Args:
+        names: names of the concepts.
+        folder: folder to write.
+        place: name of the option, for messages.
+
+    Raises:
+        UserError: for two names with the same file, or a file that cannot be written.
+    """
+    files = {name: folder / f"{file_name(name)}.safetensors" for name in names}
+    names = short(", ".join(files), 150)
+    require(len(set(files.values())) == len(files), "concepts", "names that differ in their letters", names)
+    for path in files.values():
+        check_writable_file(path, place)
+    return files
+
+
+def write_concept(concept: Concept, path: Path, quality: object = None) -> None:
+    """Write a learned concept, and print its loss, weights, form and quality."""
+    concept.save(path)
+    weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
+    say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
+    if concept.choice is not None:
+        say(f"  form: {concept.choice}")
+    if quality is not None:
+        say(f"  quality: {quality}")

@@ -15,12 +15,12 @@ from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, file_name
+from ftl_lightning.igm.library import concept_files, write_concept
 from ftl_lightning.igm.point import NEW_COMPONENT, Point
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import log_folder
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.printing import say
-from ftl_lightning.services.targets import check_writable_file
 from ftl_lightning.training.checks import longer_than_plans, notes_of
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.data import InversionData
@@ -28,7 +28,7 @@ from ftl_lightning.training.judging import judging_domain
 from ftl_lightning.training.labels import Labels
 from ftl_lightning.training.method import kinds_for
 from ftl_lightning.training.model_folder import load_model
-from ftl_lightning.training.quality import inspected
+from ftl_lightning.training.quality import Inspection, inspected
 
 
 class Adaptation(pl.LightningModule, ABC):
@@ -106,10 +106,7 @@ class Adaptation(pl.LightningModule, ABC):
         if data.domain_name != mine and (OWN in (mine, data.domain_name) or load_domain(data.domain_name) is not self.model.domain):
             raise UserError(f"data.domain: expected {mine!r} (the pretrained model's), found {data.domain_name!r}")
         self.concepts = data.concepts
-        if len({file_name(name) for name in self.concepts}) < len(self.concepts):
-            raise UserError(f"concepts: expected names that differ in their letters, found {short(', '.join(self.concepts), 150)}")
-        for name in self.concepts:
-            check_writable_file(self._file(name), "concepts")
+        self._files = concept_files(self.concepts, self.folder, "concepts")
         self._found = {}
         expected, columns = len(self.domain.plans.columns), data.demonstrations.states.shape[2]
         if columns != expected:
@@ -154,34 +151,24 @@ class Adaptation(pl.LightningModule, ABC):
         """Folder of the learned concepts."""
         return Path(self._output or Path(self.trainer.log_dir or self.trainer.default_root_dir) / "concepts")
 
-    def _file(self, concept: str) -> Path:
-        return self.folder / f"{file_name(concept)}.safetensors"
-
     def find(self) -> None:
         """Learn the concepts and write each to a file."""
         log_folder.keep()  # also without training
         for name, concept in self.learned().items():
-            path = self._file(name)
-            concept.save(path)
-            weights = ", ".join(f"{weight:.2f}" for weight in concept.weights.tolist())
-            say(f"{path}: loss {concept.origin.loss:.3f}, weights {weights}")
-            if concept.choice is not None:
-                say(f"  form: {concept.choice}")
-            if self._own:
-                self._show_quality(name, concept)
+            write_concept(concept, self._files[name], self._quality(name, concept) if self._own else None)
 
-    def _show_quality(self, name: str, concept: Concept) -> None:
-        """Print the quality of a concept's samples, and draw them into TensorBoard."""
+    def _quality(self, name: str, concept: Concept) -> Inspection | None:
+        """Quality of the samples of a user's concept, also drawn into TensorBoard; ``None`` if it cannot be measured."""
         demonstrations = self.demonstrations.select(name)
         if len(demonstrations) < 2 or self.model.config.horizon != self.domain.plans.horizon:  # some methods plan a step at a time
-            return
-        seen = inspected(self.model, self.domain, demonstrations, concept, self.hparams["seed"])
-        say(f"  quality: {seen}")
+            return None
+        inspection = inspected(self.model, self.domain, demonstrations, concept, self.hparams["seed"])
         for logger in self.trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 tag = f"quality/{file_name(name)}"
-                logger.experiment.add_figure(tag, seen.figure(), self.trainer.global_step)
-                logger.experiment.add_text(tag, str(seen), self.trainer.global_step)
+                logger.experiment.add_figure(tag, inspection.figure(), self.trainer.global_step)
+                logger.experiment.add_text(tag, str(inspection), self.trainer.global_step)
+        return inspection
 
     def on_test_start(self) -> None:
         if not self._found:  # else training in the same process has just ended
