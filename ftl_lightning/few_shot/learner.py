@@ -349,7 +349,7 @@ class FewShot(Shown):
             warnings.warn(note, stacklevel=3)
         watched = None if watch is None else self._watched(names[0], watch)
         with bar(title, total) if progress else nullcontext(lambda *_: None) as advance:
-            learned = self.model.learn(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
+            learned = self.model.learn_concepts(fitted, settings, total, lambda loss: advance(1, f"loss {loss:.3g}"), watched)
         for name in names:
             check_sizes(self.model, learned[name])
             self._examples.append(fitted.select(name))

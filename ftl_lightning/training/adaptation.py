@@ -17,7 +17,6 @@ from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, file_name
 from ftl_lightning.igm.library import concept_files, write_concept
 from ftl_lightning.igm.point import NEW_COMPONENT, Point
-from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import log_folder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.printing import say
@@ -217,7 +216,7 @@ class Adaptation(pl.LightningModule, ABC):
 
 
 class LearnerAdaptation(Adaptation):
-    """Learn concepts as the model defines it, without gradient descent.
+    """Read concepts from demonstrations, without gradient descent.
 
     Args:
         pretrained: folder of the pretrained model.
@@ -234,4 +233,4 @@ class LearnerAdaptation(Adaptation):
         return not model.invertible
 
     def learn(self) -> dict[str, Concept]:
-        return self.model.learn(self.demonstrations, InversionSettings(seed=self.hparams["seed"]), 0)
+        return self.model.read_concepts(self.demonstrations)

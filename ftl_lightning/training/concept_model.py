@@ -110,7 +110,7 @@ class ConceptModel(Shown, nn.Module, ABC):
             ``(composition, count, horizon, state)`` in the domain's units.
         """
 
-    def learn(
+    def learn_concepts(
         self,
         demonstrations: Demonstrations,
         settings: InversionSettings,
@@ -120,6 +120,8 @@ class ConceptModel(Shown, nn.Module, ABC):
         start: Inversion | None = None,
     ) -> dict[str, Concept]:
         """Learn every concept of the demonstrations, in the form of the settings, by gradient descent through the frozen model.
+
+        A model that is not :attr:`invertible` reads its concepts from the demonstrations, see :meth:`read_concepts`.
 
         Args:
             demonstrations: demonstrations; their concept texts name the concepts.
@@ -135,7 +137,13 @@ class ConceptModel(Shown, nn.Module, ABC):
         Raises:
             UserError: for settings that the model does not support, or a loss that is not finite.
         """
+        if not self.invertible:
+            return self.read_concepts(demonstrations)
         return learn(self, demonstrations, settings, steps, tell, watch, start)
+
+    def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
+        """Concepts by name, made from demonstrations without gradient descent; required of models that are not invertible."""
+        raise NotImplementedError
 
     def check_settings(self, settings: InversionSettings) -> None:
         """Refuse settings that the model does not support; warn if the loss differs from that of pretraining.

@@ -107,7 +107,7 @@ def _learn(share: _Share) -> str:
             every = Demonstrations.load(Path(share.folder) / _DEMONSTRATIONS)
             names = {name for _, name in share.concepts}
             demonstrations = every.rows([row for row, name in enumerate(every.concepts) if name in names])
-            learned = model.learn(demonstrations, share.settings, share.steps)
+            learned = model.learn_concepts(demonstrations, share.settings, share.steps)
             for number, name in share.concepts:
                 learned[name].save(_file(share.folder, number))
         except UserError as error:

@@ -35,7 +35,7 @@ class InversionModule(Adaptation):
     """Learn K embeddings and their weights for every concept of an :class:`~ftl_lightning.training.data.InversionData`.
 
     The parameters are those of :attr:`inversion`. A single training step makes all gradient steps: it calls
-    :meth:`~ftl_lightning.training.concept_model.ConceptModel.learn`, as :class:`~ftl_lightning.few_shot.learner.FewShot` does.
+    :meth:`~ftl_lightning.training.concept_model.ConceptModel.learn_concepts`, as :class:`~ftl_lightning.few_shot.learner.FewShot` does.
 
     Args:
         pretrained: folder of the pretrained model.
@@ -99,7 +99,7 @@ class InversionModule(Adaptation):
                     for logger in self.trainer.loggers:
                         logger.log_metrics({"train/loss": loss}, step)
 
-            return self.model.learn(self.demonstrations, self.settings, steps, tell, start=self.inversion)
+            return self.model.learn_concepts(self.demonstrations, self.settings, steps, tell, start=self.inversion)
 
     def training_weight(self, task: EvaluationTask) -> float:
         omega = self.settings.weights.training if task.learned else None

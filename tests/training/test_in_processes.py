@@ -72,7 +72,7 @@ def inversion(pretrained: Path, name: str, *options: str) -> list[str]:
 @pytest.mark.usefixtures("_work")
 def test_two_processes_learn_the_concepts_of_one(tiny: Path) -> None:
     line = build("invert", inversion(tiny, "one")[1:])
-    alone = line.model.model.learn(line.datamodule.demonstrations, line.model.settings, STEPS)
+    alone = line.model.model.learn_concepts(line.datamodule.demonstrations, line.model.settings, STEPS)
     assert len(alone) == 10
     succeed(*inversion(tiny, "two", "--trainer.processes=2"))
     assert len(list(Path("two/concepts").iterdir())) == len(alone)

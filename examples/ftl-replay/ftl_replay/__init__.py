@@ -55,7 +55,7 @@ class ReplayModel(ConceptModel):
             plans.append(plan + self.config.noise * noise)
         return self.decode(torch.cat(plans), observed or {}).unflatten(0, (len(compositions), count))
 
-    def learn(self, demonstrations: Demonstrations, *settings: object, **callbacks: object) -> dict[str, Concept]:
+    def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
         """Every concept is the beginning of each of its demonstrations, ``(demonstration, 1, horizon * state)``."""
         concepts = {}
         for name in dict.fromkeys(demonstrations.concepts):

@@ -11,9 +11,7 @@ from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import Observed, moved
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.igm.inversion import Inversion, Tell, Watch
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.bases import StepConfig, unroll
 from ftl_lightning.methods.in_context import METHOD
 from ftl_lightning.services.errors import UserError
@@ -143,16 +141,8 @@ class InContextModel(ConceptModel):
         """Bin of each value."""
         return ((normalised + 1) / 2 * self.config.bins).long().clamp(0, self.config.bins - 1)
 
-    def learn(
-        self,
-        demonstrations: Demonstrations,
-        settings: InversionSettings,
-        steps: int,
-        tell: Tell = lambda loss: None,
-        watch: Watch | None = None,
-        start: Inversion | None = None,
-    ) -> dict[str, Concept]:
-        """Encode demonstrations as concepts; only ``demonstrations`` is used.
+    def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
+        """Encode demonstrations as concepts.
 
         Raises:
             UserError: for features observed only at the first time.
