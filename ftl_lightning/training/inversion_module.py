@@ -34,8 +34,8 @@ _USUAL = InversionSettings()
 class InversionModule(Adaptation):
     """Learn K embeddings and their weights for every concept of an :class:`~ftl_lightning.training.data.InversionData`.
 
-    The parameters are those of :attr:`inversion`. A single training step makes all gradient steps: it calls
-    :meth:`~ftl_lightning.training.concept_model.ConceptModel.learn_concepts`, as :class:`~ftl_lightning.few_shot.learner.FewShot` does.
+    The parameters are those of :attr:`inversion`. A single training step makes all gradient steps by
+    :meth:`~ftl_lightning.training.concept_model.ConceptModel.learn_concepts`, which the Python API and other processes call as well.
 
     Args:
         pretrained: folder of the pretrained model.
