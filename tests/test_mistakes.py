@@ -27,16 +27,16 @@ from ftl_lightning.cli.main import main
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
+from ftl_lightning.igm import settings
 from ftl_lightning.igm.concept import VERSION
 from ftl_lightning.methods.bc.pretraining import CloningPretraining
 from ftl_lightning.methods.cvae.pretraining import VAEPretraining
 from ftl_lightning.methods.ftl_igm.codes import Codes
-from ftl_lightning.methods.ftl_igm.pretraining import LossOptions
+from ftl_lightning.methods.ftl_igm.pretraining import LossOptions, PretrainingModule
 from ftl_lightning.services.errors import LONGEST, UserError
-from ftl_lightning.training import inversion_settings as settings
 from ftl_lightning.training.checkpoint import WholeCheckpoints
 from ftl_lightning.training.data import InversionData
-from ftl_lightning.training.inversion_module import InversionModule, PretrainingModule
+from ftl_lightning.training.inversion_module import InversionModule
 from ftl_lightning.training.rearrangement_datamodule import ObjectRearrangementData
 from ftl_lightning.training.trainer import Trainer
 

@@ -139,6 +139,10 @@ class ConceptModel(Shown, nn.Module, ABC):
         """
         if not self.invertible:
             return self.read_concepts(demonstrations)
+        pretrained = self.config.training.get("model", {}).get("loss", settings.loss.kind)
+        if pretrained != settings.loss.kind:
+            text = "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse"
+            _LOG.warning(text, pretrained, settings.loss.kind)
         return learn(self, demonstrations, settings, steps, tell, watch, start)
 
     def read_concepts(self, demonstrations: Demonstrations) -> dict[str, Concept]:
@@ -146,7 +150,7 @@ class ConceptModel(Shown, nn.Module, ABC):
         raise NotImplementedError
 
     def check_settings(self, settings: InversionSettings) -> None:
-        """Refuse settings that the model does not support; warn if the loss differs from that of pretraining.
+        """Refuse settings that the model does not support.
 
         Raises:
             UserError: with the key.
@@ -161,10 +165,6 @@ class ConceptModel(Shown, nn.Module, ABC):
         adapted = settings.form in (AUTO, ADAPTED, MIXED)
         require(adapts or not adapted, "model.form", f"{PAPER}, {ONE} or {MODES} for {name}", settings.form)
         require(adapts or not settings.adapter.rank, "model.adapter.rank", f"0 (none) for {name}", settings.adapter.rank)
-        pretrained = self.config.training.get("model", {}).get("loss", settings.loss.kind)
-        if pretrained != settings.loss.kind:
-            text = "model.loss.kind: the model was pretrained with %r; with %r concepts are learned worse"
-            _LOG.warning(text, pretrained, settings.loss.kind)
 
     def origin(self, demonstrations: Demonstrations, name: str, weights: str, loss: float, pretrained: str = "") -> Origin:
         """Provenance of a learned concept.

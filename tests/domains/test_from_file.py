@@ -18,10 +18,11 @@ from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.settings import BudgetOptions
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
+from ftl_lightning.methods.ftl_igm.pretraining import PretrainingModule
 from ftl_lightning.networks.hashing import HashingEncoder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, OwnData
-from ftl_lightning.training.inversion_module import InversionModule, PretrainingModule
+from ftl_lightning.training.inversion_module import InversionModule
 from ftl_lightning.training.model_folder import load_model, save_model
 from ftl_lightning.training.trainer import Trainer
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from ftl_lightning.methods.in_context.prompting import prompt
 from torch import nn
 
 from ftl_lightning.data.normalization import Normalization
@@ -15,7 +14,6 @@ from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.samplers import Sampling
-from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.bases import StepConfig, added, unroll
 from ftl_lightning.methods.bc.model import CloningConfig, CloningModel, ParallelMLP
 from ftl_lightning.methods.cvae.model import VAEConfig, VAEModel
@@ -220,7 +218,7 @@ def test_the_wrong_verb_is_told() -> None:
     with pytest.raises(UserError, match=r"expected invert \(model.class_path: LearnerAdaptation learns nothing\), found fit"):
         trainer.fit(adaptation, datamodule=data)
     with pytest.raises(UserError, match="key 'per_step': expected every feature to be observed at each time"):
-        prompt(adaptation.model, replace(drives, observed=drives.initial_states.observed, per_step=()), InversionSettings(), 0)
+        adaptation.model.read_concepts(replace(drives, observed=drives.initial_states.observed, per_step=()))
 
 
 def test_prompts_can_hide_the_road() -> None:

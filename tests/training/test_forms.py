@@ -14,7 +14,7 @@ from ftl_lightning.domains.object_rearrangement.relations import columns
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.igm.forms.choice import ALL, OWN, RANK, TOLERANCE, _Shares, first_settings, formed, learn
+from ftl_lightning.igm.forms.choice import ALL, OWN, RANK, TOLERANCE, _Shares, first_settings
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
 from ftl_lightning.igm.forms.quality import Quality
 from ftl_lightning.igm.settings import ADAPTED, AUTO, FORMS, MIXED, MODES, ONE, PAPER, InversionSettings
@@ -211,15 +211,6 @@ def test_an_adapter_that_is_named_beside_the_choice_is_of_the_named_rank(model: 
     for options, rank in (({}, RANK), ({"adapter": 3}, 3)):
         adapter = model.learn(scenes(model), steps=3, form=ADAPTED, **options).concept.adapter
         assert {up.shape[-1] for up, _ in adapter.factors.values()} == {rank}
-
-
-def test_forms_are_learned_where_a_trainer_has_turned_gradients_off(model: FewShot) -> None:
-    five, settings = scenes(model), model.tuned.inversion.changed(form=MODES)
-    first = learn(model.model, five, settings.changed(form=ONE), 3)
-    expected = formed(model.model, five, settings, 3, first)[TASK].modes
-    with torch.inference_mode():
-        found = formed(model.model, five, settings, 3, first)[TASK].modes
-    assert torch.equal(found.embeddings, expected.embeddings)
 
 
 @pytest.mark.slow
