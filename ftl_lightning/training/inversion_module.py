@@ -35,7 +35,7 @@ class InversionModule(Adaptation):
     """Learn K embeddings and their weights for every concept of an :class:`~ftl_lightning.training.data.InversionData`.
 
     The parameters are those of :attr:`inversion`. A single training step makes all gradient steps by
-    :meth:`~ftl_lightning.training.concept_model.ConceptModel.learn_concepts`, which the Python API and other processes call as well.
+    :meth:`~ftl_lightning.training.concept_model.ConceptModel.learn_concepts`, as the Python API and other processes do.
 
     Args:
         pretrained: folder of the pretrained model.

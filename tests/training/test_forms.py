@@ -14,7 +14,7 @@ from ftl_lightning.domains.object_rearrangement.relations import columns
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
-from ftl_lightning.igm.forms.choice import ALL, OWN, RANK, TOLERANCE, _Shares, first_settings
+from ftl_lightning.igm.forms.choice import ALL, OWN, RANK, TOLERANCE, _Shares, first_settings, learn
 from ftl_lightning.igm.forms.modes import Modes, even_stretch
 from ftl_lightning.igm.forms.quality import Quality
 from ftl_lightning.igm.settings import ADAPTED, AUTO, FORMS, MIXED, MODES, ONE, PAPER, InversionSettings
