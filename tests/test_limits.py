@@ -23,7 +23,7 @@ import torch
 from ftl_lightning.cli.commands import generate
 from ftl_lightning.cli.sampling_command import SampleOptions
 from ftl_lightning.data import file_format
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.igm.samplers import Sampling

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ftl_lightning.services.printing import line, say
 
 if TYPE_CHECKING:
-    from ftl_lightning.data.container import Demonstrations
+    from ftl_lightning.data.demonstrations import Demonstrations
     from ftl_lightning.data.finding import Finding
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.training.demonstration_check import Check

@@ -1,5 +1,5 @@
 """Demonstrations: container, files, normalisation, checks."""
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 
 __all__ = ["Demonstrations"]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.file_format import VERSION
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.progress import bar

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from ftl_lightning.data.check import mended
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.finding import Finding
 from ftl_lightning.data.formats.file_format import read
 from ftl_lightning.services.errors import about

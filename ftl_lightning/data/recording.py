@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.episodes import Beside, Episode, contents
 from ftl_lightning.data.observations import feature_parts, states_part
 from ftl_lightning.services.errors import UserError
@@ -105,7 +105,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         return Demonstrations(**contents(every, self._beside))
 
     def save(self, path: str | Path) -> None:
-        """Write the demonstrations in any known format, see :meth:`ftl_lightning.data.container.Demonstrations.save`."""
+        """Write the demonstrations in any known format, see :meth:`ftl_lightning.data.demonstrations.Demonstrations.save`."""
         self.demonstrations().save(path)
 
     def _taken(self, observation: Any) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:

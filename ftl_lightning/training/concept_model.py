@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import READ, Feature, Observed, check_features
 from ftl_lightning.igm.adapter import LowRank
 from ftl_lightning.igm.composition import Composition

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from ftl_lightning.data.check import check
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.finding import Finding
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.progress import bar

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Choice, Concept
 from ftl_lightning.igm.modes import Modes, even_stretch

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.inversion_settings import InversionSettings

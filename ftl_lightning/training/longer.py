@@ -1,6 +1,6 @@
 """Note about demonstrations that are longer than a model's training window."""
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.training.concept_model import ConceptModel
 
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 
 LENGTHS = (5, 3, 4, 5, 2, 5)
 

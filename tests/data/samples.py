@@ -1,6 +1,6 @@
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 
 
 def demonstrations(states: torch.Tensor, **changes: object) -> Demonstrations:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ftl_lightning.data.cache import Tell, cached
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from tests.data.samples import demonstrations
 
 

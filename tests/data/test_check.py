@@ -10,7 +10,7 @@ import torch
 
 from ftl_lightning.apps.testing.strokes import NEW, TRAINING, strokes
 from ftl_lightning.data.check import check, check_each, mended
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.mended_file import read_mended
 from ftl_lightning.domains.registry import load_domain
 from tests.conftest import ROOT

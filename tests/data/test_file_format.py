@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.file_format import VERSION
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.tensor_file import file_hash, save_tensors

@@ -8,7 +8,7 @@ import pytest
 import safetensors
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.file_format import VERSION
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.tensor_file import save_tensors

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.from_file import read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError

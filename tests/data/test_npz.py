@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Feature
 from ftl_lightning.services.errors import UserError
 from tests.data.recorded import everything, expect_same

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.tabletop import DOMAIN, policies, source
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment

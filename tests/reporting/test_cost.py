@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.training.data import InversionData

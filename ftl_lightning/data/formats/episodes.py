@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, padded
+from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.services.limits import VARIABLE, most_bytes

@@ -22,7 +22,7 @@ VERSION = 4
 
 
 class Contents(TypedDict):
-    """Content of a file, by the attributes of :class:`~ftl_lightning.data.container.Demonstrations`.
+    """Content of a file, by the attributes of :class:`~ftl_lightning.data.demonstrations.Demonstrations`.
 
     Types are as annotated; shapes and values are validated by the container.
     """

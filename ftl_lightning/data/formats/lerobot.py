@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.episodes import Beside, Episode, contents
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.services.data_names import INFO

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.episodes import Episode, beside, check_names, episodes
 from ftl_lightning.data.formats.lerobot import ACTION, BESIDE, EPISODE, LENGTH, OBSERVED, SCENE, STATE, TASK, VERSIONS
 from ftl_lightning.services.data_names import INFO

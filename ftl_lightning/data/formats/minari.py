@@ -20,7 +20,7 @@ from gymnasium.spaces import Box
 from minari.data_collector import EpisodeBuffer
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.formats.episodes import Beside, Episode, beside, check_names, contents, episodes
 from ftl_lightning.data.formats.file_format import Contents
 from ftl_lightning.data.observations import PART, feature_parts, states_part

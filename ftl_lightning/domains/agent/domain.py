@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.cache import cached
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
 from ftl_lightning.domains.agent import dynamics, expert
 from ftl_lightning.domains.agent import scenes as scene_settings

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.cache import cached
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.methods.in_context.model import InContextModel
 from ftl_lightning.services.errors import UserError

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature
 from ftl_lightning.services.errors import UserError
 from tests.data.samples import demonstrations
