@@ -22,8 +22,8 @@ import torch
 
 from ftl_lightning.cli.commands import generate
 from ftl_lightning.cli.sampling_command import SampleOptions
-from ftl_lightning.data import file_format
 from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.formats import files
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.igm.samplers import Sampling
@@ -201,7 +201,7 @@ def test_a_header_that_is_none(name: str, capsys: Told) -> None:
     refused(capsys, READ["concept"], "x: expected a concept file")
 
 
-FORM = {"kind": "demonstrations", "format": file_format.VERSION, "domain": "agent", "concepts": ["", ""], "per_step": []}
+FORM = {"kind": "demonstrations", "format": files.VERSION, "domain": "agent", "concepts": ["", ""], "per_step": []}
 STATES = {"states": torch.zeros(2, 3, 13), "lengths": torch.full((2,), 3), "observed/world": torch.zeros(2, 52)}
 GIGABYTE = 2**30
 

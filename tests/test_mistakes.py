@@ -308,7 +308,7 @@ def test_demonstrations_that_do_not_fit(capsys: Told) -> None:
         "size.safetensors": "key 'states': expected shape (demo, time, 21), found (2, 1, 20)",
         "cut.safetensors": "damaged or foreign",
         "nan.npz": "expected finite numbers, found nan",
-        "none.npz": "expected at least one demonstration, found none",
+        "none.npz": "expected at least one demonstration, time and column, found none",
         "keys.npz": "key 'states': expected (demo, time, state)",
         "empty.npz": "damaged",
         "array.npz": "damaged",

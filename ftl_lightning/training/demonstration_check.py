@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from ftl_lightning.data.check import check
+from ftl_lightning.data.check import Finding, check
 from ftl_lightning.data.demonstrations import Demonstrations
-from ftl_lightning.data.finding import Finding
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.services.progress import bar
 from ftl_lightning.services.representation import counted

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.check import numbered
 from ftl_lightning.data.demonstrations import Demonstrations, concatenate
-from ftl_lightning.data.finding import numbered
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.training.concept_model import ConceptModel
 from ftl_lightning.training.inversion import invert

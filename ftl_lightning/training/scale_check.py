@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from ftl_lightning.data.check import Finding
 from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import moved
-from ftl_lightning.data.finding import Finding
 from ftl_lightning.services.errors import UserError, short
 from ftl_lightning.training.concept_model import ConceptModel
 
