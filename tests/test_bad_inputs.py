@@ -304,7 +304,7 @@ LARGE = archive(lambda data: data.replace(b"(2, 3, 13)", b"(2, 3, 13000000000)")
         (archive(states=NUMBERS, lengths=np.array([2.7, np.nan])), "key 'lengths': expected whole numbers"),
         (archive(states=NUMBERS, lengths=np.array(3)), "key 'lengths'"),
         (archive(states=NUMBERS, concepts=np.array([1, 2])), "key 'concepts': expected an array of texts"),
-        (archive(states=NUMBERS, concepts=np.array([["a", "b"]])), "key 'concepts'"),
+        (archive(states=NUMBERS, concepts=np.array([["a", "b"]])), "key 'concepts[0]'"),
         (archive(states=NUMBERS, domain=np.array([], dtype=str)), "key 'domain'"),
         (archive(states=np.zeros((), np.float32), concepts=np.array("a")), "key 'states'"),
     ],

@@ -274,11 +274,11 @@ class Demonstrations(Shown):
             UserError: for a feature that is missing or has another type or shape.
         """
         for name, feature in features.items():
-            if (given := self.features.get(name)) is None or not given.fits(feature):
-                message = "none" if given is None else given.words
-                if given is not None and given.shape[1:] == feature.shape and name not in self.per_step:
-                    message += " (observed at every time? then list it in per_step)"
-                raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {message}")
+            given = self.features.get(name)
+            message = "none" if given is None else given.words
+            if given is not None and given.shape[1:] == feature.shape and name not in self.per_step:
+                message += " (observed at every time? then list it in per_step)"
+            require(given is not None and given.fits(feature), f"key 'observed/{name}'", f"{feature.words} each", message)
         return self
 
 
@@ -287,8 +287,7 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
 
     A feature is observed at every time, and there are scenes, only if this holds for all parts.
     """
-    first = parts[0]
-    longest = max(part.states.shape[1] for part in parts)
+    first, longest = parts[0], max(part.states.shape[1] for part in parts)
     per_step = tuple(name for name in first.per_step if all(name in part.per_step for part in parts))
     scenes = [part.scenes for part in parts if part.scenes is not None]
     return replace(

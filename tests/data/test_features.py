@@ -67,7 +67,5 @@ def test_scenes_and_initial_states_that_are_missing_are_told_where_nothing_goes_
     with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), by which an environment is reset, found none"):
         starts.require_scenes()
     assert check_starts(starts) is starts
-    with pytest.raises(
-        UserError, match="starts: expected initial states, found none; give the observed features where plans start"
-    ):
+    with pytest.raises(UserError, match="expected initial states, found none; give the observed features where plans start"):
         check_starts(None)

@@ -247,7 +247,6 @@ DAMAGES: dict[str, tuple[Callable[[], object], str]] = {
     "no frames": (lambda: shutil.rmtree("robot/data"), "robot: expected Parquet files data/*/*.parquet, at most 20000, found 0"),
     "beside": (beside('{"domain": 1}'), "key 'domain': expected a text, found 1"),
     "beside names": (beside('{"state_names": ["x"]}'), "robot: key 'state_names': expected 2 entries, found 1"),
-    "beside steps": (beside('{"per_step": ["speed"]}'), "key 'per_step': expected names of observed features, found speed"),
 }
 
 

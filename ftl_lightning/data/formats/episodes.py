@@ -1,8 +1,8 @@
 """Demonstrations as episodes, the form of other programs: without padding, each with its length."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Self
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,17 +49,6 @@ class Metadata:
     per_step: tuple[str, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def restricted(self, observed: Sequence[str], same_states: bool) -> Self:
-        """Restrict to the features and states that are read.
-
-        Args:
-            observed: names of the features.
-            same_states: whether the states are those that were written, to which names and units belong.
-        """
-        per_step = None if self.per_step is None else tuple(name for name in self.per_step if name in observed)
-        names, units = (self.state_names, self.state_units) if same_states else (None, None)
-        return replace(self, state_names=names, state_units=units, per_step=per_step)
-
 
 def metadata(demonstrations: Demonstrations) -> dict[str, Any]:
     """Attributes of :class:`Metadata` as JSON can hold them."""
@@ -88,7 +77,7 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
 
     Args:
         episodes: at least one, all with the same columns and observed features.
-        given: attributes stored beside the episodes.
+        given: attributes stored beside the episodes; features that were not read are ignored.
 
     Returns:
         Attributes of demonstrations, not validated yet.
@@ -103,7 +92,7 @@ def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
     require(size <= (most := most_bytes()), "episodes", f"at most {most} bytes", message)
     states, lengths = padded([_tensor(episode.states) for episode in episodes])
     columns = states.shape[2]
-    per_step = tuple(first.observed) if given.per_step is None else given.per_step
+    per_step = tuple(name for name in (first.observed if given.per_step is None else given.per_step) if name in first.observed)
     scenes = [_tensor(episode.scene) for episode in episodes if episode.scene is not None]
     return {
         "states": states,

@@ -11,7 +11,6 @@ of features that are known only at the start, and provenance.
 
 import itertools
 import json
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -99,10 +98,9 @@ def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | 
         content = read_json(root / METADATA)
         with about(root / METADATA):
             given = from_mapping(Metadata, content, "")
-    if observed is not None or part != STATE:
-        given = given.restricted([name.removeprefix(OBSERVED) for name in names], part == STATE)
-    if given.state_names is None:
-        given = replace(given, state_names=features[part].names)
+    if part != STATE:  # names and units are those of the states that were written
+        given = replace(given, state_names=None, state_units=None)
+    given = replace(given, state_names=given.state_names or features[part].names)
     if images := short(", ".join(key for key, feature in features.items() if feature.dtype in ("image", "video")), 150):
         say(line(f"{root}: left out {images}: images and videos are not read"), error=True)
     scene = [SCENE] if written and SCENE in features else []
@@ -152,15 +150,16 @@ def _info(root: Path) -> tuple[str, int, dict[str, _Feature]]:
 
 
 def _feature(key: str, fields: Mapping[str, Any]) -> _Feature:
-    # Features that are not read, such as images, may have any shape.
-    if not (feature := _Feature(check_type(fields.get("dtype"), str, f"{key}.dtype"))).numeric:
+    feature = _Feature(check_type(fields.get("dtype"), str, f"{key}.dtype"))
+    if not feature.numeric:  # not read, such as images; any shape is allowed
         return feature
-    shape = check_type(fields.get("shape"), tuple[int, ...], f"{key}.shape")
+    shape: tuple[int, ...] = check_type(fields.get("shape"), tuple[int, ...], f"{key}.shape")
     names = fields.get("names")
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as in older data sets
         (names,) = names.values()
-    named = isinstance(names, list) and len(names) == prod(shape) and all(isinstance(name, str) for name in names)
-    return _Feature(feature.dtype, shape, tuple(names) if named else None)
+    if not isinstance(names, list) or len(names) != prod(shape) or not all(isinstance(name, str) for name in names):
+        names = None
+    return _Feature(feature.dtype, shape, None if names is None else tuple(names))
 
 
 def _part(features: Mapping[str, _Feature], part: str) -> str:
@@ -200,9 +199,8 @@ def _ranges(root: Path, lengths: Mapping[int, int], index: NDArray[np.int64]) ->
 def _lengths_and_texts(root: Path, version: str) -> tuple[dict[int, int], dict[int, str]]:
     """Lengths of episodes and texts of tasks, by number."""
     if not version.startswith("v3"):
-        return _by_number(root / "meta" / "episodes.jsonl", EPISODE, LENGTH, int), _by_number(
-            root / "meta" / "tasks.jsonl", TASK, "task", str
-        )
+        lengths = _by_number(root / "meta" / "episodes.jsonl", EPISODE, LENGTH, int)
+        return lengths, _by_number(root / "meta" / "tasks.jsonl", TASK, "task", str)
     from ftl_lightning.data.formats.parquet import read_columns, read_texts
 
     columns = read_columns(root, "meta/episodes/*/*.parquet", {EPISODE: (1,), LENGTH: (1,)}, (EPISODE, LENGTH))
@@ -345,22 +343,17 @@ def _statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder, which is renamed to ``folder`` on success and removed on failure."""
+    """Yield a temporary folder with a folder ``meta``; it is renamed to ``folder`` on success and removed on failure."""
     check_new_folder(folder)
-    temporary: Path | None = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:50]}.", dir=folder.parent))
-        (temporary / "meta").mkdir()
-        yield temporary
-        temporary.chmod(0o755)
-        temporary.replace(folder)
-        temporary = None
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:50]}.", dir=folder.parent) as temporary:
+            root = Path(temporary) / "new"
+            (root / "meta").mkdir(parents=True)
+            yield root
+            root.replace(folder)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose a writable place with room") from error
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
 
 
 FORMATS["lerobot"] = Format(read_contents, write_lerobot)

@@ -11,6 +11,7 @@ the start, and provenance. Scenes are ``scene`` in an episode's ``infos``.
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,8 +65,8 @@ def read_contents(name: str, part: str = "", observed: Sequence[str] | None = No
             given = from_mapping(Metadata, attributes.get(_HEADER, {}), _HEADER)
             part = states_part(dataset.observation_space, part)
             features = feature_parts(dataset.observation_space, part, observed, images=written)
-        if observed is not None or part not in ("", PART):
-            given = given.restricted(features, part in ("", PART))
+        if part not in ("", PART):  # names and units are those of the states that were written
+            given = replace(given, state_names=None, state_units=None)
         texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
         default = _text(attributes) or name
         episodes = [
