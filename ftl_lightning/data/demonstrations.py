@@ -173,8 +173,8 @@ class Demonstrations(Shown):
         """Start times of windows ``(window,)`` int64.
 
         If all features are observed at every time, a plan can start at any time. If a feature is known only at the first time, all
-        windows start at 0. Without observed features, nothing tells a plan where in a behaviour it is: windows stay within a
-        demonstration, and a window of its full length starts at 0.
+        windows start at 0. Without observed features, a plan has no information on its time in a behaviour: windows stay within
+        a demonstration, and a window of its full length starts at 0.
 
         Args:
             rows: ``(window,)`` int64, demonstration of each window.

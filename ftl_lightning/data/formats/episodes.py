@@ -130,5 +130,12 @@ def check_names(demonstrations: Demonstrations, reserved: str, place: str) -> No
         require(allowed, place, expected, f"{short(name)!r}; rename it")
 
 
+def measured(values: Any) -> NDArray[Any]:
+    """Convert measurements to float32; images stay uint8."""
+    array = np.asarray(values)
+    with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
+        return array if array.dtype == np.uint8 else array.astype(np.float32)
+
+
 def _tensor(values: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.array(values))  # a copy: arrays from files are often read-only

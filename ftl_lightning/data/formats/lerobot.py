@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, metadata, to_episodes
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.services.data_names import INFO
 from ftl_lightning.services.errors import UserError, about, require, short, shown
 from ftl_lightning.services.extras import check_extra
@@ -117,20 +117,14 @@ def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | 
         read.append(
             Episode(
                 frames[part][start:stop].reshape(stop - start, -1).astype(np.float32),
-                {name.removeprefix(OBSERVED): _measured(frames[name][start:stop]) for name in names},
+                {name.removeprefix(OBSERVED): measured(frames[name][start:stop]) for name in names},
                 texts[task],
-                _measured(frames[SCENE][start]) if scene else None,
+                measured(frames[SCENE][start]) if scene else None,
             )
         )
     with about(root):
         contents = from_episodes(read, given)
     return {**contents, "provenance": contents["provenance"] or {"lerobot": root.resolve().name}}
-
-
-def _measured(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert measurements to float32; images stay uint8."""
-    with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
-        return values if values.dtype == np.uint8 else values.astype(np.float32)
 
 
 def _info(root: Path) -> tuple[str, int, dict[str, _Feature]]:

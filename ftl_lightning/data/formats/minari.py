@@ -15,10 +15,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
-from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, metadata, to_episodes
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.extras import check_extra
 from ftl_lightning.services.schema import from_mapping
@@ -73,9 +72,8 @@ def read_contents(name: str, part: str = "", observed: Sequence[str] | None = No
             _episode(episode, part, features, text or default, written) for episode, text in zip(dataset, texts, strict=True)
         ]
     except FileNotFoundError as error:
-        raise UserError(
-            f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
-        ) from error
+        message = "expected a file or an installed Minari data set, found neither; see: minari list local"
+        raise UserError(f"{name}: {message}") from error
     except (ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
         message = short(str(error), 100)
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
@@ -89,15 +87,10 @@ def _episode(episode: Any, part: str, features: Sequence[str], text: str, writte
     states = np.asarray(observations[part] if part else observations, dtype=np.float32)
     return Episode(
         states.reshape(len(states), -1),
-        {key: _numbers(observations[key]) for key in features},
+        {key: measured(observations[key]) for key in features},
         _text(infos) or text,
         np.asarray(infos[SCENE], dtype=np.float32)[0] if written and SCENE in infos else None,
     )
-
-
-def _numbers(values: Any) -> NDArray[Any]:
-    array = np.asarray(values)
-    return array if array.dtype == np.uint8 else array.astype(np.float32)
 
 
 def _text(attributes: Mapping[str, Any] | None) -> str:
@@ -134,13 +127,11 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
     check_names(demonstrations, PART, name)
     space: gymnasium.Space[Any] = Box(-np.inf, np.inf, demonstrations.states.shape[2:], np.float32)
     if demonstrations.observed:
-        parts: dict[str, gymnasium.Space[Any]] = {
-            key: Box(0, 255, feature.shape, np.uint8)
-            if feature.kind == "image"
-            else Box(-np.inf, np.inf, feature.shape, np.float32)
-            for key, feature in demonstrations.features.items()
-        }
-        space = gymnasium.spaces.Dict({PART: space, **parts})
+        spaces = {PART: space}
+        for key, feature in demonstrations.features.items():
+            low, high, dtype = (0, 255, np.uint8) if feature.kind == "image" else (-np.inf, np.inf, np.float32)
+            spaces[key] = Box(low, high, feature.shape, dtype)
+        space = gymnasium.spaces.Dict(spaces)
     buffers = []
     for episode in to_episodes(demonstrations):
         steps = len(episode.states) - 1
