@@ -4,7 +4,7 @@
 # current folder off Python's path before any module could be found in it.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from ftl_lightning.data.container import Demonstrations
+    from ftl_lightning.data.demonstrations import Demonstrations
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.igm.composition import Composition
     from ftl_lightning.igm.concept import Concept
@@ -15,7 +15,7 @@ __all__ = ["Composition", "Concept", "Demonstrations", "FewShot", "__version__",
 _MODULES = {
     "Composition": "igm.composition",
     "Concept": "igm.concept",
-    "Demonstrations": "data.container",
+    "Demonstrations": "data.demonstrations",
     "FewShot": "few_shot.learner",
     "__version__": "version",
     "list_models": "services.shipped",

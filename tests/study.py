@@ -11,7 +11,7 @@ from ftl_lightning.apps.study.answers import Key
 from ftl_lightning.apps.study.films import read_films
 from ftl_lightning.apps.study.page import Made, make_study
 from ftl_lightning.apps.study.questions import ask
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Concepts, Domain, Plans, Show
 from ftl_lightning.domains.mocap.rendering import film, picture, wireframe
 from ftl_lightning.domains.mocap.skeleton import COLUMNS

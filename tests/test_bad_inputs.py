@@ -12,7 +12,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from ftl_lightning.data.formats import file_format
+from ftl_lightning.data.formats import files
 from ftl_lightning.domains.from_file import read_demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import COLUMNS, read_rows
@@ -239,14 +239,14 @@ def test_a_learned_concept(agent: ConceptModel, header: object, tensors: dict[st
 
 # Demonstrations
 
-FORM = {"kind": "demonstrations", "format": file_format.VERSION, "domain": "agent", "concepts": ["", ""], "per_step": []}
+FORM = {"kind": "demonstrations", "format": files.VERSION, "domain": "agent", "concepts": ["", ""], "per_step": []}
 STATES = {"states": torch.zeros(2, 3, 13), "lengths": torch.full((2,), 3), "observed/world": torch.zeros(2, 52)}
 
 
 @pytest.mark.parametrize(
     ("header", "tensors", "expected"),
     [
-        (FORM | {"concepts": [1, 2]}, STATES, "key 'concepts': expected a list of texts"),
+        (FORM | {"concepts": [1, 2]}, STATES, "key 'concepts[0]': expected a text, found 1"),
         (FORM | {"concepts": "text"}, STATES, "key 'concepts'"),
         (FORM | {"concepts": ["", "", ""]}, STATES, "key 'concepts': expected 2 entries, found 3"),
         *((FORM | {"per_step": value}, STATES, "key 'per_step'") for value in ("world", {"world": 1}, ["x" * 999])),
@@ -304,7 +304,7 @@ LARGE = archive(lambda data: data.replace(b"(2, 3, 13)", b"(2, 3, 13000000000)")
         (archive(states=NUMBERS, lengths=np.array([2.7, np.nan])), "key 'lengths': expected whole numbers"),
         (archive(states=NUMBERS, lengths=np.array(3)), "key 'lengths'"),
         (archive(states=NUMBERS, concepts=np.array([1, 2])), "key 'concepts': expected an array of texts"),
-        (archive(states=NUMBERS, concepts=np.array([["a", "b"]])), "key 'concepts'"),
+        (archive(states=NUMBERS, concepts=np.array([["a", "b"]])), "key 'concepts[0]'"),
         (archive(states=NUMBERS, domain=np.array([], dtype=str)), "key 'domain'"),
         (archive(states=np.zeros((), np.float32), concepts=np.array("a")), "key 'states'"),
     ],

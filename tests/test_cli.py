@@ -11,7 +11,7 @@ import yaml
 
 from ftl_lightning.apps.lightning_cli import parse
 from ftl_lightning.cli.main import COMMANDS, TRAINER_VERBS, main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.services.configuration import parts

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftl_lightning.apps.testing.strokes import strokes
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.training.model_folder import load_model

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from packaging.requirements import Requirement
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.mocap.measures import learned_elsewhere
 from ftl_lightning.reporting.figures import concept_map

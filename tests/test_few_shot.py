@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 import ftl_lightning
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.agent.scenes import OBSERVED
@@ -305,7 +305,7 @@ def walks(text: str, up: float, count: int = 3) -> Demonstrations:
 
 
 def test_plans_of_ones_own_data_are_judged_by_what_was_shown() -> None:
-    from ftl_lightning.data.container import concatenate
+    from ftl_lightning.data.demonstrations import concatenate
 
     examples = concatenate([walks("flat", 0.0), walks("steep", 2.0)])
     texts, judged = ("flat", "steep"), {"nearest_demonstration": 1.0, "dtw_to_demonstrations": 1.0}

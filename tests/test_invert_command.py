@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ftl_lightning import Demonstrations, FewShot
-from ftl_lightning.data.container import concatenate
+from ftl_lightning.data.demonstrations import concatenate
 from ftl_lightning.services.errors import UserError
 from tests.conftest import CONF, refused, succeed
 from tests.tiny import QUIET

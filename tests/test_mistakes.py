@@ -24,7 +24,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.demos.boring_classes import BoringModel
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.igm import settings
@@ -308,7 +308,7 @@ def test_demonstrations_that_do_not_fit(capsys: Told) -> None:
         "size.safetensors": "key 'states': expected shape (demo, time, 21), found (2, 1, 20)",
         "cut.safetensors": "damaged or foreign",
         "nan.npz": "expected finite numbers, found nan",
-        "none.npz": "expected at least one demonstration, found none",
+        "none.npz": "expected at least one demonstration, time and column, found none",
         "keys.npz": "key 'states': expected (demo, time, state)",
         "empty.npz": "damaged",
         "array.npz": "damaged",

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import ftl_lightning
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.domains.driving.shipped import SHIPPED

@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 from PIL import Image
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.few_shot import shared_concept
 from ftl_lightning.few_shot.learner import FewShot, LearnedConcept

@@ -13,7 +13,7 @@ import torch
 from nbclient import NotebookClient
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tabletop.tasks import PUSH

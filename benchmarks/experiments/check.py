@@ -18,7 +18,7 @@ from forms import pretrained
 
 from ftl_lightning.apps.testing.strokes import NEW, TRAINING, strokes
 from ftl_lightning.data.check import check
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.services.progress import bar

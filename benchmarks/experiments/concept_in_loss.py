@@ -14,7 +14,7 @@ import json
 import torch
 
 from ftl_lightning import FewShot
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.model import Draws
 from ftl_lightning.services.seeding import generator

@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 
 from ftl_lightning.apps.lightning_cli import parse
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, WITH_MODES, Compared
 from ftl_lightning.domains.registry import load_domain

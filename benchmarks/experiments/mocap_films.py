@@ -16,7 +16,7 @@ from mocap_distances import GUIDANCE, recorded
 from torch import Tensor
 
 from ftl_lightning.cli.commands import StudyOptions, study
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.domain import DOMAIN
 from ftl_lightning.domains.mocap.skeleton import COLUMNS
 from ftl_lightning.domains.mocap.source import NAME, Recorded

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
 from ftl_lightning.domains.tabletop.experts import Episode, perform
 from ftl_lightning.domains.tabletop.scenes import draw_scene

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import closed_loop_of
 from ftl_lightning.domains.tabletop import DOMAIN

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.few_shot.tuned import ModelSettings, settings_of
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import FULL, PRECISIONS, REDUCED

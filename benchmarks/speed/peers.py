@@ -35,7 +35,7 @@ from diffusers.optimization import get_scheduler
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.few_shot.tuned import ModelSettings
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.inversion import invert

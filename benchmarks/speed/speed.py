@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import ACCURACY
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.tuned import ModelSettings

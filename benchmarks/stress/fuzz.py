@@ -31,7 +31,7 @@ import safetensors.torch
 import torch
 import yaml
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.evaluation.results import COLUMNS, latest, read_rows
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, Origin

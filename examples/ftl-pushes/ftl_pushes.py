@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_starts
 from ftl_lightning.domains import line_plots
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Frames, Metric, Plans, Split

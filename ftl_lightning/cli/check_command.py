@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from ftl_lightning.services.printing import line, say
 
 if TYPE_CHECKING:
-    from ftl_lightning.data.container import Demonstrations
-    from ftl_lightning.data.finding import Finding
+    from ftl_lightning.data.check import Finding
+    from ftl_lightning.data.demonstrations import Demonstrations
     from ftl_lightning.few_shot.learner import FewShot
     from ftl_lightning.training.checks import Check
 
@@ -45,7 +45,7 @@ class CheckOptions:
 
 def check(options: CheckOptions) -> None:
     """Check every concept of the file; print and draw the results."""
-    from ftl_lightning.data.mended_file import read_mended
+    from ftl_lightning.data.check import read_mended
     from ftl_lightning.few_shot.learner import FewShot
 
     demonstrations, broken = read_mended(options.file)

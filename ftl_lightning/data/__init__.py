@@ -1,5 +1,6 @@
-"""Demonstrations: container, files, normalisation, checks."""
+"""Demonstrations: container, file formats, normalisation, checks."""
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data import formats
+from ftl_lightning.data.demonstrations import Demonstrations
 
-__all__ = ["Demonstrations"]
+__all__ = ["Demonstrations", "formats"]

@@ -4,15 +4,21 @@ Thresholds were chosen on demonstrations of navigation, object rearrangement and
 of 100 sets of three to ten good demonstrations pass (97 in driving).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.finding import Finding
-from ftl_lightning.services.errors import short
+from ftl_lightning.data.demonstrations import Demonstrations, read_contents
+from ftl_lightning.services.errors import about, short
 
+Severity = Literal["note", "warning", "error"]
+MOST_NAMED = 6
+"""Maximum number of demonstrations to list individually."""
 POINTS = 32
 """Number of even times at which demonstrations are compared."""
 UNUSUAL = 3.0
@@ -45,6 +51,42 @@ BEYOND = 1.5
 """Minimum ratio of an outlier's least distance to the others' largest, for five and more."""
 
 
+@dataclass(frozen=True)
+class Finding:
+    """Finding of a check.
+
+    Attributes:
+        text: a sentence without a full stop, which follows the demonstrations' numbers if there are any.
+        severity: ``'note'`` for information, ``'warning'`` for a likely fault, ``'error'`` for data that nothing can be learned
+            from.
+        rows: demonstrations, from 0; empty for all. Texts count from 1.
+    """
+
+    text: str
+    severity: Severity = "warning"
+    rows: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{numbered(self.rows)}: {self.text}" if self.rows else self.text
+
+    def among(self, rows: Sequence[int]) -> Self:
+        """Map rows of a selection to all demonstrations; ``rows`` is the selection."""
+        return replace(self, rows=tuple(rows[row] for row in self.rows))
+
+    def within(self, rows: Sequence[int]) -> Self:
+        """Invert :meth:`among`."""
+        return replace(self, rows=tuple(rows.index(row) for row in self.rows))
+
+
+def numbered(rows: Sequence[int]) -> str:
+    """Demonstrations by their numbers from 1: ``'demonstration 3'``, ``'demonstrations 1, 2 and 5'``."""
+    if len(rows) == 1:
+        return f"demonstration {rows[0] + 1}"
+    if len(rows) > MOST_NAMED:
+        return f"{len(rows)} demonstrations ({', '.join(str(row + 1) for row in rows[:3])}, ...)"
+    return f"demonstrations {', '.join(str(row + 1) for row in rows[:-1])} and {rows[-1] + 1}"
+
+
 def mended(states: Tensor, lengths: Tensor) -> tuple[Tensor, tuple[Finding, ...]]:
     """Replace missing and non-finite numbers in states.
 
@@ -56,35 +98,42 @@ def mended(states: Tensor, lengths: Tensor) -> tuple[Tensor, tuple[Finding, ...]
         States, linearly interpolated between finite values of a column (0 without any), and findings about them.
     """
     missing = ~states.isfinite()
-    if not missing.any():
-        return states, ()
     findings, whole = [], states.clone()
     for row in missing.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
         length = int(lengths[row])
-        times = missing[row].any(dim=1).nonzero()[:, 0]
-        within = times[times < length]
-        if len(within):
-            columns = int(missing[row].any(dim=0).sum())
-            message = f"{len(within)} of {length} time steps are not finite (the first is {int(within[0])}), in {columns} columns"
-            findings.append(Finding(f"{message}; nothing can be learned from them", "error", (row,)))
-        else:
-            findings.append(Finding("its padding is not finite; pad with the last state", "error", (row,)))
-        for column in missing[row].any(dim=0).nonzero()[:, 0].tolist():
-            whole[row, :, column] = _interpolated(states[row, :, column])
+        columns = missing[row].any(dim=0).nonzero()[:, 0].tolist()
+        times = missing[row, :length].any(dim=1).nonzero()[:, 0]
+        message = "its padding is not finite; pad with the last state"
+        if len(times):
+            message = f"{len(times)} of {length} time steps are not finite (the first is {int(times[0])})"
+            message += f", in {len(columns)} columns; nothing can be learned from them"
+        findings.append(Finding(message, "error", (row,)))
+        for column in columns:
+            values = whole[row, :, column].numpy()
+            finite = np.isfinite(values).nonzero()[0]
+            values[:] = np.interp(np.arange(len(values)), finite, values[finite]) if len(finite) else 0
     return whole, tuple(findings)
 
 
-def _interpolated(values: Tensor) -> Tensor:
-    """Interpolate a column ``(time,)`` linearly where it is not finite."""
-    good = values.isfinite().nonzero()[:, 0]
-    if not len(good):
-        return torch.zeros_like(values)
-    times = torch.arange(len(values))
-    after = torch.searchsorted(good, times).clamp(max=len(good) - 1)
-    before = (torch.searchsorted(good, times, right=True) - 1).clamp(min=0)
-    first, last = good[before], good[after]
-    share = ((times - first) / (last - first).clamp(min=1)).clamp(0, 1).to(values.dtype)
-    return values[first] + share * (values[last] - values[first])
+def read_mended(path: str) -> tuple[Demonstrations, tuple[Finding, ...]]:
+    """Read demonstrations with states that are not finite mended; those without a text are named after the file.
+
+    Args:
+        path: ``.npz``, safetensors, or a data set.
+
+    Returns:
+        Demonstrations, and findings for states that were not finite.
+
+    Raises:
+        UserError: naming the file, for every other mistake in it.
+    """
+    contents = read_contents(path)
+    findings: tuple[Finding, ...] = ()
+    states, lengths = contents["states"], contents["lengths"]
+    if states.dim() == 3 and states.dtype == torch.float32 and lengths.shape == states.shape[:1]:
+        contents["states"], findings = mended(states, lengths)
+    with about(path):
+        return Demonstrations(**contents).named(Path(path).stem), findings
 
 
 def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
@@ -95,7 +144,8 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
     Args:
         demonstrations: treated as a single concept, whatever their texts.
     """
-    findings = [*_few(demonstrations), *_constant(demonstrations)]
+    few = Finding("three to five demonstrations are usual; fewer do not show which of them is odd", "note")
+    findings = [*([few] if len(demonstrations) < 3 else []), *_constant(demonstrations)]
     left = list(range(len(demonstrations)))
     for look in (_lengths, _stills, _units, _duplicates, _jumps, _outliers):
         reported = [finding.among(left) for finding in look(demonstrations.rows(left))]
@@ -103,15 +153,6 @@ def check(demonstrations: Demonstrations) -> tuple[Finding, ...]:
         faulty = {row for finding in reported for row in (finding.rows[1:] if look is _duplicates else finding.rows)}
         left = [row for row in left if row not in faulty] or left
     return tuple(sorted(findings, key=lambda finding: finding.severity == "note"))
-
-
-def check_each(demonstrations: Demonstrations) -> dict[str, tuple[Finding, ...]]:
-    """Apply :func:`check` to each concept, by text; rows are those of all demonstrations."""
-    findings = {}
-    for text in dict.fromkeys(demonstrations.concepts):
-        rows = [row for row, concept in enumerate(demonstrations.concepts) if concept == text]
-        findings[text] = tuple(finding.among(rows) for finding in check(demonstrations.rows(rows)))
-    return findings
 
 
 def distances(demonstrations: Demonstrations) -> Tensor:
@@ -159,11 +200,6 @@ def _others(count: int, row: int) -> list[int]:
     return [index for index in range(count) if index != row]
 
 
-def _few(demonstrations: Demonstrations) -> Iterator[Finding]:
-    if len(demonstrations) < 3:
-        yield Finding("three to five demonstrations are usual; with fewer nothing tells which of them is odd", "note")
-
-
 def _lengths(demonstrations: Demonstrations) -> Iterator[Finding]:
     lengths = demonstrations.lengths.tolist()
     for row, length in enumerate(lengths if len(lengths) > 2 else ()):
@@ -173,9 +209,9 @@ def _lengths(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 
 def _constant(demonstrations: Demonstrations) -> Iterator[Finding]:
-    every = torch.cat(_paths(demonstrations))
-    varies = every.amax(dim=0) - every.amin(dim=0) > SAME * every.abs().amax(dim=0)
-    if len(every) > 1 and varies.any() and not varies.all():
+    states = torch.cat(_paths(demonstrations))
+    varies = states.amax(dim=0) - states.amin(dim=0) > SAME * states.abs().amax(dim=0)
+    if len(states) > 1 and varies.any() and not varies.all():
         names = [name for name, changes in zip(demonstrations.state_names, varies.tolist(), strict=True) if not changes]
         yield Finding(f"{len(names)} of {len(varies)} columns never change ({short(', '.join(names), 50)})", "note")
 
@@ -185,8 +221,8 @@ def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
     paths, apart = _paths(demonstrations), distances(demonstrations)
     usual = float(_pairs(apart).median()) if len(paths) > 2 else 1.0
     for values in demonstrations.observed.values():
-        seen = values.double().flatten(1)
-        differ = (seen[:, None] - seen).abs() > ALIKE * seen.std(dim=0, correction=0)
+        flat = values.double().flatten(1)
+        differ = (flat[:, None] - flat).abs() > ALIKE * flat.std(dim=0, correction=0)
         apart = apart.masked_fill(differ.any(dim=2), torch.inf)
     size = min(len(path) for path in paths) * paths[0].shape[1]
     limit = max(ALIKE * usual if size >= ENOUGH else 0.0, SAME)
@@ -196,23 +232,20 @@ def _duplicates(demonstrations: Demonstrations) -> Iterator[Finding]:
         copies = [row for row in rest if apart[first, row] <= limit]
         if copies:
             exact = all(torch.equal(paths[first], paths[row]) for row in copies)
-            yield Finding("are the same" if exact else "are nearly the same; they tell no more than one", rows=(first, *copies))
+            yield Finding("are the same" if exact else "are nearly the same; they count as one", rows=(first, *copies))
         left = [row for row in rest if row not in copies]
 
 
-def _steps(paths: list[Tensor]) -> list[Tensor]:
-    """Steps ``(time - 1, state)`` of each path, in columns scaled by their spread."""
-    spread = _spread(torch.cat(paths)[None])
-    return [path.diff(dim=0) / spread for path in paths]
-
-
 def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
+    """Find demonstrations that stand still much longer than the others; columns are scaled by their spread."""
     paths = _paths(demonstrations)
-    moved = [steps.square().mean(dim=1).sqrt() for steps in _steps(paths)]
-    every = torch.cat(moved)
+    spread = _spread(torch.cat(paths)[None])
+    moved = [(path.diff(dim=0) / spread).square().mean(dim=1).sqrt() for path in paths]
     if max(map(len, moved)) < FEW:
         return
-    usual = float(every[every > 0].median()) if (every > 0).any() else 0.0
+    sizes_moved = torch.cat(moved)
+    moving = sizes_moved[sizes_moved > 0]
+    usual = float(moving.median()) if len(moving) else 0.0
     if not usual:
         yield Finding("nothing moves in any of them")
         return
@@ -225,9 +258,9 @@ def _stills(demonstrations: Demonstrations) -> Iterator[Finding]:
         if run == len(sizes):
             yield Finding(f"nothing moves in its {len(sizes) + 1} steps", rows=(row,))
         elif not others or shares[row] > 2 * sorted(others)[len(others) // 2]:
-            where = f"from step {start} on" if start + run == len(sizes) else f"from step {start} to {start + run}"
-            hint = "; if it is padding, give its length" if start + run == len(sizes) else ""
-            yield Finding(f"stands still {where}, {run} of {len(sizes)} steps{hint}", rows=(row,))
+            to_end = start + run == len(sizes)
+            where, hint = ("on", "; if it is padding, give its length") if to_end else (f"to {start + run}", "")
+            yield Finding(f"stands still from step {start} {where}, {run} of {len(sizes)} steps{hint}", rows=(row,))
 
 
 def _longest(still: Tensor) -> tuple[int, int]:
@@ -269,13 +302,13 @@ def _jumps(demonstrations: Demonstrations) -> Iterator[Finding]:
 
 def _wraps(states: Tensor, steps: list[Tensor]) -> bool:
     """Whether a column ``(time,)`` crosses its range in a step in several demonstrations, and otherwise moves in small steps."""
-    every = torch.cat(steps)
-    moving = every[every > 0]
+    sizes = torch.cat(steps)
+    moving = sizes[sizes > 0]
     if len(moving) < ENOUGH:
         return False
-    large = [sizes > WRAPPED * (states.max() - states.min()) for sizes in steps]
-    often, several = sum(int(jumps.sum()) for jumps in large), sum(bool(jumps.any()) for jumps in large)
-    return several > 1 and often * JUMP_ALONE < len(moving) and bool(every.max() > 2 * JUMP_ALONE * moving.median())
+    jumps = [int((part > WRAPPED * (states.max() - states.min())).sum()) for part in steps]
+    rare = sum(jumps) * JUMP_ALONE < len(moving)
+    return len(jumps) - jumps.count(0) > 1 and rare and bool(sizes.max() > 2 * JUMP_ALONE * moving.median())
 
 
 def _units(demonstrations: Demonstrations) -> Iterator[Finding]:
@@ -300,26 +333,21 @@ def _shapes(points: Tensor) -> Tensor:
     return centred / size.clamp(min=SAME)
 
 
-_View = tuple[Callable[[Tensor], Tensor], float, str]
-"""Transformation of points, threshold of an outlier, and its description."""
-
-
 def _outliers(demonstrations: Demonstrations) -> Iterator[Finding]:
     """Find demonstrations far from all others, relative to the others' distances."""
     count, points = len(demonstrations), _points(_paths(demonstrations))
     if count < 3:
         return
-    views: list[_View] = [(lambda values: values / _spread(values), APART_PLACES, "is far from the others")]
+    views = [(points / _spread(points), APART_PLACES, "is far from the others")]
     if points.shape[1] > 1:
-        views.append((_shapes, APART_SHAPES, "moves otherwise than the others"))
+        views.append((_shapes(points), APART_SHAPES, "moves otherwise than the others"))
     reported: set[int] = set()
     for view, limit, words in views:
-        seen = view(points)
         for row in range(count):
-            times, beyond = _far(seen, row)
-            if row not in reported and times > APART.get(count, limit) and (count < 5 or beyond > BEYOND):
+            ratio, beyond = _far(view, row)
+            if row not in reported and ratio > APART.get(count, limit) and (count < 5 or beyond > BEYOND):
                 reported.add(row)
-                yield Finding(f"{words}: {times:.0f} times the usual distance among them; another concept?", rows=(row,))
+                yield Finding(f"{words}: {ratio:.0f} times the usual distance among them; another concept?", rows=(row,))
 
 
 def _far(points: Tensor, row: int) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.services.errors import UserError, shown
+from ftl_lightning.services.errors import UserError, require
 from ftl_lightning.services.representation import Shown
 
 Observed = Mapping[str, Tensor]
@@ -20,18 +20,17 @@ READ = "(read)"  # no user's feature has this name
 
 @dataclass(frozen=True)
 class Feature:
-    """One part of what is observed.
+    """Shape and kind of an observed feature.
 
     Attributes:
-        shape: shape of one sample, such as ``(7,)`` or ``(3, 96, 96)``.
+        shape: shape of a sample, such as ``(7,)`` or ``(3, 96, 96)``.
         kind: ``'vector'`` (float32) or ``'image'`` (uint8, channels first).
-        entities: for a vector: the columns of each of its exchangeable objects, in the same order for each. The other columns
-            belong to no single object.
-        attributes: which of an object's columns, counted from its first, a concept may refer to (colour, shape); all where empty.
-        state: for a vector: the columns that hold the state a plan starts from, in the order of a state; empty where it holds none.
+        entities: columns of each exchangeable object in a vector, in the same order for each; other columns belong to no object.
+        attributes: columns of an object, counted from its first, that a concept may refer to (colour, shape); empty for all.
+        state: columns of a vector that hold the state from which a plan starts, in the order of a state; empty for none.
 
     Raises:
-        UserError: at construction, for columns that it does not have.
+        UserError: at construction, for columns beyond the shape.
     """
 
     shape: tuple[int, ...]
@@ -41,25 +40,23 @@ class Feature:
     state: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        widths = {len(entity) for entity in self.entities}
-        if len(widths) > 1 or widths == {0}:
-            raise UserError(f"entities: expected as many columns of each, found {shown(sorted(widths))}")
+        widths = sorted({len(entity) for entity in self.entities})
+        require(not widths or (len(widths) == 1 and widths[0]), "entities", "as many columns of each", widths)
         for name, columns, size in (
             ("entities", [column for entity in self.entities for column in entity], self.size),
             ("attributes", self.attributes, max(widths, default=0)),
             ("state", self.state, self.size),
         ):
-            if any(not 0 <= column < size for column in columns):
-                raise UserError(f"{name}: expected columns from 0 to {size - 1}, found {shown(columns)}")
+            require(all(0 <= column < size for column in columns), name, f"columns from 0 to {size - 1}", columns)
 
     @property
     def size(self) -> int:
-        """Numbers in one sample."""
+        """Number of values in a sample."""
         return math.prod(self.shape)
 
     @property
     def words(self) -> str:
-        """Type and shape of one sample, for messages."""
+        """Type and shape of a sample, for messages."""
         return f"{'uint8 images' if self.kind == 'image' else 'float32'} of shape {self.shape}"
 
     @classmethod
@@ -94,11 +91,10 @@ def check_features(observed: Observed, expected: Mapping[str, Feature]) -> None:
         UserError: naming the feature.
     """
     for name, feature in expected.items():
-        if name not in observed:
-            names = ", ".join(observed) or "none"
-            raise UserError(f"key 'observed': expected the feature {name!r}, {feature.words}, found {names}")
-        if not (given := Feature.of(observed[name])).fits(feature):
-            raise UserError(f"key 'observed/{name}': expected {feature.words} a sample, found {given.words}")
+        names = ", ".join(observed) or "none"
+        require(name in observed, "key 'observed'", f"the feature {name!r}, {feature.words}", names)
+        given = Feature.of(observed[name])
+        require(given.fits(feature), f"key 'observed/{name}'", f"{feature.words} a sample", given.words)
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,7 +130,7 @@ class InitialStates(Shown):
             UserError: if there are none.
         """
         if self.scenes is None:
-            raise UserError("key 'scenes': expected (sample, scene), what an environment is reset with, found none")
+            raise UserError("key 'scenes': expected (sample, scene), by which an environment is reset, found none")
         return self.scenes
 
 
@@ -145,7 +141,7 @@ def check_starts(starts: InitialStates | None) -> InitialStates:
         UserError: if they are missing.
     """
     if starts is None:
-        raise UserError("starts: expected initial states, found none; give what is observed where plans start")
+        raise UserError("starts: expected initial states, found none; give the observed features where plans start")
     return starts
 
 

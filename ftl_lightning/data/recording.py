@@ -1,4 +1,4 @@
-"""Record demonstrations by a wrapper of any Gymnasium environment."""
+"""Record demonstrations by a wrapper of any Gymnasium environment. Needs ``gymnasium``, which every environment brings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -6,15 +6,69 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.formats.episodes import Beside, Episode, contents
-from ftl_lightning.data.observations import feature_parts, states_part
-from ftl_lightning.services.errors import UserError
+from ftl_lightning.data.demonstrations import Demonstrations
+from ftl_lightning.data.formats.episodes import Episode, Metadata, from_episodes
+from ftl_lightning.services.errors import UserError, require, short
 
 Part = str | Callable[[Any], ArrayLike]
 """Part of an observation: a key, or a function of the observation."""
+PART = "observation"
+"""Key of the states in observations of several parts, as in Gymnasium's environments with goals."""
+
+
+def states_part(space: gymnasium.Space[Any], part: str = "") -> str:
+    """Key of the states in an observation.
+
+    Args:
+        space: observation space.
+        part: requested key; empty for :data:`PART` or the only vector.
+
+    Returns:
+        A key; empty if an observation is itself a vector.
+
+    Raises:
+        UserError: if the part is no vector or ambiguous.
+    """
+    if isinstance(space, gymnasium.spaces.Dict):
+        vectors = [key for key, box in space.spaces.items() if _is_vector(box)]
+        keys = ", ".join(vectors) or "none"
+        expected = f"observations with one vector or {PART!r}, or the key of the states, one of {keys}"
+    else:
+        vectors = [""] if _is_vector(space) else []
+        expected = "observations that are vectors (a Box of numbers)"
+    if not part and (PART in vectors or len(vectors) == 1):
+        return PART if PART in vectors else vectors[0]
+    if not part or part not in vectors:
+        raise UserError(f"expected {expected}, found {repr(part) if part else type(space).__name__}")
+    return part
+
+
+def feature_parts(
+    space: gymnasium.Space[Any], states: str, observed: Sequence[str] | None = None, *, images: bool = False
+) -> tuple[str, ...]:
+    """Keys of the observed features in an observation.
+
+    Args:
+        space: observation space.
+        states: key of the states, which is excluded unless requested.
+        observed: requested keys; ``None`` for all other vectors.
+        images: whether to include images (uint8).
+
+    Raises:
+        UserError: for a key without such a part.
+    """
+    parts = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {}
+    known = [key for key, box in parts.items() if _is_vector(box) or (images and isinstance(box, Box))]
+    for key in observed or ():
+        require(key in known, "observed", f"some of {', '.join(known) or 'none'}", f"{short(key)!r}")
+    return tuple(key for key in known if key != states) if observed is None else tuple(observed)
+
+
+def _is_vector(space: gymnasium.Space[Any]) -> bool:
+    return isinstance(space, Box) and space.dtype != np.uint8  # the type of images
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -61,30 +115,30 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._observed: dict[str, Part] = dict(observed if isinstance(observed, Mapping) else zip(observed, observed, strict=True))
         feature_parts(space, "", [part for part in self._observed.values() if isinstance(part, str)], images=True)
         names, units = (None if labels is None else tuple(labels) for labels in (state_names, state_units))
-        self._beside = Beside(domain, names, units, None, {"environment": str(env)})
+        self._extra = Metadata(domain, names, units, None, {"environment": str(env)})
         self._keep_unfinished = keep_unfinished
         self.concept = concept
         self.dropped = 0
         self._done: list[Episode] = []
-        self._running: list[tuple[NDArray[Any], dict[str, NDArray[Any]]]] = []
+        self._running: list[dict[str, NDArray[Any]]] = []
+        self._shapes: dict[str, tuple[int, ...]] = {}
         self._text = concept
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment and begin an episode. A running episode is kept or dropped."""
         observation, info = super().reset(seed=seed, options=options)
-        if (left := self._unfinished()) is not None:
-            self._done.append(left)
-        elif self._running:
-            self.dropped += 1
+        kept = self._unfinished()
+        self._done += kept
+        self.dropped += bool(self._running) and not kept
         self._text, self._running = self.concept, []
-        self._running.append(self._taken(observation))
+        self._record(observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment and record the observation."""
         observation, reward, terminated, truncated, info = super().step(action)
         if self._running:
-            self._running.append(self._taken(observation))
+            self._record(observation)
             if terminated or truncated:
                 self._done.append(self._episode())
                 self._running = []
@@ -96,46 +150,38 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         Raises:
             UserError: if there are none, the number of columns varies, or numbers are not finite.
         """
-        left = self._unfinished()
-        every = [*self._done, *([] if left is None else [left])]
-        if not every:
-            unfinished = self.dropped + bool(self._running)
-            advice = "step the environment to its end, or give keep_unfinished=True"
-            raise UserError(f"recorder: expected an episode that ended, found none, and {unfinished} that did not; {advice}")
-        return Demonstrations(**contents(every, self._beside))
+        episodes = [*self._done, *self._unfinished()]
+        advice = "step the environment to its end, or give keep_unfinished=True"
+        unfinished = f"none, and {self.dropped + bool(self._running)} that did not; {advice}"
+        require(episodes, "recorder", "an episode that ended", unfinished)
+        return Demonstrations(**from_episodes(episodes, self._extra))
 
     def save(self, path: str | Path) -> None:
-        """Write the demonstrations in any known format, see :meth:`ftl_lightning.data.container.Demonstrations.save`."""
+        """Write the demonstrations in any known format, see :meth:`ftl_lightning.data.demonstrations.Demonstrations.save`."""
         self.demonstrations().save(path)
 
-    def _taken(self, observation: Any) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
-        state = _numbers(_of(observation, self._state)).reshape(-1)
-        features = {name: _numbers(_of(observation, part)) for name, part in self._observed.items()}
-        if self._running or self._done:
-            # A function may return any shape; padding would fail later without naming it.
-            first, before = self._running[0] if self._running else (self._done[0].states[0], _first(self._done[0]))
-            for name, now, then in [("state", state, first), *((key, features[key], before[key]) for key in features)]:
-                if now.shape != then.shape:
-                    raise UserError(f"{name}: expected shape {then.shape}, as in the first observation, found {now.shape}")
-        return state, features
+    def _record(self, observation: Any) -> None:
+        values = {"state": _numbers(_part_of(observation, self._state)).reshape(-1)}
+        values |= {f"observed {name}": _numbers(_part_of(observation, part)) for name, part in self._observed.items()}
+        self._shapes = self._shapes or {name: array.shape for name, array in values.items()}
+        for name, array in values.items():  # a function may return any shape
+            shape = self._shapes[name]
+            require(array.shape == shape, name, f"shape {shape}, as in the first observation", str(array.shape))
+        self._running.append(values)
 
     def _episode(self) -> Episode:
-        states = np.stack([state for state, _ in self._running])
-        observed = {name: np.stack([features[name] for _, features in self._running]) for name in self._observed}
-        return Episode(states, observed, self._text)
+        states, *features = (np.stack([values[name] for values in self._running]) for name in self._shapes)
+        return Episode(states, dict(zip(self._observed, features, strict=True)), self._text)
 
-    def _unfinished(self) -> Episode | None:
-        return self._episode() if self._keep_unfinished and len(self._running) > 1 else None
+    def _unfinished(self) -> list[Episode]:
+        """The running episode, if it is to be kept."""
+        return [self._episode()] if self._keep_unfinished and len(self._running) > 1 else []
 
 
-def _of(observation: Any, part: Part) -> Any:
+def _part_of(observation: Any, part: Part) -> Any:
     if callable(part):
         return part(observation)
     return observation[part] if part else observation
-
-
-def _first(episode: Episode) -> dict[str, NDArray[Any]]:
-    return {name: values[0] for name, values in episode.observed.items()}
 
 
 def _numbers(values: Any) -> NDArray[Any]:

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import Distance
 from ftl_lightning.data.features import Feature, InitialStates, Observed
 from ftl_lightning.domains import line_plots

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, padded
+from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.domains.domain import Plans, Split
 from ftl_lightning.services.seeding import VALIDATION_SEED
 

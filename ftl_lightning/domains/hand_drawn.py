@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
 from ftl_lightning.domains.recorder import Numbers, Recorder, Scene
 from ftl_lightning.domains.vector_film import VectorFilm, still

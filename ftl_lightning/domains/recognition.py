@@ -21,7 +21,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.seeding import generator
 from ftl_lightning.services.spectrum import cosines
 

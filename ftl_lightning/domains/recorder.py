@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.vector_film import VectorFilm
 from ftl_lightning.services.errors import UserError, shown

@@ -20,7 +20,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import Distance, scaled_distance
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.tasks import EvaluationTask

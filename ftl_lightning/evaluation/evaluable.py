@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, Protocol, TypeGuard
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.igm.composition import Composition

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, check_starts
 from ftl_lightning.domains.domain import ClosedLoop, Domain
 from ftl_lightning.domains.rollout import Rollout

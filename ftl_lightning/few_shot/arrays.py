@@ -8,10 +8,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ftl_lightning.data.check import mended
-from ftl_lightning.data.container import Demonstrations, padded
+from ftl_lightning.data.check import Finding, mended
+from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.features import Feature, InitialStates
-from ftl_lightning.data.finding import Finding
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.services.errors import UserError, short, shown

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, Observed, take
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.igm.composition import Composition

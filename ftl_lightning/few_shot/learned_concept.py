@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.few_shot.shared_concept import write_folder
 from ftl_lightning.few_shot.tuned import ModelSettings

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from numpy.typing import ArrayLike
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.domains.domain import Domain, closed_loop_of
 from ftl_lightning.evaluation.closed_loop import reset

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.evaluation.animation import captioned, gif

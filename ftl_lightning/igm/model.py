@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Origin

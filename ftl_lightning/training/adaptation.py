@@ -9,7 +9,7 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.from_file import OWN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask

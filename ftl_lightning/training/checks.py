@@ -8,10 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.check import check
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.check import Finding, check
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import moved
-from ftl_lightning.data.finding import Finding
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, relative_losses

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import READ, Feature, Observed, check_features, moved
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept, Origin

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import check_features
 from ftl_lightning.domains.domain import Domain, Recoveries
 from ftl_lightning.domains.from_file import OWN, domain_from_file, read_demonstrations, read_own
@@ -250,7 +250,7 @@ class OwnData(PretrainingData):
 
     Args:
         demonstrations: the file (``.npz`` or safetensors), see
-            :meth:`ftl_lightning.data.container.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
+            :meth:`ftl_lightning.data.demonstrations.Demonstrations.load`; or the folder of a LeRobot data set, or the name of
             an installed Minari data set.
         metrics: metrics of plans, number by name, see :mod:`ftl_lightning.domains.from_file`; empty for none.
         validation_share: share of each concept's demonstrations that is held out, at least one.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.services import trust

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.services.errors import UserError

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import OWN, own_domain
 from ftl_lightning.domains.registry import domain_of_file, is_known, load_domain

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from ftl_lightning.apps.testing.strokes import NEW, TRAINING, strokes
-from ftl_lightning.data.check import check, check_each, mended
-from ftl_lightning.data.container import Demonstrations, concatenate
-from ftl_lightning.data.mended_file import read_mended
+from ftl_lightning.data.check import check, mended, read_mended
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from tests.conftest import ROOT
 
@@ -142,12 +141,3 @@ def test_a_file_with_missing_numbers_is_read_to_say_so() -> None:
     found, (told,) = read_mended("five.npz")
     assert found.concepts == ("five",) * 5
     assert told.rows == (2,)
-
-
-def test_of_several_concepts_rows_are_those_of_the_file() -> None:
-    frozen = strokes("wave", 3, 0)
-    frozen[1] = frozen[1, :1]
-    both = concatenate([demonstrations(strokes("heart", 3, 0)), demonstrations(frozen, "wave")])
-    found = check_each(both)
-    assert found["heart"] == ()
-    assert [one.rows for one in found["wave"]] == [(4,)]

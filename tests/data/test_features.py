@@ -64,8 +64,8 @@ def test_initial_states_are_counted_by_what_there_is_and_are_taken_and_joined() 
 
 def test_scenes_and_initial_states_that_are_missing_are_told_where_nothing_goes_without() -> None:
     starts = InitialStates(observed(2))
-    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), what an environment is reset with, found none"):
+    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), by which an environment is reset, found none"):
         starts.require_scenes()
     assert check_starts(starts) is starts
-    with pytest.raises(UserError, match="starts: expected initial states, found none; give what is observed where plans start"):
+    with pytest.raises(UserError, match="expected initial states, found none; give the observed features where plans start"):
         check_starts(None)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.from_file import read_demonstrations, read_own
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError
@@ -22,7 +22,7 @@ from minari.data_collector import EpisodeBuffer  # noqa: E402
 
 from ftl_lightning.data.formats.minari import read_minari, write_minari  # noqa: E402
 from tests.conftest import ROOT, succeed  # noqa: E402
-from tests.data.recorded import everything, expect_same  # noqa: E402
+from tests.data.samples import everything, expect_same  # noqa: E402
 
 VECTOR = gymnasium.spaces.Box(-1, 1, (3,), np.float64)
 IMAGE = gymnasium.spaces.Box(0, 255, (4, 4, 3), np.uint8)

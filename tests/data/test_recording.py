@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT, succeed
 

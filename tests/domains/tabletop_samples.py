@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.tabletop.interface import IMAGE, PLACES, POSE, STATE_NAMES, STATE_UNITS
 from ftl_lightning.domains.tabletop.source import Expert
 from ftl_lightning.services.seeding import generator, task_key

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.agent.scenes import OBSERVED
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.methods.ftl_igm.model import build_denoiser

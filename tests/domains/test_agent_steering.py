@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.agent.domain import DOMAIN
 from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.foresight import VETOES, Foresight

@@ -6,7 +6,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.rendering import film, render
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.driving.traffic import TRAFFIC

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Feature
 from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
 from ftl_lightning.evaluation.evaluator import Evaluator

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.mocap import DOMAIN, skeleton
 from ftl_lightning.domains.mocap.measures import MEASURES, bone_error

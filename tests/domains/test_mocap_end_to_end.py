@@ -9,7 +9,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ftl_lightning import FewShot
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.measures import bone_error
 from ftl_lightning.domains.mocap.skeleton import GROUPS, HORIZON
 from ftl_lightning.domains.mocap.source import POSE, Recorded

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap import skeleton
 from ftl_lightning.domains.mocap.export import HIPS, TREE, bvh
 from ftl_lightning.domains.mocap.recordings import read_folder

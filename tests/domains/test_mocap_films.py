@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.recordings import FILE
 from ftl_lightning.domains.mocap.skeleton import HORIZON
 from ftl_lightning.few_shot.learner import FewShot

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.bvh_file import read_motion
 from ftl_lightning.domains.mocap.domain import DOMAIN
 from ftl_lightning.domains.mocap.skeleton import FPS, HORIZON

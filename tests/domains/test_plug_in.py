@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Concepts, Domain, Plans
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.registry import domain_names, load_domain, recorded_name

@@ -9,7 +9,7 @@ import torch
 import yaml
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.from_file import METRICS
 from ftl_lightning.services.errors import UserError
 from tests.conftest import ROOT

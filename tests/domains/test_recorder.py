@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ftl_lightning.apps.testing.strokes import recognised, strokes
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, TRAINING_RELATIONS, holds, overlap

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tabletop import DOMAIN, WIDE, experts, source, tasks

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.tabletop import DOMAIN, policies, source
 from ftl_lightning.domains.tabletop.environment import TableTopEnvironment
@@ -157,7 +157,7 @@ def test_scenes_of_a_file_that_cannot_be_built(scene: np.ndarray, expected: str)
 
 
 def test_demonstrations_without_scenes_are_not_executed() -> None:
-    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), what an environment is reset with, found none"):
+    with pytest.raises(UserError, match=r"key 'scenes': expected \(sample, scene\), by which an environment is reset, found none"):
         roll_out(LOOP, made(scenes=None).initial_states, still)
 
 

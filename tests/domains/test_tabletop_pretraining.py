@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.domains.tabletop import source
 from ftl_lightning.domains.tabletop.interface import IMAGE, NAME, PLACES, POSE

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance, scaled_distance
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.domains.from_file import own_domain, warped_distances

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
 from ftl_lightning.domains.registry import domain_names, load_domain
 from ftl_lightning.domains.vector_film import Shape, VectorFilm, still

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.apps.testing.strokes import strokes
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature
 from ftl_lightning.data.normalization import Normalization
 from ftl_lightning.domains.from_file import OWN, own_domain

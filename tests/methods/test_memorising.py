@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import ModelSettings

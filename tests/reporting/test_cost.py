@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.inversion import invert
 from ftl_lightning.igm.settings import InversionSettings
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel

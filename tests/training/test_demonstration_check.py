@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ftl_lightning.apps.testing.strokes import strokes
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.forms.leave_one_out import LeaveOneOut, leave_one_out, odd_one, relative_losses, subsets

@@ -8,7 +8,7 @@ import torch
 from matplotlib.colors import to_hex
 
 from ftl_lightning.apps.testing.strokes import strokes
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.object_rearrangement.generation import random_scenes
 from ftl_lightning.domains.object_rearrangement.relations import columns
 from ftl_lightning.few_shot.learner import FewShot

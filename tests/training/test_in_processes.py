@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ftl_lightning.apps.lightning_cli import build
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.results import read_rows
 from ftl_lightning.igm.concept import Concept, file_name

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import WITHOUT_WEIGHT, EvaluationTask
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.forms.stopping import IDLE, ROUND, Stopping

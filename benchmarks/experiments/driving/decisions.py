@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from ftl_lightning import FewShot
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.driving import expert

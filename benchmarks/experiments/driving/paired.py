@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning import FewShot
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving.domain import DOMAIN
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.methods.ftl_igm.model import GenerativeModel

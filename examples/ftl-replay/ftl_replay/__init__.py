@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ftl_lightning.apps.benchmark.suite import DEMONSTRATIONS, TRAINING, VALIDATION, BenchmarkSuite
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.tensor_file import file_hash, write_text
 from ftl_lightning.version import __version__

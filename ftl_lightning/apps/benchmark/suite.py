@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Domain, Recoveries, Source
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import UserError, about, short

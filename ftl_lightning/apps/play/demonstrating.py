@@ -8,7 +8,7 @@ from typing import Any
 from ftl_lightning.apps.play import requests
 from ftl_lightning.apps.play.films import Json, film, films
 from ftl_lightning.data.check import check
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Source
 from ftl_lightning.domains.recorder import Recorder, Scene, check_path
 from ftl_lightning.few_shot.learner import FewShot

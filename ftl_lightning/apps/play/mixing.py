@@ -11,7 +11,7 @@ import torch
 from ftl_lightning.apps.play.films import Json, episode_films, films
 from ftl_lightning.apps.play.requests import Sample
 from ftl_lightning.apps.play.same import Sampled
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.few_shot.learner import FewShot

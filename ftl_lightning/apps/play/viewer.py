@@ -6,9 +6,8 @@ from typing import Any
 
 from ftl_lightning.apps.play.films import Json, plan_film
 from ftl_lightning.apps.play.mixing import sampling_of, starts_of
-from ftl_lightning.data.check import check
-from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.mended_file import read_mended
+from ftl_lightning.data.check import check, read_mended
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Domain, Plans, Show, line_drawings
 from ftl_lightning.domains.from_file import OWN, read_own
 from ftl_lightning.domains.registry import domain_names, load_domain

@@ -13,7 +13,7 @@ from ftl_lightning.apps.play.demonstrating import Demonstrating, as_npz
 from ftl_lightning.apps.play.films import Json, films
 from ftl_lightning.apps.play.mixing import Mixture, goal_of, judge_of, judged, samples, sampling_of, starts_of
 from ftl_lightning.apps.play.same import VARIABLES, Learned, Part, Sampled, command, python
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.few_shot.learned_concept import LearnedConcept, Learning
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.few_shot.tuned import OWN

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.domain import Domain
 from ftl_lightning.services.errors import UserError, short, shown
 from ftl_lightning.services.schema import read_json

@@ -1,20 +1,16 @@
-"""Demonstrations as episodes, the form of other programs: without padding, each with its length.
-
-Attributes that episodes lack are stored beside them, see :class:`Beside`.
-"""
+"""Demonstrations as episodes, the form of other programs: without padding, each with its length."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Self
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, padded
-from ftl_lightning.data.formats.file_format import Contents
-from ftl_lightning.services.errors import UserError, short
+from ftl_lightning.data.demonstrations import Contents, Demonstrations, padded
+from ftl_lightning.services.errors import require, short
 from ftl_lightning.services.limits import VARIABLE, most_bytes
 
 
@@ -36,8 +32,8 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Beside:
-    """Attributes that formats of other programs lack, stored beside the episodes as JSON.
+class Metadata:
+    """Attributes of demonstrations that formats of other programs lack, stored beside the episodes as JSON.
 
     Attributes:
         domain: name of the domain; empty if unknown.
@@ -53,25 +49,14 @@ class Beside:
     per_step: tuple[str, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def of(self, observed: Sequence[str], own_states: bool) -> Self:
-        """Restrict the attributes to the features and states that are read.
 
-        Args:
-            observed: names of features that are read.
-            own_states: whether the states are those that were written, to which names and units belong.
-        """
-        per_step = None if self.per_step is None else tuple(name for name in self.per_step if name in observed)
-        names, units = (self.state_names, self.state_units) if own_states else (None, None)
-        return replace(self, state_names=names, state_units=units, per_step=per_step)
-
-
-def beside(demonstrations: Demonstrations) -> dict[str, Any]:
-    """Attributes of :class:`Beside` as JSON can hold them."""
+def metadata(demonstrations: Demonstrations) -> dict[str, Any]:
+    """Attributes of :class:`Metadata` as JSON can hold them."""
     names = ("domain", "state_names", "state_units", "per_step", "provenance")
-    return asdict(Beside(**{name: getattr(demonstrations, name) for name in names}))
+    return asdict(Metadata(**{name: getattr(demonstrations, name) for name in names}))
 
 
-def episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
+def to_episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
     """Yield each demonstration without padding; features known only at the start are repeated at each time."""
     scenes = demonstrations.scenes
     for row, (length, text) in enumerate(zip(demonstrations.lengths.tolist(), demonstrations.concepts, strict=True)):
@@ -87,12 +72,12 @@ def episodes(demonstrations: Demonstrations) -> Iterator[Episode]:
         )
 
 
-def contents(found: Sequence[Episode], told: Beside) -> Contents:
-    """Invert :func:`episodes`, padding to the longest with the last state.
+def from_episodes(episodes: Sequence[Episode], given: Metadata) -> Contents:
+    """Invert :func:`to_episodes`, padding to the longest with the last state.
 
     Args:
-        found: at least one episode, all with the same columns and observed features.
-        told: attributes beside the episodes.
+        episodes: at least one, all with the same columns and observed features.
+        given: attributes stored beside the episodes; features that were not read are ignored.
 
     Returns:
         Attributes of demonstrations, not validated yet.
@@ -100,57 +85,57 @@ def contents(found: Sequence[Episode], told: Beside) -> Contents:
     Raises:
         UserError: without episodes, or if padding needs far more memory than honest data do.
     """
-    if not found:
-        raise UserError("expected at least one episode, found none")
-    longest = max(len(episode.states) for episode in found)
-    step = sum(values[0].nbytes for values in (found[0].states, *found[0].observed.values()))
-    if (size := longest * len(found) * step) > (most := most_bytes()):
-        message = f"{len(found)} episodes, the longest of {longest} steps, which are {size} bytes padded to it"
-        raise UserError(f"expected at most {most} bytes, found {message}; leave out the longest, or set {VARIABLE} to more")
-    states, lengths = padded([_tensor(episode.states) for episode in found])
-    per_step = tuple(found[0].observed) if told.per_step is None else told.per_step
+    require(episodes, "episodes", "at least one", "none")
+    first, longest = episodes[0], max(len(episode.states) for episode in episodes)
+    size = longest * len(episodes) * sum(values[0].nbytes for values in (first.states, *first.observed.values()))
+    message = f"{size}, {len(episodes)} episodes padded to {longest} steps; leave out the longest, or set {VARIABLE} to more"
+    require(size <= (most := most_bytes()), "episodes", f"at most {most} bytes", message)
+    states, lengths = padded([_tensor(episode.states) for episode in episodes])
     columns = states.shape[2]
+    per_step = tuple(name for name in (first.observed if given.per_step is None else given.per_step) if name in first.observed)
+    scenes = [_tensor(episode.scene) for episode in episodes if episode.scene is not None]
     return {
         "states": states,
         "lengths": lengths,
-        "domain": told.domain,
-        "state_names": tuple(map(str, range(columns))) if told.state_names is None else told.state_names,
-        "state_units": ("",) * columns if told.state_units is None else told.state_units,
-        "concepts": tuple(episode.concept for episode in found),
-        "observed": {name: _observed(found, name, name in per_step) for name in found[0].observed},
+        "domain": given.domain,
+        "state_names": tuple(map(str, range(columns))) if given.state_names is None else given.state_names,
+        "state_units": ("",) * columns if given.state_units is None else given.state_units,
+        "concepts": tuple(episode.concept for episode in episodes),
+        "observed": {
+            name: padded([_tensor(episode.observed[name]) for episode in episodes])[0]
+            if name in per_step
+            else torch.stack([_tensor(episode.observed[name][0]) for episode in episodes])
+            for name in first.observed
+        },
         "per_step": per_step,
-        "scenes": _scenes(found),
-        "provenance": told.provenance,
+        "scenes": torch.stack(scenes) if len(scenes) == len(episodes) else None,
+        "provenance": given.provenance,
     }
 
 
-def check_names(demonstrations: Demonstrations, taken: str, where: str) -> None:
+def check_names(demonstrations: Demonstrations, reserved: str, place: str) -> None:
     """Refuse names of observed features that another format cannot hold.
 
     Args:
         demonstrations: demonstrations to write.
-        taken: name of the states in the format.
-        where: target, for messages.
+        reserved: name of the states in the format.
+        place: target, for messages.
 
     Raises:
         UserError: naming the feature.
     """
+    expected = f"the name of an observed feature other than {reserved!r} and without '/'"
     for name in demonstrations.observed:
-        if name == taken or "/" in name or not name.isprintable() or not name.strip("."):
-            expected = f"the name of an observed feature other than {taken!r} and without '/'"
-            raise UserError(f"{where}: expected {expected}, found {short(name)!r}; rename it")
+        allowed = name != reserved and "/" not in name and name.isprintable() and name.strip(".")
+        require(allowed, place, expected, f"{short(name)!r}; rename it")
+
+
+def measured(values: Any) -> NDArray[Any]:
+    """Convert measurements to float32; images stay uint8."""
+    array = np.asarray(values)
+    with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
+        return array if array.dtype == np.uint8 else array.astype(np.float32)
 
 
 def _tensor(values: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.array(values))  # a copy: arrays from files are often read-only
-
-
-def _observed(recorded: Sequence[Episode], name: str, per_step: bool) -> Tensor:
-    if per_step:
-        return padded([_tensor(episode.observed[name]) for episode in recorded])[0]
-    return torch.stack([_tensor(episode.observed[name][0]) for episode in recorded])
-
-
-def _scenes(recorded: Sequence[Episode]) -> Tensor | None:
-    scenes = [_tensor(episode.scene) for episode in recorded if episode.scene is not None]
-    return torch.stack(scenes) if len(scenes) == len(recorded) else None

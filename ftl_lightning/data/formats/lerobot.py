@@ -1,4 +1,4 @@
-"""Demonstrations from LeRobot data sets (LeRobotDataset v3.0, v2.1 and v2.0). Needs the extra ``lerobot``.
+"""LeRobot data sets: LeRobotDataset v3.0, v2.1 and v2.0 are read, v3.0 is written. Needs the extra ``lerobot``.
 
 A data set is a folder. ``meta/info.json`` describes the features of a frame, ``data/`` holds the frames of all episodes as Parquet
 files, and ``meta`` holds tasks and episodes. An episode is a demonstration. Its states are ``observation.state``, other vectors
@@ -9,6 +9,9 @@ The file ``meta/ftl_lightning.json``, ignored by other programs, holds what the 
 of features that are known only at the start, and provenance.
 """
 
+import itertools
+import json
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,35 +20,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.formats.episodes import Beside, Episode, contents
-from ftl_lightning.data.formats.file_format import Contents
+from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
 from ftl_lightning.services.data_names import INFO
-from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.limits import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked, read_text
+from ftl_lightning.services.errors import UserError, about, require, short, shown
+from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.limits import read_text
 from ftl_lightning.services.printing import line, say
 from ftl_lightning.services.schema import check_type, from_mapping, parse_json, read_json
-from ftl_lightning.services.tensor_file import visible
+from ftl_lightning.services.targets import check_new_folder
 
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+"""Versions that are read; the last is written."""
 STATE = "observation.state"
 """Feature that holds the states."""
 OBSERVED = "observation."
 """Prefix of observed features."""
 ACTION, SCENE = "action", "scene"
-VERSIONS = ("v2.0", "v2.1", "v3.0")
-"""Versions that are read; the last is written."""
-BESIDE = Path("meta") / "ftl_lightning.json"
-"""File of attributes that only :func:`~ftl_lightning.data.formats.lerobot_writing.write_lerobot` knows."""
 EPISODE, TASK, LENGTH = "episode_index", "task_index", "length"
-_DEFAULT = {"timestamp": "float32", "frame_index": "int64", EPISODE: "int64", "index": "int64", TASK: "int64"}
-"""Features that LeRobot adds to every frame, with their types."""
-_DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError)
-"""Exceptions of pyarrow for damaged or foreign files."""
+METADATA = Path("meta") / "ftl_lightning.json"
+"""File of :class:`~ftl_lightning.data.formats.episodes.Metadata`, if this package has written the data set."""
+_ADDED = ("timestamp", "frame_index", EPISODE, "index", TASK)
+"""Features that LeRobot adds to every frame."""
+_DATA = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_CHUNK, _MEGABYTES = 1000, 100
+"""Files in a folder, and megabytes of a file, as in LeRobot."""
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 @dataclass(frozen=True)
@@ -59,21 +61,6 @@ class _Feature:
     @property
     def numeric(self) -> bool:
         return self.dtype == "bool" or self.dtype.startswith(("float", "int", "uint"))
-
-    @property
-    def size(self) -> int:
-        return prod(self.shape)
-
-
-@dataclass(frozen=True)
-class _Info:
-    version: str
-    episodes: int
-    features: Mapping[str, _Feature]
-
-    @property
-    def old(self) -> bool:
-        return not self.version.startswith("v3")
 
 
 def read_lerobot(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Demonstrations:
@@ -96,97 +83,88 @@ def read_lerobot(folder: str | Path, part: str = "", observed: Sequence[str] | N
 
 
 def read_contents(folder: str | Path, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """Read the attributes of demonstrations without validating them. Arguments as in :func:`read_lerobot`.
+    """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_lerobot`."""
+    check_extra("lerobot", f"{folder}: a LeRobot data set")
+    from ftl_lightning.data.formats.parquet import read_columns
 
-    Raises:
-        UserError: naming the file, if it is foreign, damaged or has other parts.
-    """
     root = Path(folder)
-    info = _info(root)
-    written = (root / BESIDE).is_file()
-    extra = Beside()
-    if written:
-        content = read_json(root / BESIDE)
-        with about(root / BESIDE):
-            extra = from_mapping(Beside, content, "")
+    version, episodes, features = _info(root)
     with about(root):
-        part = _part(info.features, part)
-        names = _observed(info.features, part, observed)
-    if observed is not None or part != STATE:
-        extra = extra.of([name.removeprefix(OBSERVED) for name in names], part == STATE)
-    if left := [key for key, feature in info.features.items() if feature.dtype in ("image", "video")]:
-        say(line(f"{root}: left out {short(', '.join(left), 150)}: images and videos are not read"), error=True)
-    scene = [SCENE] if written and SCENE in info.features else []
-    wanted = {key: info.features[key] for key in (part, *names, *scene)}
-    frames = _frames(root, wanted)
-    texts = _tasks(root, info)
+        part = _part(features, part)
+        names = _observed(features, part, observed)
+    written = (root / METADATA).is_file()
+    given = Metadata()
+    if written:
+        content = read_json(root / METADATA)
+        with about(root / METADATA):
+            given = from_mapping(Metadata, content, "")
+    if part != STATE:  # names and units are those of the states that were written
+        given = replace(given, state_names=None, state_units=None)
+    given = replace(given, state_names=given.state_names or features[part].names)
+    if images := short(", ".join(key for key, feature in features.items() if feature.dtype in ("image", "video")), 150):
+        say(line(f"{root}: left out {images}: images and videos are not read"), error=True)
+    scene = [SCENE] if written and SCENE in features else []
+    shapes = {key: features[key].shape for key in (part, *names, *scene)}
+    frames = read_columns(root, "data/*/*.parquet", {**shapes, EPISODE: (1,), TASK: (1,)}, (EPISODE, TASK))
+    order = np.argsort(frames[EPISODE], kind="stable")  # copied files may be in another order
+    frames = {key: values[order] for key, values in frames.items()}
+    lengths, texts = _lengths_and_texts(root, version)
+    require(episodes == len(lengths), f"{root / INFO}: key 'total_episodes'", f"{len(lengths)}, as in meta", str(episodes))
     read = []
-    for start, stop in _ranges(root, info, frames[EPISODE]):
-        if (task := int(frames[TASK][start])) not in texts:
-            raise UserError(f"{root}: key {TASK!r}: expected one of the tasks in meta, found {task}")
+    for start, stop in _ranges(root, lengths, frames[EPISODE]):
+        task = int(frames[TASK][start])
+        require(task in texts, f"{root}: key {TASK!r}", "one of the tasks in meta", str(task))
         read.append(
             Episode(
                 frames[part][start:stop].reshape(stop - start, -1).astype(np.float32),
-                {name.removeprefix(OBSERVED): _measured(frames[name][start:stop]) for name in names},
+                {name.removeprefix(OBSERVED): measured(frames[name][start:stop]) for name in names},
                 texts[task],
-                _measured(frames[SCENE][start]) if scene else None,
+                measured(frames[SCENE][start]) if scene else None,
             )
         )
-    if extra.state_names is None:
-        extra = replace(extra, state_names=info.features[part].names)
     with about(root):
-        attributes = contents(read, extra)
-    return {**attributes, "provenance": attributes["provenance"] or {"lerobot": root.resolve().name}}
+        contents = from_episodes(read, given)
+    return {**contents, "provenance": contents["provenance"] or {"lerobot": root.resolve().name}}
 
 
-def _measured(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert measurements to float32; images stay uint8."""
-    with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
-        return values if values.dtype == np.uint8 else values.astype(np.float32)
-
-
-def _info(root: Path) -> _Info:
-    path = root / INFO
-    content = read_json(path, "a LeRobot info file")
-    with about(path):
+def _info(root: Path) -> tuple[str, int, dict[str, _Feature]]:
+    """Version, number of episodes, and features by name."""
+    content = read_json(root / INFO, "a LeRobot info file")
+    with about(root / INFO):
         content = check_type(content, Mapping[str, Any], "")
         version = check_type(content.get("codebase_version"), str, "codebase_version")
-        if version not in VERSIONS:
-            advice = "convert it with LeRobot's own tools"
-            raise UserError(f"key 'codebase_version': expected {' or '.join(VERSIONS)}, found {shown(version)}; {advice}")
+        advice = f"{shown(version)}; convert it with LeRobot's own tools"
+        require(version in VERSIONS, "key 'codebase_version'", " or ".join(VERSIONS), advice)
         data = check_type(content.get("data_path"), str, "data_path")
-        if not data.startswith("data/") or ".." in Path(data).parts:
-            raise UserError(f"key 'data_path': expected files in the folder 'data', found {shown(data)}")
-        features = {
-            key: _feature(key, value) for key, value in check_type(content.get("features"), Mapping[str, Any], "features").items()
-        }
-        return _Info(version, check_type(content.get("total_episodes"), int, "total_episodes"), features)
+        inside = data.startswith("data/") and ".." not in Path(data).parts
+        require(inside, "key 'data_path'", "files in the folder 'data'", shown(data))
+        features = check_type(content.get("features"), Mapping[str, Mapping[str, Any]], "features")
+        episodes = check_type(content.get("total_episodes"), int, "total_episodes")
+        return version, episodes, {key: _feature(f"features.{short(key)}", fields) for key, fields in features.items()}
 
 
-def _feature(key: str, content: object) -> _Feature:
-    fields = check_type(content, Mapping[str, Any], f"features.{short(key)}")
-    dtype = check_type(fields.get("dtype"), str, f"features.{short(key)}.dtype")
-    # Features that are not read, such as images, may have any shape.
-    if not (feature := _Feature(dtype)).numeric:
+def _feature(key: str, fields: Mapping[str, Any]) -> _Feature:
+    feature = _Feature(check_type(fields.get("dtype"), str, f"{key}.dtype"))
+    if not feature.numeric:  # not read, such as images; any shape is allowed
         return feature
-    shape = check_type(fields.get("shape"), tuple[int, ...], f"features.{short(key)}.shape")
+    shape: tuple[int, ...] = check_type(fields.get("shape"), tuple[int, ...], f"{key}.shape")
     names = fields.get("names")
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as in older data sets
         (names,) = names.values()
-    named = isinstance(names, list) and len(names) == prod(shape) and all(isinstance(name, str) for name in names)
-    return _Feature(dtype, shape, tuple(names) if named else None)
+    if not isinstance(names, list) or len(names) != prod(shape) or not all(isinstance(name, str) for name in names):
+        names = None
+    return _Feature(feature.dtype, shape, None if names is None else tuple(names))
 
 
 def _part(features: Mapping[str, _Feature], part: str) -> str:
     """Feature that holds the states."""
-    vectors = [key for key, feature in features.items() if feature.numeric and feature.dtype != "uint8" and key not in _DEFAULT]
+    vectors = [key for key, feature in features.items() if feature.numeric and feature.dtype != "uint8" and key not in _ADDED]
     observed = [key for key in vectors if key.startswith(OBSERVED)]
     if not part and (STATE in vectors or len(observed) == 1):
         return STATE if STATE in vectors else observed[0]
-    if not part or part not in vectors:
-        known = ", ".join(vectors) or "none"
-        expected = f"the feature {STATE!r}, a single observed vector, or read_lerobot(folder, part) with one of {short(known, 120)}"
-        raise UserError(f"features: expected {expected}, found {repr(short(part)) if part else 'none that is clear'}")
+    known = short(", ".join(vectors), 120) or "none"
+    expected = f"the feature {STATE!r}, a single observed vector, or read_lerobot(folder, part) with one of {known}"
+    require(part in vectors, "features", expected, repr(short(part)) if part else "none that is clear")
     return part
 
 
@@ -195,167 +173,181 @@ def _observed(features: Mapping[str, _Feature], part: str, observed: Sequence[st
     known = [key for key, feature in features.items() if key.startswith(OBSERVED) and feature.numeric]
     if observed is None:
         return [key for key in known if key != part]
+    available = short(", ".join(key.removeprefix(OBSERVED) for key in known), 120) or "none"
     for name in observed:
-        if OBSERVED + name not in known:
-            available = short(", ".join(key.removeprefix(OBSERVED) for key in known), 120) or "none"
-            raise UserError(f"observed: expected some of {available}, found {short(name)!r}")
+        require(OBSERVED + name in known, "observed", f"some of {available}", f"{short(name)!r}")
     return [OBSERVED + name for name in observed]
 
 
-def _frames(root: Path, wanted: Mapping[str, _Feature]) -> dict[str, NDArray[Any]]:
-    """Columns of all frames by name ``(frame, *shape)``, ordered by episode."""
-    columns = {**wanted, EPISODE: _Feature("int64"), TASK: _Feature("int64")}
-    frames = _columns(root, "data/*/*.parquet", columns)
-    order = np.argsort(frames[EPISODE], kind="stable")  # copied files may be in another order
-    return frames if (np.diff(order) == 1).all() else {key: values[order] for key, values in frames.items()}
+def _ranges(root: Path, lengths: Mapping[int, int], index: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First frame and end of each episode, of sorted frames; their numbers must be those in meta."""
+    numbers, starts, counts = (part.tolist() for part in np.unique(index, return_index=True, return_counts=True))
+    actual = dict(zip(numbers, counts, strict=True))
+    for number in {**lengths, **actual}:
+        expected, count = lengths.get(number, 0), actual.get(number, 0)
+        message = f"{count} in data; take another, whole copy"
+        require(expected == count, f"{root}: episode {number}", f"{expected} frames, as in meta", message)
+    return [(start, start + count) for start, count in zip(starts, counts, strict=True)]
 
 
-def _ranges(root: Path, info: _Info, index: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First frame and end of each episode, checked against meta."""
-    numbers, starts, counts = np.unique(index, return_index=True, return_counts=True)
-    counted = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-    lengths = _lengths(root, info)
-    if info.episodes != len(lengths):
-        raise UserError(f"{root / INFO}: key 'total_episodes': expected {len(lengths)}, as in meta, found {info.episodes}")
-    for number in {**lengths, **counted}:
-        if lengths.get(number) != counted.get(number):
-            message = f"{lengths.get(number, 0)} frames, as in meta, found {counted.get(number, 0)} in data"
-            raise UserError(f"{root}: episode {number}: expected {message}; take another, whole copy")
-    return [(start, start + count) for start, count in zip(starts.tolist(), counts.tolist(), strict=True)]
+def _lengths_and_texts(root: Path, version: str) -> tuple[dict[int, int], dict[int, str]]:
+    """Lengths of episodes and texts of tasks, by number."""
+    if not version.startswith("v3"):
+        lengths = _by_number(root / "meta" / "episodes.jsonl", EPISODE, LENGTH, int)
+        return lengths, _by_number(root / "meta" / "tasks.jsonl", TASK, "task", str)
+    from ftl_lightning.data.formats.parquet import read_columns, read_texts
+
+    columns = read_columns(root, "meta/episodes/*/*.parquet", {EPISODE: (1,), LENGTH: (1,)}, (EPISODE, LENGTH))
+    lengths = dict(zip(columns[EPISODE].tolist(), columns[LENGTH].tolist(), strict=True))
+    return lengths, read_texts(root / "meta" / "tasks.parquet", TASK, "task")
 
 
-def _lengths(root: Path, info: _Info) -> dict[int, int]:
-    if not info.old:
-        columns = _columns(root, "meta/episodes/*/*.parquet", {EPISODE: _Feature("int64"), LENGTH: _Feature("int64")})
-        return dict(zip(columns[EPISODE].tolist(), columns[LENGTH].tolist(), strict=True))
+def _by_number(path: Path, number: str, value: str, kind: type) -> dict[int, Any]:
+    """Values by number, from a file with a JSON object in each line."""
+    values = {}
+    for index, text in enumerate(read_text(path, "LeRobot").splitlines()):
+        if text.strip():
+            with about(path):
+                row = check_type(parse_json(text), Mapping[str, Any], f"line {index + 1}")
+                values[check_type(row.get(number), int, number)] = check_type(row.get(value), kind, value)
+    return values
+
+
+def write_lerobot(demonstrations: Demonstrations, folder: str | Path, fps: int = 10) -> None:
+    """Write a data set for LeRobot and :func:`read_lerobot`, whole or not at all.
+
+    Demonstrations have no actions. The action of a frame is the next state, of the last frame its state, as for a robot controlled
+    by positions. Scenes and features known only at the start are repeated in each frame.
+
+    Args:
+        demonstrations: written without padding.
+        folder: a new or empty folder.
+        fps: frames per second, which demonstrations do not record.
+
+    Raises:
+        UserError: if the folder cannot be written or is not empty, or the name of an observed feature is not allowed.
+    """
+    require(isinstance(fps, int) and fps >= 1, "fps", "a whole number from 1", fps)
+    check_extra("lerobot", f"{folder}: this data set")
+    check_names(demonstrations, STATE.removeprefix(OBSERVED), str(folder))
+    from ftl_lightning.data.formats.parquet import write_rows, write_texts
+
+    texts = {text: number for number, text in enumerate(dict.fromkeys(demonstrations.concepts))}
+    frames: list[dict[str, NDArray[Any]]] = []
+    total = 0
+    for number, episode in enumerate(to_episodes(demonstrations)):
+        frames.append(_columns(episode, number, texts[episode.concept], total, fps))
+        total += len(episode.states)
+    names = {STATE: demonstrations.state_names, ACTION: demonstrations.state_names}
+    info = {
+        "codebase_version": VERSIONS[-1],
+        "robot_type": None,
+        "total_episodes": len(frames),
+        "total_frames": total,
+        "total_tasks": len(texts),
+        "chunks_size": _CHUNK,
+        "data_files_size_in_mb": _MEGABYTES,
+        "video_files_size_in_mb": 5 * _MEGABYTES,
+        "fps": fps,
+        "splits": {"train": f"0:{len(frames)}"},
+        "data_path": f"data/{_DATA}",
+        "video_path": None,
+        "features": {
+            key: {"dtype": str(values.dtype), "shape": list(values.shape[1:]), "names": names.get(key)}
+            for key, values in frames[0].items()
+        },
+    }
+    statistics = _statistics({key: np.concatenate([columns[key] for columns in frames]) for key in frames[0]})
+    with _new_folder(Path(folder)) as root:
+        places = _write_data(root, frames)
+        rows = [_row(*values) for values in zip(frames, places, demonstrations.concepts, strict=True)]
+        write_rows(root / "meta" / "episodes" / _DATA.format(chunk_index=0, file_index=0), rows)
+        write_texts(root / "meta" / "tasks.parquet", TASK, "task", texts)
+        for name, content in ((INFO, info), (Path("meta") / "stats.json", statistics), (METADATA, metadata(demonstrations))):
+            (root / name).write_text(json.dumps(content, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
+def _columns(episode: Episode, number: int, task: int, first: int, fps: int) -> dict[str, NDArray[Any]]:
+    """Columns of an episode by feature, ``(frame, *shape)``; ``first`` is the index of its first frame in the data set."""
+    time = len(episode.states)
+    steps = np.arange(time)[:, None]
     return {
-        check_type(row.get(EPISODE), int, EPISODE): check_type(row.get(LENGTH), int, LENGTH)
-        for row in _lines(root / "meta" / "episodes.jsonl")
+        STATE: episode.states,
+        ACTION: np.concatenate((episode.states[1:], episode.states[-1:])),
+        **{OBSERVED + name: values for name, values in episode.observed.items()},
+        **({} if episode.scene is None else {SCENE: np.repeat(episode.scene[None], time, axis=0)}),
+        "timestamp": (steps / fps).astype(np.float32),
+        "frame_index": steps,
+        EPISODE: np.full((time, 1), number),
+        "index": first + steps,
+        TASK: np.full((time, 1), task),
     }
 
 
-def _tasks(root: Path, info: _Info) -> dict[int, str]:
-    """Task texts by number."""
-    if info.old:
-        return {
-            check_type(row.get(TASK), int, TASK): check_type(row.get("task"), str, "task")
-            for row in _lines(root / "meta" / "tasks.jsonl")
+def _write_data(root: Path, frames: Sequence[Mapping[str, NDArray[Any]]]) -> list[tuple[int, int]]:
+    """Write frames, a row group for each episode; return the chunk and file of each episode."""
+    from ftl_lightning.data.formats.parquet import to_table, write_columns
+
+    tables, places = [to_table(columns) for columns in frames], []
+    size, file = 0, 0
+    for table in tables:
+        if size and size + table.nbytes > _MEGABYTES * 2**20:
+            size, file = 0, file + 1
+        size += table.nbytes
+        places.append(divmod(file, _CHUNK))
+    for (chunk, index), group in itertools.groupby(zip(places, tables, strict=True), key=lambda pair: pair[0]):
+        write_columns(root / "data" / _DATA.format(chunk_index=chunk, file_index=index), [table for _, table in group])
+    return places
+
+
+def _row(columns: Mapping[str, NDArray[Any]], place: tuple[int, int], text: str) -> dict[str, Any]:
+    """Description of an episode in ``meta/episodes``."""
+    return {
+        EPISODE: int(columns[EPISODE][0, 0]),
+        "tasks": [text],
+        LENGTH: len(columns["index"]),
+        "data/chunk_index": place[0],
+        "data/file_index": place[1],
+        "dataset_from_index": int(columns["index"][0, 0]),
+        "dataset_to_index": int(columns["index"][-1, 0]) + 1,
+        **{f"stats/{key}/{name}": value for key, values in _statistics(columns).items() for name, value in values.items()},
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+    }
+
+
+def _statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[Any]]]:
+    """Statistics of each feature but images, by which LeRobot normalises, as lists of its shape."""
+    statistics: dict[str, dict[str, list[Any]]] = {}
+    for key, values in columns.items():
+        if values.dtype == np.uint8 or not values.size:
+            continue
+        exact = values.astype(np.float64)
+        quantiles = np.quantile(exact, list(_QUANTILES.values()), axis=0)
+        statistics[key] = {
+            "min": values.min(axis=0).tolist(),
+            "max": values.max(axis=0).tolist(),
+            "mean": exact.mean(axis=0).tolist(),
+            "std": exact.std(axis=0).tolist(),
+            "count": [len(values)],
+            **{name: quantile.tolist() for name, quantile in zip(_QUANTILES, quantiles, strict=True)},
         }
-    path = root / "meta" / "tasks.parquet"
-    check_readable(path, "tasks", MOST_TEXT)
-    with _reading(path), pq.ParquetFile(path) as file:
-        unpacked = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
-        if max(unpacked, file.metadata.num_rows) > MOST_TEXT:
-            raise UserError(f"{path}: expected texts of at most {MOST_TEXT} bytes, found {unpacked}")
-        schema = file.schema_arrow
-        # The texts are pandas' index, named 'task' or by pandas' default.
-        texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
-        if TASK not in schema.names or not texts or not pa.types.is_integer(schema.field(TASK).type):
-            raise UserError(f"{path}: expected the columns {TASK!r} and 'task', found {short(', '.join(schema.names))}")
-        table = file.read(columns=[TASK, "task" if "task" in texts else texts[0]])
-        numbers, tasks = (column.to_pylist() for column in (table.column(0), table.column(1)))
-    return {number: text for number, text in zip(numbers, tasks, strict=True) if isinstance(text, str)}
-
-
-def _lines(path: Path) -> Iterator[Mapping[str, Any]]:
-    """Yield the JSON object of each line."""
-    for number, text in enumerate(read_text(path, "LeRobot").splitlines()):
-        if text.strip():
-            with about(path):
-                yield check_type(parse_json(text), Mapping[str, Any], f"line {number + 1}")
-
-
-def _columns(root: Path, pattern: str, wanted: Mapping[str, _Feature]) -> dict[str, NDArray[Any]]:
-    """Concatenate columns of Parquet files, by name ``(row, *shape)``.
-
-    Raises:
-        UserError: naming the file, if it is missing, damaged, much larger than its bytes, or has other columns.
-    """
-    paths = visible(root, pattern)
-    if not 1 <= len(paths) <= MOST_TENSORS:
-        raise UserError(f"{root}: expected Parquet files {pattern}, at most {MOST_TENSORS}, found {len(paths)}")
-    packed = sum(check_readable(path, "Parquet") for path in paths)
-    rows = 0
-    for path in paths:
-        with _reading(path), pq.ParquetFile(path) as file:
-            _expect_columns(path, file, wanted)
-            rows += file.metadata.num_rows
-    with about(root):
-        check_unpacked(rows * sum(spec.size * (1 if spec.dtype == "uint8" else 8) for spec in wanted.values()), packed, "frames")
-    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in wanted}
-    for path in paths:
-        with _reading(path), pq.ParquetFile(path) as file:
-            table = file.read(columns=list(wanted))
-            for name, feature in wanted.items():
-                parts[name].append(_numbers(path, name, table.column(name), feature))
-    return {name: np.concatenate(arrays) for name, arrays in parts.items()}
+    return statistics
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder with a folder ``meta``; it is renamed to ``folder`` on success and removed on failure."""
+    check_new_folder(folder)
     try:
-        yield
-    except _DAMAGED as error:
-        raise UserError(f"{path}: expected a Parquet file, found a damaged one ({short(str(error), 100)})") from error
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:50]}.", dir=folder.parent) as temporary:
+            root = Path(temporary) / "new"
+            (root / "meta").mkdir(parents=True)
+            yield root
+            root.replace(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose a writable place with room") from error
 
 
-def _expect_columns(path: Path, file: pq.ParquetFile, wanted: Mapping[str, _Feature]) -> None:
-    """Refuse a file that lacks a column or holds more numbers than its shape, which could exhaust memory."""
-    schema, leaf = file.schema_arrow, 0
-    leaves: dict[str, int] = {}
-    for field in schema:
-        leaves[field.name] = -1 if field.name in leaves else leaf
-        leaf += _leaves(field.type)
-    for name, feature in wanted.items():
-        if leaves.get(name, -1) < 0:
-            names = short(", ".join(schema.names), 120)
-            raise UserError(f"{path}: expected the column {name!r} once, found {names}")
-        for group in range(file.num_row_groups):
-            rows = file.metadata.row_group(group)
-            if (count := rows.column(leaves[name]).num_values) != rows.num_rows * max(1, feature.size):
-                expected = f"{rows.num_rows} times {feature.size} numbers"
-                raise UserError(f"{path}: column {name!r}: expected {expected}, as info.json says, found {count}")
-
-
-def _leaves(kind: pa.DataType) -> int:
-    """Number of Parquet columns of an Arrow column."""
-    if _is_list(kind):
-        return _leaves(kind.value_type)
-    if pa.types.is_struct(kind):
-        return sum(_leaves(kind.field(index).type) for index in range(kind.num_fields))
-    if pa.types.is_map(kind):
-        return _leaves(kind.key_type) + _leaves(kind.item_type)
-    return 1
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-
-
-def _numbers(path: Path, name: str, column: pa.ChunkedArray, feature: _Feature) -> NDArray[Any]:
-    """Values ``(row, *shape)`` of a column; missing numbers are NaN."""
-    values, rows = column.combine_chunks(), len(column)
-    if isinstance(values, pa.ChunkedArray):
-        values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([], values.type)
-    for size in feature.shape:
-        if isinstance(values, pa.ExtensionArray):
-            values = values.storage
-        if not _is_list(values.type):
-            break  # a vector of one number is the number itself
-        if len(values) and pc.unique(pc.list_value_length(values)).to_pylist() != [size]:
-            raise UserError(f"{path}: column {name!r}: expected {size} numbers in each list, found other lists")
-        values = values.flatten()
-    kind = values.type
-    if len(values) != rows * feature.size or not (
-        pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
-    ):
-        raise UserError(f"{path}: column {name!r}: expected numbers of shape {feature.shape}, found {short(str(column.type))}")
-    whole = name in (EPISODE, TASK, LENGTH)
-    if whole and (values.null_count or not pa.types.is_integer(kind)):
-        raise UserError(f"{path}: column {name!r}: expected whole numbers, found {short(str(kind))} or missing ones")
-    if pa.types.is_boolean(kind):
-        values = values.cast(pa.uint8()).cast(pa.float32())
-    numbers: NDArray[Any] = values.to_numpy(zero_copy_only=False)
-    if whole:
-        return numbers.astype(np.int64)
-    return numbers.reshape(rows, *feature.shape)
+FORMATS["lerobot"] = Format(read_contents, write_lerobot)

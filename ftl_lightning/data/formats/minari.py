@@ -1,4 +1,4 @@
-"""Demonstrations as Minari data sets, and back. Needs the extra ``minari``.
+"""Minari data sets. Needs the extra ``minari``.
 
 An episode is a demonstration. Its states are the flattened observations. If an observation is a dictionary, one part holds the
 states, and its other vectors are observed features that are known at every time. A demonstration's text is the first ``concept`` in
@@ -11,20 +11,15 @@ the start, and provenance. Scenes are ``scene`` in an episode's ``infos``.
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-import gymnasium
-import minari
 import numpy as np
-from gymnasium.spaces import Box
-from minari.data_collector import EpisodeBuffer
-from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.data.formats.episodes import Beside, Episode, beside, check_names, contents, episodes
-from ftl_lightning.data.formats.file_format import Contents
-from ftl_lightning.data.observations import PART, feature_parts, states_part
-from ftl_lightning.services.errors import UserError, about, short
+from ftl_lightning.data.demonstrations import FORMATS, Contents, Demonstrations, Format
+from ftl_lightning.data.formats.episodes import Episode, Metadata, check_names, from_episodes, measured, metadata, to_episodes
+from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.extras import check_extra
 from ftl_lightning.services.schema import from_mapping
 
 CONCEPT = "concept"
@@ -55,35 +50,54 @@ def read_minari(name: str, part: str = "", observed: Sequence[str] | None = None
 
 
 def read_contents(name: str, part: str = "", observed: Sequence[str] | None = None) -> Contents:
-    """Read the attributes of demonstrations without validating them. Arguments as in :func:`read_minari`.
+    """Read the attributes of demonstrations without validating them. Arguments and errors as in :func:`read_minari`."""
+    check_extra("minari", f"{name}: expected a file, found none; a Minari data set of this name")
+    import minari
 
-    Raises:
-        UserError: naming the data set, if it is foreign, damaged or has other parts.
-    """
+    from ftl_lightning.data.recording import PART, feature_parts, states_part
+
     try:
         dataset = minari.load_dataset(name)
-        metadata = dataset.storage.metadata
+        attributes = dataset.storage.metadata
+        written = _HEADER in attributes
         with about(name):
-            extra = from_mapping(Beside, metadata.get(_HEADER, {}), _HEADER)
-        written = _HEADER in metadata
-        with about(name):
+            given = from_mapping(Metadata, attributes.get(_HEADER, {}), _HEADER)
             part = states_part(dataset.observation_space, part)
             features = feature_parts(dataset.observation_space, part, observed, images=written)
-        if observed is not None or part not in ("", PART):
-            extra = extra.of(features, part in ("", PART))
+        if part not in ("", PART):  # names and units are those of the states that were written
+            given = replace(given, state_names=None, state_units=None)
         texts = [_text(entry) for entry in dataset.storage.get_episode_metadata(dataset.episode_indices)]
-        whole = _text(metadata) or name
-        read = [_read(episode, part, features, text or whole, written) for episode, text in zip(dataset, texts, strict=True)]
+        default = _text(attributes) or name
+        episodes = [
+            _episode(episode, part, features, text or default, written) for episode, text in zip(dataset, texts, strict=True)
+        ]
     except FileNotFoundError as error:
-        raise UserError(
-            f"{name}: expected a file or an installed Minari data set, found neither; see: minari list local"
-        ) from error
+        message = "expected a file or an installed Minari data set, found neither; see: minari list local"
+        raise UserError(f"{name}: {message}") from error
     except (ImportError, OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
         message = short(str(error), 100)
         raise UserError(f"{name}: expected a Minari data set, found a damaged or foreign one ({message})") from error
     with about(name):
-        attributes = contents(read, extra)
-    return {**attributes, "provenance": attributes["provenance"] or {"minari": name}}
+        contents = from_episodes(episodes, given)
+    return {**contents, "provenance": contents["provenance"] or {"minari": name}}
+
+
+def _episode(episode: Any, part: str, features: Sequence[str], text: str, written: bool) -> Episode:
+    observations, infos = episode.observations, episode.infos or {}
+    states = np.asarray(observations[part] if part else observations, dtype=np.float32)
+    return Episode(
+        states.reshape(len(states), -1),
+        {key: measured(observations[key]) for key in features},
+        _text(infos) or text,
+        np.asarray(infos[SCENE], dtype=np.float32)[0] if written and SCENE in infos else None,
+    )
+
+
+def _text(attributes: Mapping[str, Any] | None) -> str:
+    """Text of the concept, or the first of several; empty if there is none."""
+    texts = np.ravel((attributes or {}).get(CONCEPT, ""))
+    first = texts[0] if len(texts) else ""
+    return first.decode("utf-8") if isinstance(first, bytes) else str(first)
 
 
 def write_minari(demonstrations: Demonstrations, name: str) -> None:
@@ -100,65 +114,47 @@ def write_minari(demonstrations: Demonstrations, name: str) -> None:
         UserError: naming the data set, if it exists or cannot be written, a demonstration is too short, or the name of an observed
             feature cannot be a key.
     """
-    if int(demonstrations.lengths.min()) < 2:
-        raise UserError(f"{name}: expected demonstrations of two states or more, found one of 1, which makes no step")
+    check_extra("minari", f"{name}: this data set")
+    import gymnasium
+    import minari
+    from gymnasium.spaces import Box
+    from minari.data_collector import EpisodeBuffer
+
+    from ftl_lightning.data.recording import PART
+
+    enough = int(demonstrations.lengths.min()) >= 2
+    require(enough, name, "demonstrations of two states or more", "one of 1, which makes no step")
     check_names(demonstrations, PART, name)
     space: gymnasium.Space[Any] = Box(-np.inf, np.inf, demonstrations.states.shape[2:], np.float32)
     if demonstrations.observed:
-        parts = {key: _space(feature.kind == "image", feature.shape) for key, feature in demonstrations.features.items()}
-        space = gymnasium.spaces.Dict({PART: space, **parts})
+        spaces = {PART: space}
+        for key, feature in demonstrations.features.items():
+            low, high, dtype = (0, 255, np.uint8) if feature.kind == "image" else (-np.inf, np.inf, np.float32)
+            spaces[key] = Box(low, high, feature.shape, dtype)
+        space = gymnasium.spaces.Dict(spaces)
+    buffers = []
+    for episode in to_episodes(demonstrations):
+        steps = len(episode.states) - 1
+        infos = {CONCEPT: episode.concept} if episode.scene is None else {CONCEPT: episode.concept, SCENE: episode.scene}
+        features = {PART: list(episode.states), **{key: list(values) for key, values in episode.observed.items()}}
+        buffers.append(
+            EpisodeBuffer(
+                observations=features if episode.observed else features[PART],
+                actions=list(np.zeros((steps, 1), np.float32)),
+                rewards=[0.0] * steps,
+                terminations=[False] * steps,
+                truncations=[False] * (steps - 1) + [True],
+                infos={key: [value] * (steps + 1) for key, value in infos.items()},
+            )
+        )
     try:
         with warnings.catch_warnings(action="ignore"):  # advice about author, permalink and so on
             written = minari.create_dataset_from_buffers(
-                name,
-                [_buffer(episode) for episode in episodes(demonstrations)],
-                observation_space=space,
-                action_space=Box(0, 0, (1,), np.float32),
+                name, buffers, observation_space=space, action_space=Box(0, 0, (1,), np.float32)
             )
-            written.storage.update_metadata({_HEADER: beside(demonstrations)})
+            written.storage.update_metadata({_HEADER: metadata(demonstrations)})
     except (ImportError, OSError, ValueError, AttributeError, TypeError) as error:
         raise UserError(f"{name}: cannot be written as a Minari data set such as strokes/test-v0 ({error})") from error
 
 
-def _space(image: bool, shape: tuple[int, ...]) -> Box:
-    return Box(0, 255, shape, np.uint8) if image else Box(-np.inf, np.inf, shape, np.float32)
-
-
-def _buffer(episode: Episode) -> EpisodeBuffer:
-    times = len(episode.states)
-    steps = times - 1
-    scene = {} if episode.scene is None else {SCENE: [episode.scene] * times}
-    return EpisodeBuffer(
-        observations={PART: list(episode.states), **{key: list(values) for key, values in episode.observed.items()}}
-        if episode.observed
-        else list(episode.states),
-        actions=list(np.zeros((steps, 1), np.float32)),
-        rewards=[0.0] * steps,
-        terminations=[False] * steps,
-        truncations=[False] * (steps - 1) + [True],
-        infos={CONCEPT: [episode.concept] * times, **scene},
-    )
-
-
-def _read(episode: Any, part: str, features: Sequence[str], text: str, written: bool) -> Episode:
-    observations = episode.observations
-    states = np.asarray(observations[part] if part else observations, dtype=np.float32)
-    infos = episode.infos or {}
-    return Episode(
-        states.reshape(len(states), -1),
-        {key: _numbers(observations[key]) for key in features},
-        _text(infos) or text,
-        np.asarray(infos[SCENE], dtype=np.float32)[0] if written and SCENE in infos else None,
-    )
-
-
-def _numbers(values: Any) -> NDArray[Any]:
-    array = np.asarray(values)
-    return array if array.dtype == np.uint8 else array.astype(np.float32)
-
-
-def _text(where: Mapping[str, Any] | None) -> str:
-    """Text of the concept, or the first of several; empty if there is none."""
-    texts = np.ravel((where or {}).get(CONCEPT, ""))
-    first = texts[0] if len(texts) else ""
-    return first.decode("utf-8") if isinstance(first, bytes) else str(first)
+FORMATS["minari"] = Format(read_contents, write_minari)

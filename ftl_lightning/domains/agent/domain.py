@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.cache import cached
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, Observed, check_starts
+from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.agent import dynamics, expert
 from ftl_lightning.domains.agent import scenes as scene_settings
 from ftl_lightning.domains.agent.dynamics import LOOKAHEAD, MAX_STEPS, check_simulator

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.agent.domain import NAME, drives, environment, initial_states
 from ftl_lightning.domains.agent.dynamics import STEP, check_simulator
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED, STOP, Plane, follow

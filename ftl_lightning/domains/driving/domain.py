@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.cache import cached
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Plans, Show, Split
 from ftl_lightning.domains.driving import policies

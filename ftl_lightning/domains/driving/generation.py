@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.driving import expert
 from ftl_lightning.domains.driving.expert import SEARCH
 from ftl_lightning.domains.driving.foresight import VETOES

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.driving.tasks import TRAINING_CONCEPTS
 from ftl_lightning.services.errors import UserError

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.mocap.asf_amc import INCH, THORAX, Skeleton
 from ftl_lightning.domains.mocap.bvh_file import Motion, read_motion
 from ftl_lightning.domains.mocap.export import NODES as EXPORTED

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ftl_lightning.data.formats.npz import check_arrays
+from ftl_lightning.data.formats.files import check_arrays
 from ftl_lightning.domains.mocap.segments import SEGMENTS, Segment, read_segments, shipped_segments
 from ftl_lightning.domains.mocap.skeleton import JOINTS
 from ftl_lightning.domains.mocap.tasks import cleaned

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, padded
+from ftl_lightning.data.demonstrations import Demonstrations, padded
 from ftl_lightning.data.features import Feature, InitialStates
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.mocap import skeleton

@@ -2,7 +2,7 @@
 
 import torch
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.object_rearrangement.domain import CENTRES, NAME, PLANS
 from ftl_lightning.domains.object_rearrangement.generation import plain_scene
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, SHAPES

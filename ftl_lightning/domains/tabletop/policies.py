@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.domain import Policy
 from ftl_lightning.domains.tabletop.experts import PUSH_HEIGHT, perform

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ftl_lightning.data.cache import cached
-from ftl_lightning.data.container import Demonstrations, concatenate, padded
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate, padded
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.data.formats.files import cached
 from ftl_lightning.domains.domain import Split
 from ftl_lightning.domains.tabletop import distractors, environment, experts, pushing, success, world
 from ftl_lightning.domains.tabletop import scenes as scene_settings

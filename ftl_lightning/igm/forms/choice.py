@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Choice, Concept
 from ftl_lightning.igm.forms.leave_one_out import learned_from, quickly, relative_losses

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.check import numbered
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Observed
-from ftl_lightning.data.finding import numbered
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.inversion import Tell, invert
 from ftl_lightning.igm.model import Draws, Invertible

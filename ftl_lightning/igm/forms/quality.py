@@ -7,7 +7,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.distances import path_distance
 from ftl_lightning.data.features import InitialStates, moved
 from ftl_lightning.igm.concept import Concept

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.data.features import Observed, moved
 from ftl_lightning.igm.composition import Composition, batched
 from ftl_lightning.igm.concept import Concept

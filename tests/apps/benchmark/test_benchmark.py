@@ -16,7 +16,7 @@ from ftl_lightning.apps.benchmark.leaderboard import leaderboard, read_submissio
 from ftl_lightning.apps.benchmark.run import scored
 from ftl_lightning.apps.benchmark.submission import Submission
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.services.errors import LONGEST
 from tests.conftest import ROOT, Once, succeed
 

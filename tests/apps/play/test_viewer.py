@@ -11,7 +11,7 @@ import pytest
 from ftl_lightning.apps.play.viewer import MOST_SHOWN, holds_results, results_page, viewed
 from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.domains.registry import load_domain
 from tests.apps.play.served import here
 from tests.conftest import ROOT, refused

@@ -18,7 +18,7 @@ from ftl_lightning.apps.play.same import VARIABLES, Learned
 from ftl_lightning.apps.play.workspace import Stopped, Workspace
 from ftl_lightning.apps.testing.more_strokes import drawn
 from ftl_lightning.cli.main import main
-from ftl_lightning.data.container import Demonstrations
+from ftl_lightning.data.demonstrations import Demonstrations
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.igm.settings import PAPER
 from ftl_lightning.services.errors import UserError

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ftl_lightning.data.container import Demonstrations, concatenate
+from ftl_lightning.data.demonstrations import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature
 from ftl_lightning.services.errors import UserError
 from tests.data.samples import demonstrations
@@ -12,7 +12,10 @@ from tests.data.samples import demonstrations
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"states": torch.zeros(0, 1, 2)}, "at least one demonstration, found none"),
+        (
+            {"states": torch.zeros(0, 1, 2)},
+            r"at least one demonstration, time and column, found none in \(0, 1, 2\)",
+        ),
         ({"states": torch.full((1, 1, 2), float("nan"))}, r"key 'states': expected finite numbers, found nan at index \[0, 0, 0\]"),
         ({"states": torch.zeros(1, 2)}, r"expected float32 of shape \(demo, time, state\)"),
         ({"lengths": torch.tensor([3])}, "key 'lengths': expected 1 values between 1 and 1"),

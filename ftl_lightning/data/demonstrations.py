@@ -1,21 +1,66 @@
-"""Container of demonstrations of one or several tasks."""
+"""Demonstrations of one or several tasks, and the registry of formats that hold them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypedDict
 
 import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import Feature, InitialStates, Observed, take
-from ftl_lightning.data.formats.file_format import read, write
-from ftl_lightning.data.formats.file_keys import KIND, OBSERVED
-from ftl_lightning.services.data_names import written_to
-from ftl_lightning.services.errors import UserError, about, short, shown
-from ftl_lightning.services.extras import check_extra
+from ftl_lightning.services.data_names import read_from, written_to
+from ftl_lightning.services.errors import UserError, about, require, short
 from ftl_lightning.services.representation import Shown, counted
 from ftl_lightning.services.tensor_file import bytes_hash, serialise
+
+KIND = "demonstrations"
+"""Kind of a safetensors file of demonstrations."""
+OBSERVED = "observed/"
+"""Prefix of observed features in files."""
+
+
+class Contents(TypedDict):
+    """Attributes of :class:`Demonstrations` that a format has read; shapes and values are not validated yet."""
+
+    states: Tensor
+    lengths: Tensor
+    domain: str
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    concepts: tuple[str, ...]
+    observed: Observed
+    per_step: tuple[str, ...]
+    scenes: Tensor | None
+    provenance: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Format:
+    """Format of demonstrations. A module of :mod:`ftl_lightning.data.formats` registers each in :data:`FORMATS`.
+
+    Attributes:
+        read: reads a file, or a data set by its folder or name.
+        write: writes demonstrations under a name, whole or not at all.
+    """
+
+    read: Callable[[str], Contents]
+    write: Callable[["Demonstrations", str], None]
+
+
+FORMATS: dict[str, Format] = {}
+"""Formats by the suffix of a file, or by the kind of a data set."""
+
+
+def read_contents(path: str | Path) -> Contents:
+    """Read attributes of demonstrations in any format, see :meth:`Demonstrations.load`, without validating them."""
+    kind, name = read_from(str(path))
+    return _format(kind, name).read(name)
+
+
+def _format(kind: str, name: str) -> Format:
+    """Format of a resolved name; files of unknown suffixes are safetensors."""
+    return FORMATS.get(Path(name).suffix if kind == "file" else kind, FORMATS[".safetensors"])
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,41 +96,30 @@ class Demonstrations(Shown):
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.states.dim() != 3 or self.states.dtype != torch.float32:
-            raise UserError(
-                f"key 'states': expected float32 of shape (demo, time, state), found {self.states.dtype} {tuple(self.states.shape)}"
-            )
-        count, time, state = self.states.shape
-        if not count:
-            raise UserError("key 'states': expected at least one demonstration, found none")
-        if not time or not state:
-            raise UserError(f"key 'states': expected at least one time and column, found none in {tuple(self.states.shape)}")
-        if self.lengths.dtype != torch.int64:
-            raise UserError(f"key 'lengths': expected whole numbers (int64), found {self.lengths.dtype}")
-        if self.lengths.shape != (count,) or self.lengths.min() < 1 or self.lengths.max() > time:
-            lengths = shown(self.lengths.flatten()[:20].tolist())
-            raise UserError(f"key 'lengths': expected {count} values between 1 and {time}, found {lengths}")
-        for key, values, expected in (
-            ("state_names", self.state_names, state),
-            ("state_units", self.state_units, state),
-            ("concepts", self.concepts, count),
-        ):
-            if len(values) != expected:
-                raise UserError(f"key {key!r}: expected {expected} entries, found {len(values)}")
-        if unknown := set(self.per_step) - set(self.observed):
-            raise UserError(f"key 'per_step': expected names of observed features, found {short(', '.join(sorted(unknown)))}")
-        for name, feature in self.observed.items():
-            leading = (count, time) if name in self.per_step else (count,)
-            if tuple(feature.shape[: len(leading)]) != leading or feature.dim() <= len(leading):
-                axes = ", ".join(map(str, leading))
-                raise UserError(f"key 'observed/{name}': expected shape ({axes}, ...), found {tuple(feature.shape)}")
-            if feature.dtype not in (torch.float32, torch.uint8):
-                dtype = str(feature.dtype).removeprefix("torch.")
-                raise UserError(f"key 'observed/{name}': expected float32, or uint8 for images, found {dtype}")
-        if self.scenes is not None and (self.scenes.dim() != 2 or len(self.scenes) != count):
-            raise UserError(f"key 'scenes': expected shape ({count}, scene), found {tuple(self.scenes.shape)}")
-        if self.scenes is not None and self.scenes.dtype != torch.float32:
-            raise UserError(f"key 'scenes': expected float32, found {self.scenes.dtype}")
+        size = tuple(self.states.shape)
+        typed = len(size) == 3 and self.states.dtype == torch.float32
+        require(typed, "key 'states'", "float32 of shape (demo, time, state)", f"{self.states.dtype} {size}")
+        require(min(size) > 0, "key 'states'", "at least one demonstration, time and column", f"none in {size}")
+        count, time, state = size
+        require(self.lengths.dtype == torch.int64, "key 'lengths'", "whole numbers (int64)", str(self.lengths.dtype))
+        lengths = self.lengths.flatten().tolist()
+        within = self.lengths.shape == (count,) and all(1 <= length <= time for length in lengths)
+        require(within, "key 'lengths'", f"{count} values between 1 and {time}", lengths[:20])
+        for key, texts, expected in (("state_names", self.state_names, state), ("state_units", self.state_units, state)):
+            require(len(texts) == expected, f"key {key!r}", f"{expected} entries", len(texts))
+        require(len(self.concepts) == count, "key 'concepts'", f"{count} entries", len(self.concepts))
+        unknown = short(", ".join(sorted(set(self.per_step) - set(self.observed))))
+        require(not unknown, "key 'per_step'", "names of observed features", unknown)
+        for name, values in self.observed.items():
+            leading, shape = (count, time) if name in self.per_step else (count,), tuple(values.shape)
+            fits = shape[: len(leading)] == leading and len(shape) > len(leading)
+            require(fits, f"key 'observed/{name}'", f"shape ({', '.join(map(str, leading))}, ...)", str(shape))
+            dtype = str(values.dtype).removeprefix("torch.")
+            require(dtype in ("float32", "uint8"), f"key 'observed/{name}'", "float32, or uint8 for images", dtype)
+        if self.scenes is not None:
+            shape = tuple(self.scenes.shape)
+            require(len(shape) == 2 and shape[0] == count, "key 'scenes'", f"shape ({count}, scene)", str(shape))
+            require(self.scenes.dtype == torch.float32, "key 'scenes'", "float32", str(self.scenes.dtype))
         for key, tensor in self.tensors.items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 where = (~torch.isfinite(tensor)).nonzero()[0].tolist()
@@ -139,8 +173,8 @@ class Demonstrations(Shown):
         """Start times of windows ``(window,)`` int64.
 
         If all features are observed at every time, a plan can start at any time. If a feature is known only at the first time, all
-        windows start at 0. Without observed features, nothing tells a plan where in a behaviour it is: windows stay within a
-        demonstration, and a window of its full length starts at 0.
+        windows start at 0. Without observed features, a plan has no information on its time in a behaviour: windows stay within
+        a demonstration, and a window of its full length starts at 0.
 
         Args:
             rows: ``(window,)`` int64, demonstration of each window.
@@ -167,8 +201,11 @@ class Demonstrations(Shown):
             States ``(window, horizon, state)`` and features observed at each start, by name ``(window, *shape)``.
         """
         times = (starts[:, None] + torch.arange(horizon)).clamp(max=self.states.shape[1] - 1)
-        observed = {name: values[rows, starts] if name in self.per_step else values[rows] for name, values in self.observed.items()}
-        return self.states[rows[:, None], times], observed
+        return self.states[rows[:, None], times], self._observed_at(rows, starts)
+
+    def _observed_at(self, rows: Tensor, times: Tensor) -> dict[str, Tensor]:
+        """Features observed at times ``(sample,)`` of demonstrations ``(sample,)``."""
+        return {name: values[rows, times] if name in self.per_step else values[rows] for name, values in self.observed.items()}
 
     @property
     def initial_states(self) -> InitialStates:
@@ -179,9 +216,7 @@ class Demonstrations(Shown):
     @property
     def final_states(self) -> InitialStates:
         """Final states as initial states of behaviour that continues; features known only at the start are unchanged."""
-        rows, last = torch.arange(len(self)), self.lengths - 1
-        observed = {name: values[rows, last] if name in self.per_step else values for name, values in self.observed.items()}
-        return InitialStates(observed, self.scenes)
+        return InitialStates(self._observed_at(torch.arange(len(self)), self.lengths - 1), self.scenes)
 
     @property
     def every_observation(self) -> dict[str, Tensor]:
@@ -208,25 +243,7 @@ class Demonstrations(Shown):
             UserError: naming the path, if it cannot be written or needs an extra that is not installed.
         """
         kind, name = written_to(str(path))
-        if kind != "file":
-            check_extra(kind, f"{path}: this data set")
-        if kind == "minari":
-            from ftl_lightning.data.formats.minari import write_minari
-
-            return write_minari(self, name)
-        if kind == "lerobot":
-            from ftl_lightning.data.formats.lerobot_writing import write_lerobot
-
-            return write_lerobot(self, name)
-        header = {
-            "domain": self.domain,
-            "state_names": self.state_names,
-            "state_units": self.state_units,
-            "concepts": self.concepts,
-            "per_step": self.per_step,
-            "provenance": dict(self.provenance),
-        }
-        write(path, self.tensors, header)
+        _format(kind, name).write(self, name)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -243,7 +260,7 @@ class Demonstrations(Shown):
         Raises:
             UserError: naming the file, if it is missing, damaged, of another kind, or its content is not as described.
         """
-        contents = read(path)
+        contents = read_contents(path)
         with about(path):
             return cls(**contents)
 
@@ -257,11 +274,11 @@ class Demonstrations(Shown):
             UserError: for a feature that is missing or has another type or shape.
         """
         for name, feature in features.items():
-            if (given := self.features.get(name)) is None or not given.fits(feature):
-                message = "none" if given is None else given.words
-                if given is not None and given.shape[1:] == feature.shape and name not in self.per_step:
-                    message += " (observed at every time? then list it in per_step)"
-                raise UserError(f"key 'observed/{name}': expected {feature.words} each, found {message}")
+            given = self.features.get(name)
+            message = "none" if given is None else given.words
+            if given is not None and given.shape[1:] == feature.shape and name not in self.per_step:
+                message += " (observed at every time? then list it in per_step)"
+            require(given is not None and given.fits(feature), f"key 'observed/{name}'", f"{feature.words} each", message)
         return self
 
 
@@ -270,8 +287,7 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
 
     A feature is observed at every time, and there are scenes, only if this holds for all parts.
     """
-    first = parts[0]
-    longest = max(part.states.shape[1] for part in parts)
+    first, longest = parts[0], max(part.states.shape[1] for part in parts)
     per_step = tuple(name for name in first.per_step if all(name in part.per_step for part in parts))
     scenes = [part.scenes for part in parts if part.scenes is not None]
     return replace(

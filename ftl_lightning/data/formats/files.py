@@ -1,0 +1,240 @@
+"""Files of demonstrations: safetensors with a JSON header, and ``.npz`` of plain arrays, the form of other software."""
+
+import lzma
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ftl_lightning.data.demonstrations import FORMATS, KIND, OBSERVED, Contents, Demonstrations, Format
+from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.limits import MOST_TENSORS, check_readable, check_unpacked
+from ftl_lightning.services.progress import bar
+from ftl_lightning.services.schema import check_type
+from ftl_lightning.services.tensor_file import atomic, cache_folder, content_hash, load_tensors, save_tensors
+
+VERSION = 4
+"""Version of the safetensors format. Images are compressed (zlib) to 1-D uint8; the header has their shapes by key as
+``compressed``."""
+TEXTS = ("state_names", "state_units", "concepts", "per_step")
+"""Keys of lists of texts."""
+MOST_SHRUNK = 1032
+"""Maximum compression ratio of zlib."""
+SLOW = 20
+"""Minimum number of demonstrations for progress lines without a terminal."""
+_DAMAGED = (
+    *(OSError, ValueError, EOFError, AttributeError, TypeError, RuntimeError, LookupError, MemoryError, SyntaxError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError),
+)
+"""Exceptions of numpy and zipfile for damaged or foreign files."""
+
+Tell = Callable[[], None]
+
+
+def write_safetensors(demonstrations: Demonstrations, name: str) -> None:
+    """Write a safetensors file, whole or not at all; the same demonstrations give the same bytes.
+
+    Raises:
+        UserError: if the file cannot be written.
+    """
+    tensors = demonstrations.tensors
+    images = {key: values for key, values in tensors.items() if values.dtype == torch.uint8}
+    header = {**_header(demonstrations), "provenance": dict(demonstrations.provenance)}
+    if images:
+        header["compressed"] = {key: list(values.shape) for key, values in images.items()}
+    save_tensors(name, KIND, {**tensors, **{key: _compressed(values) for key, values in images.items()}}, header, VERSION)
+
+
+def read_safetensors(name: str) -> Contents:
+    """Read a file of :func:`write_safetensors`.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, of another kind, or holds a value of another type.
+    """
+    tensors, header = load_tensors(name, KIND, VERSION)
+    with about(name):
+        return _contents(tensors, header)
+
+
+def write_npz(demonstrations: Demonstrations, name: str) -> None:
+    """Write an ``.npz`` file without compression and without provenance, whole or not at all.
+
+    Raises:
+        UserError: if the file cannot be written.
+    """
+    arrays: dict[str, Any] = {key: values.detach().cpu().numpy() for key, values in demonstrations.tensors.items()}
+    arrays |= {key: np.array(value, dtype=np.str_) for key, value in _header(demonstrations).items()}
+    with atomic(name) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def read_npz(name: str) -> Contents:
+    """Read an ``.npz`` file without objects. A single text in ``concepts`` is that of all demonstrations.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, holds objects, or an array of another type than its key requires.
+    """
+    path = Path(name)
+    size = check_readable(path, "demonstrations")
+    try:
+        check_arrays(path, size)
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: np.asarray(archive[key]) for key in archive.files}
+        "".join(text for array in arrays.values() if array.dtype.kind == "U" for text in np.ravel(array)).encode()
+    except _DAMAGED as error:
+        message = short(str(error), 100)
+        raise UserError(f"{path}: expected an .npz of plain arrays, found a damaged one or one with objects ({message})") from error
+    tensors: dict[str, Tensor] = {}
+    header: dict[str, Any] = {}
+    with about(path):
+        for key, array in arrays.items():
+            numeric, actual = array.dtype.kind in "fiub", f"one of {short(str(array.dtype))}"
+            if key.startswith(OBSERVED) or key in ("states", "lengths", "scenes"):
+                require(numeric, f"key {short(key)!r}", "an array of numbers", actual)
+                tensors[key] = _tensor(key, array)
+            elif key in (*TEXTS, "domain"):
+                require(array.dtype.kind == "U", f"key {key!r}", "an array of texts", actual)
+                texts = np.atleast_1d(array).tolist()
+                repeated = len(np.atleast_1d(arrays.get("states", 0))) if key == "concepts" and not array.ndim else 1
+                header[key] = texts[0] if key == "domain" and len(texts) == 1 else texts * repeated
+            elif numeric:
+                tensors[key] = _tensor(key, array)
+        return _contents(tensors, header)
+
+
+def _tensor(key: str, array: NDArray[Any]) -> Tensor:
+    """Convert an array: images stay uint8 and whole lengths int64; other numbers become float32."""
+    image = array.dtype == np.uint8 and key.startswith(OBSERVED)
+    kind = np.uint8 if image else np.int64 if key == "lengths" and array.dtype.kind in "iu" else np.float32
+    with np.errstate(over="ignore"):  # overflow is reported later as a number that is not finite
+        return torch.from_numpy(np.array(array, dtype=kind, order="C", ndmin=array.ndim))
+
+
+def _header(demonstrations: Demonstrations) -> dict[str, Any]:
+    return {"domain": demonstrations.domain, **{key: getattr(demonstrations, key) for key in TEXTS}}
+
+
+def _contents(tensors: dict[str, Tensor], header: Mapping[str, Any]) -> Contents:
+    """Attributes of demonstrations, with defaults for missing keys.
+
+    Raises:
+        UserError: naming the key, for a value of another type.
+    """
+    names = short(", ".join(tensors)) or "nothing"
+    require("states" in tensors, "key 'states'", "(demo, time, state)", f"only {names}")
+    states = tensors["states"]
+    demos, time, columns = states.shape if states.dim() == 3 else (0, 0, 0)
+    texts: dict[str, tuple[str, ...]] = {key: check_type(header[key], tuple[str, ...], key) for key in TEXTS if key in header}
+    per_step = texts.get("per_step", ())
+    shapes: dict[str, tuple[int, ...]] = check_type(header.get("compressed", {}), Mapping[str, tuple[int, ...]], "compressed")
+    for key, shape in shapes.items():
+        leading = states.shape[: 2 if key.removeprefix(OBSERVED) in per_step else 1]
+        tensors[key] = _decompressed(key, tensors.get(key), shape, tuple(leading))
+    return {
+        "states": states,
+        "lengths": tensors.get("lengths", torch.full((demos,), time)),
+        "domain": check_type(header.get("domain", ""), str, "domain"),
+        "state_names": texts.get("state_names", tuple(map(str, range(columns)))),
+        "state_units": texts.get("state_units", ("",) * columns),
+        "concepts": texts.get("concepts", ("",) * demos),
+        "observed": {key.removeprefix(OBSERVED): values for key, values in tensors.items() if key.startswith(OBSERVED)},
+        "per_step": per_step,
+        "scenes": tensors.get("scenes"),
+        "provenance": check_type(header.get("provenance", {}), Mapping[str, Any], "provenance"),
+    }
+
+
+def _compressed(images: Tensor) -> Tensor:
+    """Compress images ``(demo, ...)`` uint8 to ``(byte,)``."""
+    return torch.frombuffer(bytearray(zlib.compress(images.detach().cpu().numpy().tobytes())), dtype=torch.uint8)
+
+
+def _decompressed(key: str, packed: Tensor | None, shape: tuple[int, ...], leading: tuple[int, ...]) -> Tensor:
+    """Decompress images of a file.
+
+    Memory is bounded: nothing beyond the shape is decompressed.
+
+    Args:
+        key: key of the images in the file.
+        packed: ``(byte,)``, the tensor of this key.
+        shape: shape in the header.
+        leading: expected first sizes, those of the states.
+
+    Raises:
+        UserError: naming the key, for an impossible shape or damaged bytes.
+    """
+    place = f"key {short(key)!r}"
+    if packed is None or not key.startswith(OBSERVED) or packed.dtype != torch.uint8 or packed.dim() != 1:
+        actual = "nothing" if packed is None else f"{str(packed.dtype).removeprefix('torch.')} of shape {tuple(packed.shape)}"
+        raise UserError(f"{place}: expected compressed images, uint8 of shape (byte,) under 'observed/NAME', found {actual}")
+    size = math.prod(shape)
+    expected = f"images of shape ({', '.join(map(str, leading))}, ...) that fit into {len(packed)} compressed bytes"
+    fits = shape[: len(leading)] == leading and size <= MOST_SHRUNK * len(packed)
+    require(fits, place, expected, f"the shape {list(shape)} in the header; the file is damaged")
+    with about(place):
+        check_unpacked(size, len(packed), "images")
+    reader = zlib.decompressobj()
+    try:
+        content = bytearray(reader.decompress(packed.numpy().tobytes(), size + 1))  # one more, to reach the end
+    except zlib.error as error:
+        raise UserError(f"{place}: expected compressed images, found damaged bytes ({error}); take another copy") from error
+    longer = len(content) > size or bool(reader.unused_data)
+    actual = "more" if longer else f"{len(content)}{'' if reader.eof else ' and no end'}"
+    whole = len(content) == size and reader.eof and not longer
+    require(whole, place, f"{size} bytes of images", f"{actual}; the file is damaged: take another copy")
+    return torch.from_numpy(np.frombuffer(content, dtype=np.uint8)).reshape(shape)
+
+
+def check_arrays(path: Path, size: int) -> None:
+    """Refuse an archive that is much larger than its file, or an array whose header contradicts its size in bytes.
+
+    Raises:
+        ValueError: naming the mismatch.
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if len(members) > MOST_TENSORS:
+            raise ValueError(f"{len(members)} arrays")
+        with about(path):
+            check_unpacked(sum(member.file_size for member in members), size, "arrays")
+        for member in members:
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(file)
+                stated = math.prod(shape) * dtype.itemsize
+                if not dtype.hasobject and (min(shape, default=0) < 0 or stated != member.file_size - file.tell()):
+                    raise ValueError(f"{member.filename} is not of the size that its header states")
+
+
+def cached(settings: Mapping[str, Any], total: int, make: Callable[[Tell], Demonstrations]) -> Demonstrations:
+    """Read demonstrations from the user's cache folder, or make and cache them, with a progress bar.
+
+    Args:
+        settings: everything that determines them; their hash with the version of the file format names the file.
+        total: number of demonstrations.
+        make: function that makes them, and calls its argument after each.
+    """
+    path = cache_folder() / f"{settings['domain']}-{content_hash({**settings, 'format': VERSION})}.safetensors"
+    if path.is_file():
+        try:
+            return Demonstrations.load(path)
+        except UserError:
+            path.unlink(missing_ok=True)  # damaged; another process may have removed the file
+    with bar(f"{settings['domain']}: demonstrations", total, lines=total >= SLOW) as advance:
+        made = make(advance)
+    made.save(path)
+    return made
+
+
+FORMATS[".safetensors"] = Format(read_safetensors, write_safetensors)
+FORMATS[".npz"] = Format(read_npz, write_npz)

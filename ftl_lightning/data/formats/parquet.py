@@ -1,0 +1,175 @@
+"""Numbers and texts in Parquet files. Needs ``pyarrow``: import this module only after the check of the extra."""
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from ftl_lightning.services.errors import UserError, about, require, short
+from ftl_lightning.services.limits import MOST_TENSORS, MOST_TEXT, check_readable, check_unpacked
+from ftl_lightning.services.tensor_file import visible
+
+_DAMAGED = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError)
+"""Exceptions of pyarrow for damaged or foreign files."""
+
+
+def read_columns(
+    root: Path, pattern: str, shapes: Mapping[str, tuple[int, ...]], whole: Collection[str]
+) -> dict[str, NDArray[Any]]:
+    """Read and concatenate columns of files.
+
+    Args:
+        root: folder.
+        pattern: pattern of the files in the folder.
+        shapes: shape of a row of each column, by name; a shape of one number may be stored without a list.
+        whole: names of columns of whole numbers (int64).
+
+    Returns:
+        Numbers by name, ``(row, *shape)``, or ``(row,)`` if whole; missing numbers are NaN.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, much larger than its bytes, or has other columns.
+    """
+    paths = visible(root, pattern)
+    require(1 <= len(paths) <= MOST_TENSORS, str(root), f"Parquet files {pattern}, at most {MOST_TENSORS}", str(len(paths)))
+    packed, size = sum(check_readable(path, "Parquet") for path in paths), 0
+    for path in paths:
+        with _opened(path) as file:
+            size += _checked_size(path, file, shapes)
+    with about(root):
+        check_unpacked(size, packed, "frames")
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in shapes}
+    for path in paths:
+        with _opened(path) as file:
+            table = file.read(columns=list(shapes))
+            for name, shape in shapes.items():
+                parts[name].append(_numbers(f"{path}: column {name!r}", table.column(name), shape, name in whole))
+    return {name: np.concatenate(arrays) for name, arrays in parts.items()}
+
+
+def read_texts(path: Path, number: str, name: str) -> dict[int, str]:
+    """Read texts by number.
+
+    Args:
+        path: the file.
+        number: column of whole numbers.
+        name: column of texts, or the only such column under any name, since pandas names an index.
+
+    Raises:
+        UserError: naming the file, if it is missing, damaged, too large, or lacks the columns.
+    """
+    check_readable(path, "tasks", MOST_TEXT)
+    with _opened(path) as file:
+        size = sum(file.metadata.row_group(group).total_byte_size for group in range(file.num_row_groups))
+        require(max(size, file.metadata.num_rows) <= MOST_TEXT, str(path), f"texts of at most {MOST_TEXT} bytes", str(size))
+        schema = file.schema_arrow
+        texts = [field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)]
+        known = number in schema.names and texts and pa.types.is_integer(schema.field(number).type)
+        require(known, str(path), f"the columns {number!r} and {name!r}", short(", ".join(schema.names)))
+        table = file.read(columns=[number, name if name in texts else texts[0]])
+        return {key: text for key, text in zip(*(column.to_pylist() for column in table.columns), strict=True) if text is not None}
+
+
+def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows of values by column name; types are those of the values."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.Table.from_pylist(rows), path)
+
+
+def write_texts(path: Path, number: str, name: str, texts: Mapping[str, int]) -> None:
+    """Write numbers by text, with the texts as the index of a pandas table, as LeRobot expects."""
+    pd.DataFrame({number: list(texts.values())}, index=pd.Index(list(texts), name=name, dtype=object)).to_parquet(path)
+
+
+def write_columns(path: Path, groups: list[pa.Table]) -> None:
+    """Write tables of :func:`to_table` as the row groups of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with pq.ParquetWriter(path, groups[0].schema) as writer:
+        for group in groups:
+            writer.write_table(group)
+
+
+def to_table(columns: Mapping[str, NDArray[Any]]) -> pa.Table:
+    """Convert columns ``(row, *shape)``: shape (1,) to numbers, vectors to lists of fixed size, others to nested lists."""
+    return pa.table({name: _to_arrow(values) for name, values in columns.items()})
+
+
+def _to_arrow(values: NDArray[Any]) -> pa.Array:
+    shape = values.shape[1:]
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    if shape == (1,):
+        return flat
+    if len(shape) == 1 and shape[0]:
+        return pa.FixedSizeListArray.from_arrays(flat, shape[0])
+    for axis in reversed(range(1, values.ndim)):
+        count = prod(values.shape[:axis])
+        flat = pa.ListArray.from_arrays(pa.array(np.arange(count + 1, dtype=np.int32) * values.shape[axis]), flat)
+    return flat
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[pq.ParquetFile]:
+    try:
+        with pq.ParquetFile(path) as file:
+            yield file
+    except _DAMAGED as error:
+        raise UserError(f"{path}: expected a Parquet file, found a damaged one ({short(str(error), 100)})") from error
+
+
+def _checked_size(path: Path, file: pq.ParquetFile, shapes: Mapping[str, tuple[int, ...]]) -> int:
+    """Unpacked bytes of columns.
+
+    Raises:
+        UserError: if a column is missing or holds more numbers than its shape, which could exhaust memory.
+    """
+    names, size = file.schema_arrow.names, 0
+    paths = [file.schema.column(index).path for index in range(len(file.schema))]
+    for name, shape in shapes.items():
+        leaves = [index for index, leaf in enumerate(paths) if leaf == name or leaf.startswith(f"{name}.list.")]
+        require(len(leaves) == 1, str(path), f"the column {name!r} once", short(", ".join(names), 120))
+        for group in range(file.num_row_groups):
+            rows = file.metadata.row_group(group)
+            count, expected = rows.column(leaves[0]).num_values, rows.num_rows * max(1, prod(shape))
+            message = f"{rows.num_rows} times {prod(shape)} numbers, as info.json says"
+            require(count == expected, f"{path}: column {name!r}", message, str(count))
+        kind = file.schema_arrow.field(name).type
+        while _is_list(kind):
+            kind = kind.value_type
+        size += file.metadata.num_rows * prod(shape) * (1 if pa.types.is_uint8(kind) else 8)
+    return size
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _numbers(place: str, column: pa.ChunkedArray, shape: tuple[int, ...], whole: bool) -> NDArray[Any]:
+    """Values ``(row, *shape)`` of a column, or ``(row,)`` if whole."""
+    values = column.combine_chunks()
+    for size in shape:
+        if isinstance(values, pa.ExtensionArray):
+            values = values.storage
+        if not _is_list(values.type):
+            break  # a vector of one number is the number itself
+        even = not len(values) or pc.unique(pc.list_value_length(values)).to_pylist() == [size]
+        require(even, place, f"{size} numbers in each list", "other lists")
+        values = values.flatten()
+    kind = values.type
+    numeric = pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
+    fits = numeric and len(values) == len(column) * prod(shape)
+    require(fits, place, f"numbers of shape {shape}", short(str(column.type)))
+    if whole:
+        valid = pa.types.is_integer(kind) and not values.null_count
+        require(valid, place, "whole numbers", f"{short(str(kind))} or missing ones")
+        return values.to_numpy(zero_copy_only=False).astype(np.int64)
+    if pa.types.is_boolean(kind):
+        values = values.cast(pa.uint8()).cast(pa.float32())
+    return values.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
