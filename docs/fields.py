@@ -11,11 +11,26 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the package of this checkout, whatever is installed
 
 from ftl_lightning.data.features import Feature
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Metric, Plans, Show, View
+from ftl_lightning.domains.domain import ClosedLoop, Comparison, Concepts, Domain, Metric, Plans, Privileged, Recordings, Show, View
 from ftl_lightning.domains.paper import Paper, Published
 from ftl_lightning.domains.tasks import EvaluationTask
 
-CLASSES: tuple[type, ...] = (Domain, Plans, Concepts, EvaluationTask, Feature, Metric, Show, ClosedLoop, View, Paper, Published)
+CLASSES: tuple[type, ...] = (
+    Domain,
+    Plans,
+    Concepts,
+    EvaluationTask,
+    Feature,
+    Metric,
+    Show,
+    ClosedLoop,
+    View,
+    Comparison,
+    Paper,
+    Published,
+    Recordings,
+    Privileged,
+)
 PAGE = Path(__file__).parent / "own-domain.md"
 BEGIN, END = "<!-- fields: begin, written by `make fields` -->\n", "<!-- fields: end -->\n"
 

@@ -212,8 +212,9 @@ def _paper(given: Mapping[str, Any] | float, rest: Mapping[str, Any]) -> Iterato
         return
     wanted = dict(given)
     domain = domain_of_file(wanted.pop("domain"))
-    if domain.paper:  # texts may name numbers beside which tables put none
-        domain = replace(domain, paper=replace(domain.paper, comparable=True))
+    if domain.comparison.paper:  # texts may name numbers beside which tables put none
+        paper = replace(domain.comparison.paper, comparable=True)
+        domain = replace(domain, comparison=replace(domain.comparison, paper=paper))
     method = Compared(wanted.pop("method", OURS))
     number = lookup(domain, wanted.pop("setting"), wanted.pop("metric", "accuracy"), method=method, **wanted)
     if number is None:

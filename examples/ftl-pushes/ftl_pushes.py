@@ -10,7 +10,7 @@ from torch import Tensor
 from ftl_lightning.data.container import Demonstrations, concatenate
 from ftl_lightning.data.features import Feature, InitialStates, Observed, check_starts
 from ftl_lightning.domains import line_plots
-from ftl_lightning.domains.domain import ClosedLoop, Concepts, Domain, Frames, Metric, Plans, Split
+from ftl_lightning.domains.domain import ClosedLoop, Comparison, Concepts, Domain, Frames, Metric, Plans, Split
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.services.seeding import VALIDATION_SEED, generator, task_key
@@ -111,7 +111,6 @@ DOMAIN = Domain(
     source=lambda root: Expert(),
     observed={"world": WORLD},
     metrics={"accuracy": Metric(arrives)},
-    headline="closed loop success",
-    references={"random target": random_target},
+    comparison=Comparison(headline="closed loop success", references={"random target": random_target}),
     closed_loop=ClosedLoop(environment=PushEnvironment, act=act, steps=20, judge=judge, film=film),
 )

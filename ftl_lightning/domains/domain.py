@@ -293,6 +293,46 @@ class Privileged:
     told: Callable[[Tensor, torch.Generator], Tensor] | None = None
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """What results of a domain are compared with.
+
+    Attributes:
+        ours: our method, in the form that baselines are compared with; by default the paper's form.
+        headline: main measure: the name of a metric, or ``'closed loop '`` and the name of an outcome.
+        references: reference policies (trivial policies and oracles) by name: ``(goal, samples, initial states or None, seed) ->
+            states (sample, horizon, state)``.
+        distance: distance between plans for novelty and coverage, ``(states (a, horizon, state), others (b, horizon, state)) ->
+            (a, b)``; ``None`` for the root mean square over a plan's times, with columns scaled to standard deviation 1.
+        fresh: whether the source draws demonstrations of any goal fast enough for every evaluation; otherwise coverage is not
+            measured.
+        paper: published numbers; ``None`` for none.
+    """
+
+    ours: Compared = PAPERS_METHOD
+    headline: str = ACCURACY
+    references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
+    distance: Distance | None = None
+    fresh: bool = True
+    paper: Paper | None = None
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Recording and import of demonstrations.
+
+    Attributes:
+        prepare: conversion of the user's copy of a data set (``python -m ftl_lightning prepare``): ``(folder to read or None,
+            folder to write or None for the same) -> text to print``; ``None`` if none is needed.
+        recorder: recorder of demonstrations with a pointer; ``None`` if behaviour cannot be shown in this way.
+        imports: readers of other programs' files by ending, such as ``'.bvh'``: ``file -> demonstrations`` without a text.
+    """
+
+    prepare: Callable[[Path | None, Path | None], str] | None = None
+    recorder: "Recorder | None" = None
+    imports: Mapping[str, Callable[[Path], Demonstrations]] = field(default_factory=dict)
+
+
 def _expect(what: str, values: object, shapes: Sequence[tuple[int, ...]]) -> None:
     if not isinstance(values, Tensor) or tuple(values.shape) not in shapes:
         found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
@@ -310,25 +350,14 @@ class Domain(Shown):
         source: makes the source of demonstrations, given the folder of the user's data or ``None``.
         show: pictures of plans; by default lines over time, or paths where a state has two or three columns.
         observed: features that a plan is conditioned on, by name; empty where plans have no initial state.
-        privileged: what training demonstrations show beside these, by name: the encoder of images can be taught by it in
-            pretraining (``model.privileged``). No model observes it.
         metrics: how plans are judged in open loop, by name; the first is the one that ablations report. Empty where behaviour is
             judged in closed loop only.
-        ours: our method in the form that others are compared with; the paper's by default.
-        headline: what methods are compared by: the name of a metric, or ``'closed loop '`` and an outcome.
-        references: reference lines (trivial policies and oracles) by name: ``(goal, samples, initial states or None, seed) ->
-            states (sample, horizon, state)``.
-        views: ways in which a model may see behaviour, by name; without any, the model sees states as they are.
-        closed_loop: how plans are executed; ``None`` where they cannot be.
-        distance: between plans, for novelty and coverage: ``(states (a, horizon, state), others (b, horizon, state)) -> (a, b)``;
-            ``None`` for the root mean square over the plan's times, columns scaled by their spread.
-        fresh: whether the source draws demonstrations of any goal quickly enough to do so in every evaluation; otherwise coverage
-            is not measured.
-        paper: published numbers, if there are any.
-        prepare: ``(folder of the user's copy of the data, folder to write or None for the same) -> text to print``, for recordings
-            that are read once before they are used; see ``python -m ftl_lightning prepare``.
-        recorder: how a person shows behaviour with a pointer, see :mod:`ftl_lightning.domains.recorder`; ``None`` where nobody can.
-        imports: by the ending of a file of other programs, such as ``'.bvh'``, ``file -> demonstrations`` without a text.
+        closed_loop: execution of plans; ``None`` for a domain without an environment.
+        views: alternative representations of behaviour for models, by name. A model without a view sees states as they are.
+        comparison: what results are compared with.
+        recordings: recording and import of demonstrations.
+        privileged: quantities of training demonstrations that are not observed, by name. Pretraining can train image encoders
+            to predict them (``model.privileged``).
     """
 
     name: str
@@ -337,19 +366,12 @@ class Domain(Shown):
     source: Callable[[Path | None], Source]
     show: Show = _UNSAID
     observed: Mapping[str, Feature] = field(default_factory=dict)
-    privileged: Mapping[str, Privileged] = field(default_factory=dict)
     metrics: Mapping[str, Metric] = field(default_factory=dict)
-    ours: Compared = PAPERS_METHOD
-    headline: str = ACCURACY
-    references: Mapping[str, Callable[[str, int, InitialStates | None, int], Tensor]] = field(default_factory=dict)
-    views: Mapping[str, View] = field(default_factory=dict)
     closed_loop: ClosedLoop | None = None
-    distance: Distance | None = None
-    fresh: bool = True
-    paper: Paper | None = None
-    prepare: Callable[[Path | None, Path | None], str] | None = None
-    recorder: "Recorder | None" = None
-    imports: Mapping[str, Callable[[Path], Demonstrations]] = field(default_factory=dict)
+    views: Mapping[str, View] = field(default_factory=dict)
+    comparison: Comparison = field(default_factory=Comparison)
+    recordings: Recordings = field(default_factory=Recordings)
+    privileged: Mapping[str, Privileged] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.show is _UNSAID:

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import Concepts, Domain, Metric, Plans, Split
+from ftl_lightning.domains.domain import Comparison, Concepts, Domain, Metric, Plans, Recordings, Split
 from ftl_lightning.domains.hand_drawn import drawn_by_hand
 from ftl_lightning.domains.recognition import Recognition
 from ftl_lightning.services.errors import UserError, about, short
@@ -113,10 +113,12 @@ def own_domain(
         source=lambda root: every,
         observed=examples.features,
         metrics={name: METRICS[name](examples, horizon, number) for name, number in metrics.items()},
-        headline=next(iter(metrics), ""),
-        distance=partial(_warped, examples),
-        fresh=False,  # the file is all there is
-        recorder=drawn_by_hand(examples, horizon),
+        comparison=Comparison(
+            headline=next(iter(metrics), ""),
+            distance=partial(_warped, examples),
+            fresh=False,  # the file is all there is
+        ),
+        recordings=Recordings(recorder=drawn_by_hand(examples, horizon)),
     )
 
 

@@ -34,7 +34,9 @@ def references(
         environments: alternative environments in which the method's behaviour was executed.
     """
     loop = None if all(behaviour.rollout is None for behaviour in judged) else domain.closed_loop
-    by_policy = {name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.references}
+    by_policy = {
+        name: [_planned(name, like, domain, loop, seed, environments) for like in judged] for name in domain.comparison.references
+    }
     if loop is not None:
         for name in loop.policies:
             acted = (_acted(name, like, domain, loop, demonstrated, seed, environments) for like in judged)
@@ -49,7 +51,7 @@ def _planned(
     task, starts, (count, _, columns) = like.task, like.starts, like.states.shape
     key = (name, domain.name, task.goal, count, _hash(starts), seed)
     if key not in _KNOWN:
-        _KNOWN[key] = domain.references[name](task.goal, count, starts, seed)
+        _KNOWN[key] = domain.comparison.references[name](task.goal, count, starts, seed)
     plans = _KNOWN[key]
     if (expected := (count, domain.plans.horizon, columns)) != tuple(plans.shape):
         raise UserError(f"domain {domain.name}, reference {name!r}: expected plans {expected}, found {tuple(plans.shape)}")

@@ -260,7 +260,7 @@ def _paired(domain: Domain, rows: pd.DataFrame) -> Table:
             if counts is not None:
                 lines.append([setting, label, f"{name}{place}", episodes(*counts)])
                 elsewhere = "; an environment other than the domain's own is named behind the policy" if place else elsewhere
-    compared = domain.headline.removeprefix(f"{CLOSED} ")
+    compared = domain.comparison.headline.removeprefix(f"{CLOSED} ")
     caption = (
         f"{domain.name}: {compared} less that of policies from the same starts, 95 % interval, McNemar's exact p "
         f"(of these learned concepts: the episodes of a seed share one){elsewhere}"

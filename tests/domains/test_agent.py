@@ -256,7 +256,7 @@ def test_references_stand_where_they_must() -> None:
     initial = initial_states(scenes("go to red bowl", 20, 0))
     rate = {
         name: progressed("go to red bowl", draw("go to red bowl", 20, initial, 0), initial).float().mean().item()
-        for name, draw in DOMAIN.references.items()
+        for name, draw in DOMAIN.comparison.references.items()
     }
     assert rate["expert (oracle)"] == 1.0
     assert 0.2 < rate["random object"] < 0.8

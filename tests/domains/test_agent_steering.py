@@ -20,8 +20,8 @@ from ftl_lightning.domains.recorder import Scene, check_path
 from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.services.errors import UserError
 
-assert DOMAIN.recorder is not None
-RECORDER = DOMAIN.recorder
+assert DOMAIN.recordings.recorder is not None
+RECORDER = DOMAIN.recordings.recorder
 GOAL = "go to red bowl"
 
 

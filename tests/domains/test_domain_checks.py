@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import ClosedLoop, Domain, Metric
+from ftl_lightning.domains.domain import ClosedLoop, Comparison, Domain, Metric
 from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.rollout import Rollout
@@ -39,7 +39,11 @@ def test_metrics_judges_and_reference_lines_of_another_shape_are_refused() -> No
         loop = ClosedLoop(lambda: None, lambda plans, step, observed: plans, 1, lambda *_, said=outcomes: said)  # type: ignore[arg-type,misc,return-value]
         with pytest.raises(UserError, match=expected):
             replace(DOMAIN, closed_loop=loop).judge(GOAL, rollout)
-    domain = replace(DOMAIN, name="other", references={"mine": lambda goal, count, starts, seed: torch.zeros(count, 2, 21)})
+    domain = replace(
+        DOMAIN,
+        name="other",
+        comparison=Comparison(references={"mine": lambda goal, count, starts, seed: torch.zeros(count, 2, 21)}),
+    )
     one = TaskResult.of(EvaluationTask("s", GOAL), STATES, None, domain)
     with pytest.raises(UserError, match=r"reference 'mine': expected plans \(5, 1, 21\), found \(5, 2, 21\)"):
         references([one], domain, lambda concept: None, 0)

@@ -67,14 +67,14 @@ def test_a_file_is_a_domain_which_has_no_headline_without_metrics(file: str) -> 
     assert [task.goal for task in domain.concepts.suites["training"].tasks] == ["go right", "go up"]
     assert domain.concepts.reads("go up")
     assert not domain.concepts.reads("go between")
-    assert domain.main_metric == domain.headline == "end_point_within"
+    assert domain.main_metric == domain.comparison.headline == "end_point_within"
     assert [domain.less_is_better(name) for name in domain.metrics] == [False, True]
     assert domain.show.film is not None
     assert domain.observed == {}
     known = examples(go_right=walks("go right", 2), go_up=walks("go up", 2, 1))
     domain = own_domain(known, ("go right",), TIME, {})
     assert domain.metrics == {}
-    assert domain.headline == ""
+    assert domain.comparison.headline == ""
     assert domain.concepts.reads("go up")  # it can be compared with, though it is no training concept
     assert domain.concepts.training == ("go right",)
 

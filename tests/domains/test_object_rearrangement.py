@@ -159,7 +159,7 @@ def test_a_ring_can_be_laid_onto_either_diagonal() -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**31))
 def test_relaxed_contains_exact_and_right_of_excludes_its_reverse(seed: int) -> None:
-    states = DOMAIN.references["random scenes"]("", 200, None, seed)[:, 0]
+    states = DOMAIN.comparison.references["random scenes"]("", 200, None, seed)[:, 0]
     for kind, pair in itertools.product(("right of", "above", "next to"), itertools.permutations(SHAPES, 2)):
         relation, reverse = Relation(kind, pair), Relation(kind, pair[::-1])
         exact = holds(relation, states, relaxed=False)
@@ -191,5 +191,5 @@ def test_contradicting_relations_and_an_unreadable_task_are_clear_errors() -> No
 @pytest.mark.usefixtures("few")
 def test_the_oracle_is_right_and_chance_is_not() -> None:
     for task in TASKS[::7]:
-        assert succeeded(task, DOMAIN.references["generator (oracle)"](task, 20, None, 0)).all()
-        assert succeeded(task, DOMAIN.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5
+        assert succeeded(task, DOMAIN.comparison.references["generator (oracle)"](task, 20, None, 0)).all()
+        assert succeeded(task, DOMAIN.comparison.references["random scenes"](task, 500, None, 0)).float().mean() < 0.5

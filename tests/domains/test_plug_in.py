@@ -132,7 +132,7 @@ def test_the_expert_s_pushes_are_right_in_open_and_closed_loop_and_a_random_targ
         starts = drawn.initial_states
         assert torch.equal(starts.observed["world"], starts.require_scenes())
         assert measure(task, drawn.states, starts).all()
-        assert measure(task, pushes.references["random target"](task, 40, starts, 0), starts).float().mean() < 0.8
+        assert measure(task, pushes.comparison.references["random target"](task, 40, starts, 0), starts).float().mean() < 0.8
         rollout = roll_out(loop, starts, PlanFollower(fixed_plans(drawn.states), loop.act, loop.steps))
         assert loop.judge(task, rollout)["success"].all()
         assert len(loop.film(rollout.take(0, 1), drawn.states[:1])) > 1

@@ -18,8 +18,8 @@ from ftl_lightning.domains.vector_film import VectorFilm, still
 from ftl_lightning.services.errors import LONGEST, UserError
 
 SHAPES = load_domain("object_rearrangement")
-assert SHAPES.recorder is not None
-ARRANGED = SHAPES.recorder
+assert SHAPES.recordings.recorder is not None
+ARRANGED = SHAPES.recordings.recorder
 EMPTY = Scene(VectorFilm((still("line", [(0, 0), (1, 1)], "#000000"),), (0.0, 0.0, 10.0, 10.0), 1.0))
 
 
@@ -30,7 +30,7 @@ def examples(horizon: int = 40, columns: int = 2) -> Demonstrations:
 
 
 def drawn(horizon: int = 40) -> Recorder:
-    found = own_domain(examples(horizon), ("heart",), horizon, {}).recorder
+    found = own_domain(examples(horizon), ("heart",), horizon, {}).recordings.recorder
     assert found is not None
     return found
 
@@ -124,7 +124,7 @@ def test_lines_are_drawn_within_a_square_around_the_examples_and_slips_and_other
             shown(recorder, [[[x, y]], [[x + length * width, y]]])
     assert shown(recorder, [[[x, y]], [[x + 0.03 * width, y]]]).states.shape == (1, 40, 2)
     for horizon, columns in ((1, 2), (40, 4)):
-        assert own_domain(examples(horizon, columns), ("heart",), horizon, {}).recorder is None
+        assert own_domain(examples(horizon, columns), ("heart",), horizon, {}).recordings.recorder is None
 
 
 def test_shapes_are_put_where_they_belong_and_judged_as_any_scene() -> None:

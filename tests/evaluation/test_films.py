@@ -55,7 +55,7 @@ def test_an_evaluation_writes_films_of_its_rows(evaluated: Path, log: Path) -> N
 def test_the_agent_of_a_film_goes_where_it_went() -> None:
     domain = load_domain("agent")
     starts = domain.source(None).starts("go to red bowl", 1, 0)
-    plans = domain.references["expert (oracle)"]("go to red bowl", 1, starts, 0)
+    plans = domain.comparison.references["expert (oracle)"]("go to red bowl", 1, starts, 0)
     rollout = roll_out(domain.closed_loop, starts, PlanFollower(fixed_plans(plans), domain.closed_loop.act, 200))
     film = domain.closed_loop.vector_film(rollout)
     way = next(shape for shape in film.shapes if shape.kind == "way")
@@ -134,7 +134,7 @@ def middle(film: VectorFilm) -> NDArray[np.float32]:
 def test_a_plan_of_the_agent_is_a_way_in_its_scene(length: int) -> None:
     domain = load_domain("agent")
     starts = domain.source(None).starts("go to red bowl", 1, 0)
-    states = domain.references["nearest object"]("go to red bowl", 1, starts, 0)[0, :length]
+    states = domain.comparison.references["nearest object"]("go to red bowl", 1, starts, 0)[0, :length]
     film = domain.show.vector_film(states, starts)
     assert film.frames == length
     assert np.allclose(middle(film), states[:, [0, 2]].numpy(), atol=1e-5)

@@ -20,7 +20,7 @@ from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Concepts, Domain, Metric, Plans, Show, Split
+from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Comparison, Concepts, Domain, Metric, Plans, Recordings, Show, Split
 from ftl_lightning.domains.paper import Paper
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
@@ -196,9 +196,7 @@ DOMAIN = Domain(
     source=lambda root: Expert(),
     observed={OBSERVED: FEATURE},
     metrics={ACCURACY: Metric(progressed)},
-    headline="closed loop success",
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:plan_film")),
-    references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
     views=VIEWS,
     closed_loop=ClosedLoop(
         environment=environment,
@@ -209,13 +207,19 @@ DOMAIN = Domain(
         vector_film=deferred(f"{RENDERING}:vector_film"),
         expect=check_simulator,
     ),
-    distance=distance,
-    paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
-    recorder=Recorder(
-        "steer",
-        "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
-        deferred(f"{STEERING}:scene"),
-        deferred(f"{STEERING}:record"),
-        tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
+    comparison=Comparison(
+        headline="closed loop success",
+        references={"nearest object": _nearest, "random object": _random, "expert (oracle)": _oracle},
+        distance=distance,
+        paper=Paper(PUBLISHED, omega="1.6", ours="0.6"),
+    ),
+    recordings=Recordings(
+        recorder=Recorder(
+            "steer",
+            "Lead the agent, the brown dot, to where it should go; each time other objects stand elsewhere.",
+            deferred(f"{STEERING}:scene"),
+            deferred(f"{STEERING}:record"),
+            tuple(dict.fromkeys((*TRAINING_CONCEPTS, *(goal for name in ("paper", "validation") for goal in SUITES[name].goals)))),
+        )
     ),
 )

@@ -8,7 +8,7 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.deferred import deferred
 from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Show
+from ftl_lightning.domains.domain import ACCURACY, Comparison, Concepts, Domain, Metric, Plans, Recordings, Show
 from ftl_lightning.domains.generated import Generated
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
@@ -71,16 +71,20 @@ DOMAIN = Domain(
     source=lambda root: Generated(NAME, PLANS, TRAINING_CONCEPTS, lambda task, count, seed: generate(task, count, seed)[:, None]),
     metrics={ACCURACY: Metric(succeeded)},
     show=Show(deferred(f"{RENDERING}:render"), vector_film=deferred(f"{RENDERING}:vector_film")),
-    references={
-        "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
-        "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
-    },
-    distance=distance,
-    paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
-    recorder=Recorder(
-        "arrange",
-        "Put the three shapes where they show what you mean; their sizes are new each time.",
-        deferred(f"{RECORDING}:scene"),
-        deferred(f"{RECORDING}:record"),
+    comparison=Comparison(
+        references={
+            "random scenes": lambda goal, count, starts, seed: random_scenes(count, seed)[:, None],
+            "generator (oracle)": lambda goal, count, starts, seed: generate(goal, count, seed)[:, None],
+        },
+        distance=distance,
+        paper=Paper(PUBLISHED, omega="1.2", ours="1.2"),
+    ),
+    recordings=Recordings(
+        recorder=Recorder(
+            "arrange",
+            "Put the three shapes where they show what you mean; their sizes are new each time.",
+            deferred(f"{RECORDING}:scene"),
+            deferred(f"{RECORDING}:record"),
+        )
     ),
 )
