@@ -20,7 +20,7 @@ import pandas as pd
 import yaml
 from safetensors import safe_open
 
-from ftl_lightning.domains.paper import OURS, Compared
+from ftl_lightning.domains.comparison import OURS, Compared
 from ftl_lightning.domains.registry import domain_of_file
 from ftl_lightning.evaluation.results import latest, read_rows
 from ftl_lightning.few_shot.tuned import ModelSettings

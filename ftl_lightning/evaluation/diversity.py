@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.distances import Distance, scaled_distance
+from ftl_lightning.domains.comparison import Distance, scaled_distance
 from ftl_lightning.domains.domain import COVERAGE, NOVELTY, Domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.evaluable import demonstrations_of

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, join
-from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, Policy, closed_loop_of
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.domain import CLOSED, SUCCESS, Domain, closed_loop_of
+from ftl_lightning.domains.execution import Policy, Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.closed_loop import roll_out
 

@@ -5,8 +5,8 @@ from typing import Any
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import InitialStates, check_starts
-from ftl_lightning.domains.domain import ClosedLoop, Domain
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.evaluable import demonstrations_of
 from ftl_lightning.evaluation.judged import TaskResult

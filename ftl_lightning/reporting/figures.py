@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ftl_lightning.domains.comparison import CHOSEN, OURS, Compared
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.paper import CHOSEN, OURS, Compared
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED
 from ftl_lightning.evaluation.results import latest
 from ftl_lightning.evaluation.row import REFERENCE

@@ -6,9 +6,9 @@ from typing import NoReturn
 
 import pandas as pd
 
-from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Comparison, Concepts, Domain, Metric, Plans
+from ftl_lightning.domains.comparison import OURS, PAPERS_METHOD, Compared, Comparison, Published
+from ftl_lightning.domains.domain import CLOSED, COVERAGE, EXECUTED, NOVELTY, Concepts, Domain, Metric, Plans
 from ftl_lightning.domains.from_file import OWN
-from ftl_lightning.domains.paper import OURS, PAPERS_METHOD, Compared, Published
 from ftl_lightning.domains.registry import domain_of_file, is_known
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.judged import LOST, WON

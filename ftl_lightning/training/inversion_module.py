@@ -7,7 +7,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
-from ftl_lightning.domains.paper import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
+from ftl_lightning.domains.comparison import CHOSEN, FINE_TUNED, WITH_ADAPTER, WITH_MODES
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.igm.concept import Concept
 from ftl_lightning.services.option_groups import flat, groups_of

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import InitialStates, moved
-from ftl_lightning.domains.beside import Drawn, beside
-from ftl_lightning.domains.distances import path_distance
+from ftl_lightning.domains.comparison import path_distance
 from ftl_lightning.domains.domain import Domain
+from ftl_lightning.domains.pictures import Drawn, beside
 from ftl_lightning.igm.concept import Concept, QualityRecord
 from ftl_lightning.igm.samplers import Sampling
 from ftl_lightning.services.seeding import generator, task_key

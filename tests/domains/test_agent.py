@@ -17,7 +17,7 @@ from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, REACH, pairs, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import COMPOSITIONS, TRAINING_CONCEPTS
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.services.errors import UserError
 
 SOURCE = DOMAIN.source(None)

@@ -16,8 +16,8 @@ from ftl_lightning.domains.agent.expert import LENGTH, SPEED
 from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.rendering import SEEN
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
+from ftl_lightning.domains.execution import Rollout
 from ftl_lightning.domains.recorder import Scene, check_path
-from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.services.errors import UserError
 
 assert DOMAIN.recordings.recorder is not None

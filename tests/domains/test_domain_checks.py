@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import ClosedLoop, Comparison, Domain, Metric
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.domain import Domain, Metric
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
 from ftl_lightning.domains.object_rearrangement import DOMAIN
 from ftl_lightning.domains.registry import load_domain
-from ftl_lightning.domains.rollout import Rollout
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.references import references

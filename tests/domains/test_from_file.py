@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import Feature
-from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own, warped_distances
+from ftl_lightning.domains.comparison import warped_distances
+from ftl_lightning.domains.from_file import METRICS, domain_from_file, own_domain, read_own
 from ftl_lightning.evaluation.evaluator import Evaluator
 from ftl_lightning.evaluation.judged import TaskResult
 from ftl_lightning.evaluation.results import read_rows

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.domain import Concepts, Domain, Plans
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.domain import Concepts, Domain, Generated, Plans
 from ftl_lightning.domains.registry import domain_names, load_domain, recorded_name
 from ftl_lightning.domains.tasks import few_shot_suites
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.distances import path_distance, scaled_distance
+from ftl_lightning.domains.comparison import path_distance, scaled_distance, warped_distances
 from ftl_lightning.domains.domain import Domain
-from ftl_lightning.domains.from_file import own_domain, warped_distances
+from ftl_lightning.domains.from_file import own_domain
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.diversity import FRESH, REPLAYED, Real, coverage, lines, novelty

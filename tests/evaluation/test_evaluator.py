@@ -17,7 +17,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams.metadata import parse_session_start_info_plugin_data
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.domain import Comparison, Domain, Metric
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.domain import Domain, Metric
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.domains.tasks import EvaluationTask
 from ftl_lightning.evaluation.drawing import picture

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.driving.shipped import SHIPPED
+from ftl_lightning.domains.films import Shape, VectorFilm, Wireframe, still
 from ftl_lightning.domains.registry import domain_names, load_domain
-from ftl_lightning.domains.vector_film import Shape, VectorFilm, still
-from ftl_lightning.domains.wireframe import Wireframe
 from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll_out
 from ftl_lightning.evaluation.films import ABSENT, STEPS, packed, packed_space
 from ftl_lightning.evaluation.results import read_rows
@@ -88,10 +87,10 @@ def test_roads_stay_and_the_controlled_vehicle_drives() -> None:
 
 @pytest.mark.parametrize("columns", [2, 4])
 def test_own_behaviour_is_filmed_by_its_columns(columns: int) -> None:
-    from ftl_lightning.domains.domain import Plans, line_drawings
+    from ftl_lightning.domains.pictures import line_drawings
 
     names = tuple(f"c{number}" for number in range(columns))
-    show = line_drawings(Plans(12, names, ("m",) * columns))
+    show = line_drawings(names)
     film = show.vector_film(torch.randn(12, columns, generator=torch.Generator().manual_seed(0)), None)
     left, lower, width, height = film.window
     for shape in film.shapes:

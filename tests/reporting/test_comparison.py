@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ftl_lightning.cli.main import main
-from ftl_lightning.domains.paper import Compared
+from ftl_lightning.domains.comparison import Compared
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.evaluation.results import append_rows, read_rows, read_study
 from ftl_lightning.evaluation.row import Row

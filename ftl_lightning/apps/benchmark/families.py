@@ -15,8 +15,8 @@ from torch import Tensor
 from ftl_lightning.apps.testing import more_strokes
 from ftl_lightning.apps.testing.families import beats, pictures, reaches
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.domain import ACCURACY, Comparison, Concepts, Domain, Metric, Plans
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.comparison import Comparison
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans
 from ftl_lightning.domains.tasks import EvaluationTask, Suite, training_suite
 from ftl_lightning.services.seeding import FRESH_SEED
 

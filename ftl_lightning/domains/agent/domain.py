@@ -18,10 +18,10 @@ from ftl_lightning.domains.agent.published import PUBLISHED
 from ftl_lightning.domains.agent.scenes import FEATURE, OBSERVED, PLANE, STATE, object_positions, parse, scenes, target
 from ftl_lightning.domains.agent.tasks import SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.agent.views import VIEWS
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ACCURACY, ClosedLoop, Comparison, Concepts, Domain, Metric, Plans, Recordings, Show, Split
-from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.comparison import Comparison, Paper, path_distance
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Metric, Plans, Recordings, Split, deferred
+from ftl_lightning.domains.execution import ClosedLoop
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.services.seeding import VALIDATION_SEED

@@ -23,7 +23,7 @@ from ftl_lightning.domains.agent.scenes import (
     looks,
     scenes,
 )
-from ftl_lightning.domains.physics import Simulator, pybullet
+from ftl_lightning.domains.execution import Simulator, pybullet
 from ftl_lightning.services.errors import UserError
 
 BOWL_THICKNESS = 0.025

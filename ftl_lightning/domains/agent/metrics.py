@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates, check_starts
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import Rollout
 
 
 def distances(positions: Tensor, world: Tensor) -> Tensor:

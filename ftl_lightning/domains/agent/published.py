@@ -1,6 +1,6 @@
 """The paper's numbers for navigation."""
 
-from ftl_lightning.domains.paper import Published
+from ftl_lightning.domains.comparison import Published
 
 NEW = "new initial state"
 

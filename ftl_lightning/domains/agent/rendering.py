@@ -11,8 +11,8 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates, check_starts
 from ftl_lightning.domains.agent.dynamics import check_simulator
 from ftl_lightning.domains.agent.scenes import COLOURS, OBSERVED, PLANE, REACH, looks, object_positions
-from ftl_lightning.domains.rollout import Rollout
-from ftl_lightning.domains.vector_film import Shape, VectorFilm, regular, some, still
+from ftl_lightning.domains.execution import Rollout
+from ftl_lightning.domains.films import Shape, VectorFilm, regular, some, still
 from ftl_lightning.services.escape import figure_text
 
 MARKERS = {"cone": "^", "sphere": "o", "bowl": "v", "cube": "s"}

@@ -10,8 +10,7 @@ from ftl_lightning.domains.agent.expert import LENGTH, SPEED, STOP, Plane, follo
 from ftl_lightning.domains.agent.rendering import SEEN, STEPS_A_SECOND, from_above
 from ftl_lightning.domains.agent.scenes import OBSERVED, PLANE, object_positions, scenes
 from ftl_lightning.domains.agent.tasks import COMPOSITIONS
-from ftl_lightning.domains.hand_line import at_even_steps, reached, smoothed
-from ftl_lightning.domains.recorder import Numbers, Piece, Scene
+from ftl_lightning.domains.recorder import Numbers, Piece, Scene, at_even_steps, reached, smoothed
 from ftl_lightning.services.errors import UserError
 
 BRAKING = 20

@@ -11,9 +11,8 @@ from torch import Tensor
 from ftl_lightning.data.cache import cached
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ClosedLoop, Comparison, Concepts, Domain, Plans, Show, Split
+from ftl_lightning.domains.comparison import Comparison, Paper, path_distance
+from ftl_lightning.domains.domain import Concepts, Domain, Plans, Split, deferred
 from ftl_lightning.domains.driving import policies
 from ftl_lightning.domains.driving.motion import turned
 from ftl_lightning.domains.driving.published import PUBLISHED
@@ -37,8 +36,8 @@ from ftl_lightning.domains.driving.traffic import (
     scene,
 )
 from ftl_lightning.domains.driving.views import VIEWS
-from ftl_lightning.domains.paper import Paper
-from ftl_lightning.domains.rollout import Rollout
+from ftl_lightning.domains.execution import ClosedLoop, Rollout
+from ftl_lightning.domains.pictures import Show
 
 if TYPE_CHECKING:
     from ftl_lightning.domains.driving.environment import DrivingEnvironment

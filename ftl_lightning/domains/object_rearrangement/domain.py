@@ -6,15 +6,13 @@ import torch
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.distances import path_distance
-from ftl_lightning.domains.domain import ACCURACY, Comparison, Concepts, Domain, Metric, Plans, Recordings, Show
-from ftl_lightning.domains.generated import Generated
+from ftl_lightning.domains.comparison import Comparison, Paper, path_distance
+from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans, Recordings, deferred
 from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
 from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
 from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES, holds, parse, sentence
 from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
-from ftl_lightning.domains.paper import Paper
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
 

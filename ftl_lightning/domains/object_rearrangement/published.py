@@ -1,6 +1,6 @@
 """The paper's numbers for object rearrangement."""
 
-from ftl_lightning.domains.paper import Published
+from ftl_lightning.domains.comparison import Published
 
 
 def _bars() -> list[Published]:

@@ -10,8 +10,8 @@ from matplotlib.patches import Circle, RegularPolygon
 from torch import Tensor
 
 from ftl_lightning.data.features import InitialStates
+from ftl_lightning.domains.films import VectorFilm, regular, still
 from ftl_lightning.domains.object_rearrangement.relations import EXTENT, PER_SHAPE, SHAPES
-from ftl_lightning.domains.vector_film import VectorFilm, regular, still
 from ftl_lightning.services.escape import figure_text
 
 COLOURS = {"circle": "#e4704a", "triangle": "#4c9f70", "square": "#4a78c8"}

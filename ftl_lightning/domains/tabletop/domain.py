@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from ftl_lightning.data.features import Observed
-from ftl_lightning.domains.deferred import deferred
-from ftl_lightning.domains.domain import EXECUTED, ClosedLoop, Comparison, Concepts, Domain, Plans, Privileged, Show
-from ftl_lightning.domains.paper import Paper, Published
+from ftl_lightning.domains.comparison import Comparison, Paper, Published
+from ftl_lightning.domains.domain import EXECUTED, Concepts, Domain, Plans, Privileged, deferred
+from ftl_lightning.domains.execution import ClosedLoop
+from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.tabletop.interface import (
     FEATURES,
     MAX_STEPS,

@@ -1,6 +1,6 @@
 """Goal-conditioned behaviour cloning (paper, 'Baselines' and 'Implementation Details')."""
 
-from ftl_lightning.domains.paper import WITH_MODES
+from ftl_lightning.domains.comparison import WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
 METHOD = Method(

@@ -1,6 +1,6 @@
 """Conditional VAE (paper, 'Baselines'): a concept space learned from behaviour alone, without the paired concepts."""
 
-from ftl_lightning.domains.paper import WITH_MODES
+from ftl_lightning.domains.comparison import WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
 METHOD = Method(

@@ -1,6 +1,6 @@
 """Our method (the paper's FTL-IGM): a conditional diffusion model whose concepts are learned by gradient descent."""
 
-from ftl_lightning.domains.paper import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
+from ftl_lightning.domains.comparison import OURS, WITH_ADAPTER, WITH_KNOTS, WITH_MODES
 from ftl_lightning.training.method import Form, Method
 
 METHOD = Method(

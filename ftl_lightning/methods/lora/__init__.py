@@ -1,6 +1,6 @@
 """Fine-tuning our model by a low-rank adapter of all branches (LoRA, Hu et al., 2022), a baseline."""
 
-from ftl_lightning.domains.paper import FINE_TUNED
+from ftl_lightning.domains.comparison import FINE_TUNED
 from ftl_lightning.methods.ftl_igm import METHOD as OURS
 from ftl_lightning.training.method import Method
 
