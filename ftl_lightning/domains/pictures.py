@@ -137,6 +137,32 @@ def line_drawings(columns: Sequence[str]) -> Show:
     return Show(picture, film if len(columns) in (2, 3) else None, vector_film=vector_film, beside=both)
 
 
+def framed(count: int, right: Sequence[bool] | None, title: str, columns: int, size: tuple[float, float]) -> "Figure":
+    """Grid of empty panels with equal axes: green frames for right plans, red for wrong ones, grey for plans that are not judged.
+
+    Args:
+        count: number of panels.
+        right: whether each plan is right ``(count,)``; ``None`` if not judged.
+        title: title above the grid.
+        columns: maximum number of columns.
+        size: width and height of a panel in inches.
+    """
+    from matplotlib.figure import Figure
+
+    columns = min(count, columns)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows + 0.4), layout="constrained")
+    figure.suptitle(figure_text(title), fontsize=9)
+    figure.subplots(rows, columns, squeeze=False)
+    for axes, good in zip(figure.axes, [None] * count if right is None else right, strict=False):
+        axes.set(xticks=[], yticks=[], aspect="equal")
+        for spine in axes.spines.values():
+            spine.set(color=PLAIN if good is None else RIGHT if good else WRONG, linewidth=2.0)
+    for axes in figure.axes[count:]:
+        axes.set_axis_off()
+    return figure
+
+
 def _grid(names: Sequence[str], groups: Sequence[Drawn], title: str) -> "Figure":
     """Draw groups of plans on a shared scale, each from a new row.
 

@@ -10,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from ftl_lightning.data.container import Demonstrations
-from ftl_lightning.domains.agent.domain import DOMAIN
+from ftl_lightning.domains.agent.domain import DOMAIN, progressed, reached
 from ftl_lightning.domains.agent.environment import AgentEnvironment
 from ftl_lightning.domains.agent.expert import LENGTH, SPEED
-from ftl_lightning.domains.agent.metrics import progressed, reached
 from ftl_lightning.domains.agent.rendering import SEEN
 from ftl_lightning.domains.agent.scenes import OBSERVED, REACH, object_positions, target
 from ftl_lightning.domains.execution import Rollout

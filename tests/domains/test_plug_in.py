@@ -21,7 +21,7 @@ from ftl_lightning.evaluation.closed_loop import PlanFollower, fixed_plans, roll
 from ftl_lightning.services.errors import UserError
 from ftl_lightning.training.data import InversionData, PretrainingData
 from tests.conftest import ROOT, Once, python, refused, succeed
-from tests.domains.test_registry import offering
+from tests.domains.test_domain import offering
 
 EXAMPLES = ROOT / "examples"
 EXAMPLE = EXAMPLES / "ftl-strokes"

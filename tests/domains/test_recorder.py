@@ -11,7 +11,7 @@ from ftl_lightning.apps.testing.strokes import recognised, strokes
 from ftl_lightning.data.container import Demonstrations
 from ftl_lightning.domains.films import VectorFilm, still
 from ftl_lightning.domains.from_file import own_domain
-from ftl_lightning.domains.object_rearrangement.relations import EXTENT, TRAINING_RELATIONS, holds, overlap
+from ftl_lightning.domains.object_rearrangement.scenes import EXTENT, TRAINING_RELATIONS, holds, overlap
 from ftl_lightning.domains.recorder import AROUND, MOST_STEPS, Recorder, Scene, at_even_steps, check_path, reached, smoothed
 from ftl_lightning.domains.registry import load_domain
 from ftl_lightning.services.errors import LONGEST, UserError

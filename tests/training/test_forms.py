@@ -9,8 +9,7 @@ from matplotlib.colors import to_hex
 
 from ftl_lightning.apps.testing.strokes import strokes
 from ftl_lightning.data.container import Demonstrations, concatenate
-from ftl_lightning.domains.object_rearrangement.generation import random_scenes
-from ftl_lightning.domains.object_rearrangement.relations import columns
+from ftl_lightning.domains.object_rearrangement.scenes import columns, random_scenes
 from ftl_lightning.few_shot.learner import FewShot
 from ftl_lightning.igm.composition import Composition
 from ftl_lightning.igm.concept import Concept

@@ -8,10 +8,8 @@ from torch import Tensor
 from ftl_lightning.data.features import InitialStates
 from ftl_lightning.domains.comparison import Comparison, Paper, path_distance
 from ftl_lightning.domains.domain import ACCURACY, Concepts, Domain, Generated, Metric, Plans, Recordings, deferred
-from ftl_lightning.domains.object_rearrangement.generation import generate, random_scenes
-from ftl_lightning.domains.object_rearrangement.published import PUBLISHED
-from ftl_lightning.domains.object_rearrangement.relations import PER_SHAPE, SHAPES, holds, parse, sentence
-from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, SUITES, TRAINING_CONCEPTS
+from ftl_lightning.domains.object_rearrangement.scenes import PER_SHAPE, SHAPES, generate, holds, parse, random_scenes, sentence
+from ftl_lightning.domains.object_rearrangement.tasks import DESCRIBED, PUBLISHED, SUITES, TRAINING_CONCEPTS
 from ftl_lightning.domains.pictures import Show
 from ftl_lightning.domains.recorder import Recorder
 from ftl_lightning.services.errors import UserError
@@ -53,7 +51,6 @@ def distance(states: Tensor, others: Tensor) -> Tensor:
     return path_distance(states[..., CENTRES], others[..., CENTRES])
 
 
-RECORDING = "ftl_lightning.domains.object_rearrangement.recording"
 RENDERING = "ftl_lightning.domains.object_rearrangement.rendering"
 DOMAIN = Domain(
     name=NAME,
@@ -81,8 +78,8 @@ DOMAIN = Domain(
         recorder=Recorder(
             "arrange",
             "Put the three shapes where they show what you mean; their sizes are new each time.",
-            deferred(f"{RECORDING}:scene"),
-            deferred(f"{RECORDING}:record"),
+            deferred(f"{RENDERING}:scene"),
+            deferred(f"{RENDERING}:record"),
         )
     ),
 )
